@@ -1,0 +1,238 @@
+"""The messages on the control channel (JSON text frames, tagged by ``t``).
+
+A task set dials the master and sends :class:`Hello`. The master answers :class:`Welcome` and
+:class:`Sync` with all that it desires there, and from then on single :class:`Put` and :class:`Drop`.
+Messages with a ``request`` number are answered by the reply with the same number.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Any, Union
+
+import msgspec
+from msgspec import Struct
+
+from rce.control.model import (
+    EndpointSpec,
+    EndpointStatus,
+    EndpointUsage,
+    LinkAddress,
+)
+
+CONTROL_VERSION = 1
+
+
+class TaskSetKind(Enum):
+    """Which kind of task set dials."""
+
+    ROBOT = "robot"
+    CONTAINER = "container"
+
+
+class MachineInfo(Struct, frozen=True, kw_only=True, omit_defaults=True, tag_field=None):
+    """The machine a task set runs on."""
+
+    name: str
+    cores: int = 0
+    memory: int = 0
+    """Bytes."""
+    runtime: str = ""
+    """The runtime in use; container task sets only."""
+    labels: tuple[str, ...] = ()
+    detail: str = ""
+    """What is missing on this machine, in words."""
+
+
+class _Message(Struct, frozen=True, kw_only=True, omit_defaults=True, tag_field="t"):
+    """Base of all control messages."""
+
+
+# Task set to master
+
+
+class Hello(_Message):
+    """First message of a task set."""
+
+    version: int
+    kind: TaskSetKind
+    process: str
+    """Names the task set; a container task set keeps its name over a restart, so that it finds its containers again."""
+    machine: MachineInfo
+    url: str = ""
+    """Robot task sets: the WebSocket URL that clients are sent to."""
+    address: LinkAddress = LinkAddress()
+    """Robot task sets: where links to any of its robots are accepted."""
+    endpoints: tuple[EndpointStatus, ...] = ()
+    """All that is there now."""
+
+
+class Status(_Message):
+    """An endpoint changed."""
+
+    status: EndpointStatus
+
+
+class Gone(_Message):
+    """A dropped endpoint is gone with all that belonged to it."""
+
+    id: str
+    revision: int
+
+
+class Fault(_Message):
+    """Something failed that the endpoint's user must know of; becomes an ``ER`` and an event."""
+
+    id: str
+    text: str
+    robot: str = ""
+    """Endpoint id of the robot to tell; all robots of the user if empty."""
+
+
+class Usage(_Message):
+    """Periodic counters of a task set."""
+
+    cpu_s: float
+    memory: int
+    endpoints: dict[str, EndpointUsage]
+
+
+class Login(_Message):
+    """A robot wants to connect. Answered by :class:`LoginReply`."""
+
+    request: int
+    user: str
+    robot: str
+    password: str
+    """SHA-256 of the password, in hex, as the client sent it."""
+
+
+class Left(_Message):
+    """A robot's connection ended."""
+
+    id: str
+    reason: str
+
+
+class ClientRequest(_Message):
+    """A client's CC, DC, CN or CX. Answered by :class:`ClientReply`."""
+
+    request: int
+    id: str
+    """Endpoint id of the robot that asks."""
+    type: str
+    data: Any
+
+
+class LogChunk(_Message):
+    """Answer to :class:`ReadLog`."""
+
+    request: int
+    offset: int
+    """Where the next read goes on."""
+    text: str = ""
+    error: str = ""
+
+
+# Master to task set
+
+
+class Welcome(_Message):
+    """The master took the task set."""
+
+    version: int
+    master: str
+
+
+class Refused(_Message):
+    """The master does not take the task set; the channel is closed after it."""
+
+    reason: str
+
+
+class Sync(_Message):
+    """All that is desired at this task set; what else is there is to be removed."""
+
+    endpoints: tuple[EndpointSpec, ...]
+
+
+class Put(_Message):
+    """One endpoint is desired like this. An older revision than the one applied is ignored."""
+
+    endpoint: EndpointSpec
+
+
+class Drop(_Message):
+    """One endpoint is no longer desired here. Answered by :class:`Gone`."""
+
+    id: str
+    revision: int
+    reason: str = ""
+
+
+class Notify(_Message):
+    """Send an ``ER`` to a robot, or to all connected robots of a user if ``id`` holds no slash."""
+
+    id: str
+    text: str
+
+
+class LoginReply(_Message):
+    """Answer to :class:`Login`."""
+
+    request: int
+    endpoint: EndpointSpec | None = None
+    """The robot's desired state if it may come in."""
+    status: int = 200
+    """HTTP status for the handshake: 200, 401, 409 (already connected), 503."""
+    reason: str = ""
+
+
+class ClientReply(_Message):
+    """Answer to :class:`ClientRequest`: the texts of the ``ER`` messages to send, empty if all was done."""
+
+    request: int
+    errors: tuple[str, ...] = ()
+
+
+class ReadLog(_Message):
+    """Read a node's log. Answered by :class:`LogChunk`."""
+
+    request: int
+    id: str
+    node: str
+    """Node tag; empty for the environment's own log."""
+    offset: int = 0
+    """Negative: that many bytes before the end."""
+    limit: int = 65536
+
+
+ToMaster = Union[Hello, Status, Gone, Fault, Usage, Login, Left, ClientRequest, LogChunk]
+ToTaskSet = Union[Welcome, Refused, Sync, Put, Drop, Notify, LoginReply, ClientReply, ReadLog]
+
+_encoder = msgspec.json.Encoder()
+_to_master = msgspec.json.Decoder(ToMaster)
+_to_task_set = msgspec.json.Decoder(ToTaskSet)
+
+
+def encode(message: ToMaster | ToTaskSet) -> str:
+    """Write a message as a text frame."""
+    return _encoder.encode(message).decode()
+
+
+def decode_to_master(text: str | bytes) -> ToMaster:
+    """Read a message that came from a task set.
+
+    Raises:
+        msgspec.ValidationError: It is none; the text names the place.
+    """
+    return _to_master.decode(text)
+
+
+def decode_to_task_set(text: str | bytes) -> ToTaskSet:
+    """Read a message that came from the master.
+
+    Raises:
+        msgspec.ValidationError: It is none; the text names the place.
+    """
+    return _to_task_set.decode(text)

@@ -1,0 +1,1 @@
+"""The protocol between a client and its robot endpoint: vocabulary, messages, binary assembler (sans-I/O)."""
