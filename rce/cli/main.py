@@ -1,0 +1,49 @@
+"""Puts the ``rce`` program together from the commands that the packages plug in.
+
+A package adds a command by an entry point of the group ``rce.commands``: the entry point's name is the
+command, its value a function or a :class:`typer.Typer` of subcommands. So ``rce`` imports no package above it.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+import typer
+
+from rce import __version__
+
+GROUP = "rce.commands"
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"rce {__version__}")
+        raise typer.Exit
+
+
+def _root(
+    version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
+) -> None:
+    """RCE, a cloud robotics engine: run it, look into it, drive a fleet on it."""
+
+
+def build_app(points: list[EntryPoint]) -> typer.Typer:
+    """Make the program with the given commands in it."""
+    app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+    app.callback()(_root)
+    for point in points:
+        plugged: Any = point.load()
+        if isinstance(plugged, typer.Typer):
+            app.add_typer(plugged, name=point.name)
+        else:
+            app.command(name=point.name)(plugged)
+    return app
+
+
+def main() -> None:
+    """Run the ``rce`` program. A command that is named first is the only one that gets imported."""
+    points = sorted(entry_points(group=GROUP), key=lambda point: point.name)
+    asked = [point for point in points if point.name == sys.argv[1]] if len(sys.argv) > 1 else []
+    build_app(asked or points)(prog_name="rce")

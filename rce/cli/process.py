@@ -1,0 +1,103 @@
+"""A child program under supervision: started, read line by line, ended by escalation."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ctypes
+import os
+import signal
+import sys
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from typing import Final
+
+_PR_SET_PDEATHSIG: Final = 1
+_libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
+
+STOP_TIMEOUT_S = 20.0
+KILL_TIMEOUT_S = 5.0
+MAX_LINE = 1 << 20
+
+
+def _end_with_parent() -> None:
+    """Runs in the child: ask the kernel for a SIGTERM when the supervisor dies, however it dies."""
+    if _libc is not None:
+        _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+class Child:
+    """A running program. Its output is read by :meth:`lines`; it ends with its supervisor."""
+
+    def __init__(self, name: str, process: asyncio.subprocess.Process) -> None:
+        self.name = name
+        self._process = process
+
+    @classmethod
+    async def start(cls, name: str, argv: Sequence[str], *, env: Mapping[str, str] | None = None) -> Child:
+        """Start a program in its own session, so that a Ctrl-C at the terminal reaches the supervisor only.
+
+        Raises:
+            OSError: It cannot be started.
+        """
+        process = await asyncio.create_subprocess_exec(
+            *argv,
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.STDOUT,
+            env={**os.environ, "PYTHONUNBUFFERED": "1", **(env or {})},
+            start_new_session=True,
+            preexec_fn=_end_with_parent,
+            limit=MAX_LINE,
+        )
+        return cls(name, process)
+
+    @property
+    def pid(self) -> int:
+        """The process id."""
+        return self._process.pid
+
+    @property
+    def returncode(self) -> int | None:
+        """The exit code, or None while it runs."""
+        return self._process.returncode
+
+    async def lines(self) -> AsyncIterator[str]:
+        """Yield what the program prints, until it closes its output."""
+        assert self._process.stdout is not None
+        while True:
+            try:
+                line = await self._process.stdout.readline()
+            except ValueError:
+                yield f"(a line longer than {MAX_LINE} bytes was left out)"
+                continue
+            if not line:
+                return
+            yield line.decode(errors="replace").rstrip("\n")
+
+    async def wait(self) -> int:
+        """Wait for its end; returns the exit code."""
+        return await self._process.wait()
+
+    async def stop(self, *, timeout: float = STOP_TIMEOUT_S) -> None:
+        """End it: SIGTERM, and SIGKILL for its whole group after ``timeout`` seconds."""
+        if self.returncode is None:
+            self._signal(signal.SIGTERM)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(timeout):
+                    await self.wait()
+        if self.returncode is None:
+            self._signal(signal.SIGKILL)
+            async with asyncio.timeout(KILL_TIMEOUT_S):
+                await self.wait()
+
+    def _signal(self, number: signal.Signals) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.pid, number)
+
+
+async def relay(child: Child, show: Callable[[str], None], ready: asyncio.Event | None = None) -> None:
+    """Show a child's lines; set ``ready`` at its first line that says so."""
+    async for line in child.lines():
+        show(f"[{child.name}] {line}")
+        if ready is not None and " ready: " in line:
+            ready.set()

@@ -1,0 +1,89 @@
+"""Keeps programs running: starts them in order, restarts one that dies, ends all in reverse order."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from rce.cli.process import Child, relay
+
+RESTART_DELAY_S = 0.2
+RESTART_DELAY_MAX_S = 5.0
+STABLE_AFTER_S = 10.0
+READY_TIMEOUT_S = 30.0
+OUTPUT_TIMEOUT_S = 1.0
+"""How long the output of an ended program is read on; something that it started may hold it open."""
+
+
+class StartError(Exception):
+    """A program did not come up."""
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """A program to keep running. It prints a line holding ``ready:`` once it can be used."""
+
+    name: str
+    argv: Sequence[str]
+    env: Mapping[str, str] = field(default_factory=dict)
+
+
+class Supervisor:
+    """Runs programs until it is cancelled. ``show`` gets every line they print."""
+
+    def __init__(self, programs: Sequence[Program], show: Callable[[str], None]) -> None:
+        self._programs = programs
+        self._show = show
+
+    async def run(self, on_ready: Callable[[], None]) -> None:
+        """Start all programs, call ``on_ready`` once all are up, and keep them up until cancelled.
+
+        Raises:
+            StartError: A program ended, or was not ready in time, at the first start.
+        """
+        async with asyncio.TaskGroup() as group:
+            keepers: list[tuple[asyncio.Task[None], asyncio.Event]] = []
+            try:
+                for program in self._programs:
+                    ready = asyncio.Event()
+                    keepers.append((group.create_task(self._keep(program, ready), name=program.name), ready))
+                    await self._until_ready(program, ready)
+                on_ready()
+                await asyncio.Event().wait()
+            finally:
+                for task, _ in reversed(keepers):
+                    task.cancel()
+                    await asyncio.wait([task])
+
+    async def _until_ready(self, program: Program, ready: asyncio.Event) -> None:
+        try:
+            async with asyncio.timeout(READY_TIMEOUT_S):
+                await ready.wait()
+        except TimeoutError:
+            raise StartError(f"{program.name} was not ready within {READY_TIMEOUT_S:.0f} s") from None
+
+    async def _keep(self, program: Program, ready: asyncio.Event) -> None:
+        loop = asyncio.get_running_loop()
+        delay = RESTART_DELAY_S
+        while True:
+            started = loop.time()
+            code = await self._run_once(program, ready)
+            if not ready.is_set():
+                raise StartError(f"{program.name} ended with exit code {code} before it was ready")
+            if loop.time() - started > STABLE_AFTER_S:
+                delay = RESTART_DELAY_S
+            self._show(f"[up] {program.name} ended with exit code {code}; starting it again in {delay:.1f} s")
+            await asyncio.sleep(delay)
+            delay = min(2 * delay, RESTART_DELAY_MAX_S)
+
+    async def _run_once(self, program: Program, ready: asyncio.Event) -> int:
+        child = await Child.start(program.name, program.argv, env=program.env)
+        reader = asyncio.create_task(relay(child, self._show, ready))
+        try:
+            return await child.wait()
+        finally:
+            await child.stop()
+            await asyncio.wait([reader], timeout=OUTPUT_TIMEOUT_S)
+            reader.cancel()
+            await asyncio.gather(reader, return_exceptions=True)

@@ -1,0 +1,133 @@
+"""What every test gets: tool markers, and a check that nothing is leaked."""
+
+from __future__ import annotations
+
+import gc
+import os
+import shutil
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+
+import psutil
+import pytest
+
+REQUIRE_ALL = os.environ.get("RCE_REQUIRE_ALL") == "1"
+LEAK_PATIENCE_S = 3.0
+
+
+def _runs(*argv: str) -> bool:
+    try:
+        return subprocess.run(argv, capture_output=True, timeout=30, check=False).returncode == 0
+    except OSError:
+        return False
+
+
+_CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
+    "bwrap": (
+        lambda: _runs("bwrap", "--unshare-all", "--ro-bind", "/", "/", "true"),
+        "bubblewrap is not installed or may not make namespaces here (Debian: bubblewrap)",
+    ),
+    "rospy": (
+        lambda: _runs("/usr/bin/python3", "-c", "import rospy"),
+        "ROS 1 is not installed (Debian: python3-rospy ros-core)",
+    ),
+    "rostopic": (lambda: shutil.which("rostopic") is not None, "rostopic is missing (Debian: python3-rostopic)"),
+    "chromium": (lambda: chromium_path() is not None, "Chromium is not installed (Debian: chromium)"),
+    "pymunk": (lambda: _runs("python3", "-c", "") and _importable("pymunk"), "the extra 'fleet' is not installed"),
+    "data": (lambda: data_folder() is not None, "the folder of public maps and logs is absent (set RCE_DATA)"),
+    "root": (lambda: os.geteuid() == 0, "needs root"),
+}
+
+
+def _importable(module: str) -> bool:
+    import importlib.util
+
+    return importlib.util.find_spec(module) is not None
+
+
+def chromium_path() -> str | None:
+    """The browser to test the page with."""
+    return shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+def data_folder() -> Path | None:
+    """The folder of public maps and lidar logs, if it is there."""
+    folder = Path(os.environ.get("RCE_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    return folder if folder.is_dir() else None
+
+
+@cache
+def missing(tool: str) -> str | None:
+    """Why ``tool`` cannot be used here, or None."""
+    check, reason = _CHECKS[tool]
+    return None if check() else reason
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    for marker in item.iter_markers("needs"):
+        for tool in marker.args:
+            reason = missing(tool)
+            if reason is None:
+                continue
+            if REQUIRE_ALL:
+                pytest.fail(f"{reason}; a skip is a failure here (RCE_REQUIRE_ALL=1)", pytrace=False)
+            pytest.skip(reason)
+
+
+@pytest.fixture(scope="session")
+def rce_data() -> Path:
+    """The folder of public maps and lidar logs."""
+    folder = data_folder()
+    if folder is None:
+        pytest.skip("the folder of public maps and logs is absent (set RCE_DATA)")
+    return folder
+
+
+def _descriptors() -> dict[int, str]:
+    found = {}
+    for entry in Path("/proc/self/fd").iterdir():
+        try:
+            found[int(entry.name)] = str(entry.readlink())
+        except OSError:
+            continue
+    return found
+
+
+def _leaks(fds: dict[int, str], children: set[int], threads: set[threading.Thread]) -> list[str]:
+    found = [
+        f"descriptor {fd} -> {target}"
+        for fd, target in _descriptors().items()
+        if fds.get(fd) != target and not target.startswith(("/dev/", "anon_inode:", "/proc/")) and "__pycache__" not in target
+    ]
+    found += [
+        f"process {child.pid} {child.name()}"
+        for child in psutil.Process().children(recursive=True)
+        if child.pid not in children
+    ]
+    found += [
+        f"thread {thread.name}"
+        for thread in threading.enumerate()
+        if thread not in threads and thread.is_alive() and not thread.daemon and not thread.name.startswith("asyncio_")
+    ]
+    return found
+
+
+@pytest.fixture(autouse=True)
+def _no_leaks(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Fail a test that leaves a descriptor, a process or a thread behind."""
+    if "shared_engine" in request.fixturenames:
+        yield
+        return
+    fds, threads = _descriptors(), set(threading.enumerate())
+    children = {child.pid for child in psutil.Process().children(recursive=True)}
+    yield
+    deadline = time.monotonic() + LEAK_PATIENCE_S
+    while leaks := _leaks(fds, children, threads):
+        if time.monotonic() > deadline:
+            pytest.fail("left behind: " + "; ".join(leaks))
+        gc.collect()
+        time.sleep(0.05)
