@@ -1,0 +1,1 @@
+"""The client side: :class:`rce_client.connection.Connection`, and ``rce-ros``, which bridges a ROS graph."""

@@ -1,0 +1,207 @@
+"""What waits to be sent to one robot: two lanes, bounded, fair among interfaces (sans-I/O).
+
+* The *control lane* carries what is small and urgent: ``ST``, ``ER``, small service messages. It always
+  goes first and is never thinned out: when it is full, the sender is told.
+* The *data lane* holds one queue per interface. Interfaces take turns by deficit round robin, so that a
+  stream of 10 MB images leaves room for every small message that comes meanwhile.
+
+A robot that stops reading fills its own queues and nothing else. A topic's queue then forgets its oldest
+message for every new one and counts it; a service's queue refuses, so that the caller learns of it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import dataclass
+from enum import Enum
+
+Buffer = bytes | bytearray | memoryview
+
+
+class Overflow(Enum):
+    """What a full queue does with a new message."""
+
+    DROP_OLDEST = "drop oldest"
+    """Forget the oldest message and count it. Topics."""
+    REFUSE = "refuse"
+    """Take no more; the sender is told. Services."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outgoing:
+    """One message as it goes over the WebSocket: a JSON text and the binary frames it names."""
+
+    text: bytes
+    """UTF-8."""
+    binaries: tuple[Buffer, ...] = ()
+
+    @property
+    def size(self) -> int:
+        """Payload bytes of all its frames."""
+        return len(self.text) + sum(len(binary) for binary in self.binaries)
+
+
+@dataclass(frozen=True, slots=True)
+class OutboxLimits:
+    """How much may wait for one robot. A queue always takes one message, however large."""
+
+    queue_messages: int = 128
+    """Messages per interface."""
+    queue_bytes: int = 16 << 20
+    """Bytes per interface."""
+    total_bytes: int = 64 << 20
+    """Bytes of all interfaces together; topics make room, services may add their own queue to it."""
+    control_messages: int = 4096
+    control_bytes: int = 8 << 20
+    quantum: int = 256 << 10
+    """Bytes an interface may send per turn while others wait."""
+
+
+class _Flow:
+    """The queue of one interface in the data lane. ``credit`` is what it may send now, in bytes."""
+
+    __slots__ = ("bytes", "credit", "messages", "overflow", "tag")
+
+    def __init__(self, tag: str, overflow: Overflow) -> None:
+        self.tag = tag
+        self.overflow = overflow
+        self.messages: deque[tuple[Outgoing, int]] = deque()
+        self.bytes = 0
+        self.credit = 0
+
+    def push(self, message: Outgoing, size: int) -> None:
+        self.messages.append((message, size))
+        self.bytes += size
+
+    def pop(self) -> tuple[Outgoing, int]:
+        message, size = self.messages.popleft()
+        self.bytes -= size
+        return message, size
+
+
+class Outbox:
+    """The queues between a robot's interfaces and its connection.
+
+    Invariants: a flow is in ``_ring`` exactly while it holds messages; ``_data_bytes`` is the sum of the
+    flows' bytes; no queue is over its limits by more than one message.
+    """
+
+    def __init__(self, limits: OutboxLimits = OutboxLimits()) -> None:
+        self._limits = limits
+        self._control: deque[tuple[Outgoing, int]] = deque()
+        self._control_bytes = 0
+        self._states: dict[str, Outgoing] = {}
+        self._flows: dict[str, _Flow] = {}
+        self._ring: deque[_Flow] = deque()
+        self._data_bytes = 0
+        self.dropped: Counter[str] = Counter()
+        """Interface tag to the number of its messages that were thrown away."""
+
+    def __bool__(self) -> bool:
+        return bool(self._states or self._control or self._ring)
+
+    @property
+    def bytes(self) -> int:
+        """Bytes that wait in both lanes."""
+        return self._control_bytes + self._data_bytes
+
+    def put_state(self, key: str, message: Outgoing) -> None:
+        """Queue a statement that makes an earlier, unsent one of the same ``key`` obsolete (``ST``)."""
+        self._states[key] = message
+
+    def put_control(self, message: Outgoing) -> bool:
+        """Queue a small urgent message.
+
+        Returns:
+            False if the lane is full and the message was not taken.
+        """
+        size = message.size
+        if self._control and (
+            len(self._control) >= self._limits.control_messages
+            or self._control_bytes + size > self._limits.control_bytes
+        ):
+            return False
+        self._control.append((message, size))
+        self._control_bytes += size
+        return True
+
+    def put_data(self, tag: str, message: Outgoing, overflow: Overflow = Overflow.DROP_OLDEST) -> bool:
+        """Queue a message of the interface ``tag``; its first message settles the queue's ``overflow``.
+
+        Returns:
+            False if the queue is full and refuses.
+        """
+        size = message.size
+        flow = self._flows.get(tag)
+        if flow is None:
+            flow = self._flows[tag] = _Flow(tag, overflow)
+        if flow.overflow is Overflow.REFUSE and self._over(flow, size):
+            return False
+        while self._over(flow, size):
+            self._drop(flow)
+        if self._data_bytes + size > self._limits.total_bytes:
+            self._make_room(size)
+        if not flow.messages:
+            self._ring.append(flow)
+        flow.push(message, size)
+        self._data_bytes += size
+        return True
+
+    def pop(self) -> Outgoing | None:
+        """Take the message to send next, None if nothing waits."""
+        if self._states:
+            key = next(iter(self._states))
+            return self._states.pop(key)
+        if self._control:
+            message, size = self._control.popleft()
+            self._control_bytes -= size
+            return message
+        if self._ring:
+            return self._pop_data()
+        return None
+
+    def discard(self, tag: str) -> None:
+        """Forget what waits for an interface that is gone."""
+        self._states.pop(tag, None)
+        flow = self._flows.pop(tag, None)
+        if flow is not None and flow.messages:
+            self._ring.remove(flow)
+            self._data_bytes -= flow.bytes
+
+    def _over(self, flow: _Flow, size: int) -> bool:
+        limits = self._limits
+        return bool(flow.messages) and (
+            len(flow.messages) >= limits.queue_messages or flow.bytes + size > limits.queue_bytes
+        )
+
+    def _make_room(self, size: int) -> None:
+        """Drop from whichever topic holds most, until ``size`` more bytes fit or no topic holds anything."""
+        while self._data_bytes + size > self._limits.total_bytes:
+            topics = [flow for flow in self._ring if flow.overflow is Overflow.DROP_OLDEST]
+            if not topics:
+                return
+            self._drop(max(topics, key=lambda flow: flow.bytes))
+
+    def _drop(self, flow: _Flow) -> None:
+        _, size = flow.pop()
+        self._data_bytes -= size
+        self.dropped[flow.tag] += 1
+        if not flow.messages:
+            self._ring.remove(flow)
+            flow.credit = 0
+
+    def _pop_data(self) -> Outgoing:
+        ring = self._ring
+        while True:
+            flow = ring[0]
+            if len(ring) == 1 or flow.messages[0][1] <= flow.credit:
+                break
+            flow.credit += self._limits.quantum
+            ring.rotate(-1)
+        message, size = flow.pop()
+        self._data_bytes -= size
+        flow.credit = max(0, flow.credit - size)
+        if not flow.messages:
+            ring.popleft()
+            flow.credit = 0
+        return message

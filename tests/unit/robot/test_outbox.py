@@ -1,0 +1,152 @@
+"""The outgoing queue of one robot."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rce_robot.outbox import Outbox, OutboxLimits, Outgoing, Overflow
+
+
+def message(text: str, extra: int = 0) -> Outgoing:
+    return Outgoing(text.encode(), (bytes(extra),) if extra else ())
+
+
+def drain(outbox: Outbox) -> list[str]:
+    texts = []
+    while (item := outbox.pop()) is not None:
+        texts.append(item.text.decode())
+    return texts
+
+
+def test_keeps_the_order_within_an_interface() -> None:
+    outbox = Outbox()
+    for index in range(5):
+        assert outbox.put_data("pose", message(str(index)))
+    assert drain(outbox) == list("01234")
+    assert not outbox
+
+
+def test_control_goes_before_data() -> None:
+    outbox = Outbox()
+    outbox.put_data("pose", message("data"))
+    outbox.put_control(message("control"))
+    outbox.put_state("pose", message("state"))
+    assert drain(outbox) == ["state", "control", "data"]
+
+
+def test_a_newer_state_replaces_an_unsent_one() -> None:
+    outbox = Outbox()
+    outbox.put_state("pose", message("on"))
+    outbox.put_state("scan", message("scan on"))
+    outbox.put_state("pose", message("off"))
+    assert drain(outbox) == ["off", "scan on"]
+
+
+def test_a_full_topic_forgets_its_oldest_and_counts() -> None:
+    outbox = Outbox(OutboxLimits(queue_messages=3))
+    for index in range(10):
+        assert outbox.put_data("image", message(str(index)))
+    assert outbox.dropped == {"image": 7}
+    assert drain(outbox) == list("789")
+
+
+def test_a_full_topic_leaves_others_alone() -> None:
+    outbox = Outbox(OutboxLimits(queue_bytes=1000))
+    outbox.put_data("pose", message("pose"))
+    for _ in range(100):
+        outbox.put_data("image", message("image", 400))
+    assert outbox.dropped == {"image": 98}
+    assert sorted(drain(outbox)) == ["image", "image", "pose"]
+
+
+def test_takes_one_message_however_large() -> None:
+    outbox = Outbox(OutboxLimits(queue_bytes=10, total_bytes=10))
+    assert outbox.put_data("image", message("first", 1000))
+    assert outbox.put_data("image", message("second", 1000))
+    assert drain(outbox) == ["second"]
+
+
+def test_a_full_service_refuses() -> None:
+    outbox = Outbox(OutboxLimits(queue_messages=2))
+    assert outbox.put_data("map", message("1"), Overflow.REFUSE)
+    assert outbox.put_data("map", message("2"), Overflow.REFUSE)
+    assert not outbox.put_data("map", message("3"), Overflow.REFUSE)
+    assert drain(outbox) == ["1", "2"]
+    assert not outbox.dropped
+
+
+def test_the_total_is_bounded_and_the_fattest_topic_pays() -> None:
+    outbox = Outbox(OutboxLimits(queue_bytes=1000, total_bytes=1500))
+    outbox.put_data("service", message("s", 400), Overflow.REFUSE)
+    outbox.put_data("pose", message("p"))
+    for tag in ("left", "right"):
+        for _ in range(4):
+            outbox.put_data(tag, message(tag, 200))
+    assert outbox.bytes <= 1500
+    assert "pose" not in outbox.dropped
+    assert "service" not in outbox.dropped
+
+
+def test_full_control_lane_says_so() -> None:
+    outbox = Outbox(OutboxLimits(control_messages=2))
+    assert outbox.put_control(message("1"))
+    assert outbox.put_control(message("2"))
+    assert not outbox.put_control(message("3"))
+
+
+def test_small_messages_pass_large_ones() -> None:
+    outbox = Outbox(OutboxLimits(quantum=1000))
+    for index in range(3):
+        outbox.put_data("image", message(f"image{index}", 10_000))
+    outbox.put_data("cancelGoal", message("cancel"))
+    outbox.put_data("pose", message("pose"))
+    assert drain(outbox)[:2] == ["cancel", "pose"]
+
+
+def test_discard_forgets_an_interface() -> None:
+    outbox = Outbox()
+    outbox.put_data("gone", message("x"))
+    outbox.put_data("stays", message("y"))
+    outbox.put_state("gone", message("z"))
+    outbox.discard("gone")
+    outbox.discard("never there")
+    assert drain(outbox) == ["y"]
+    assert outbox.bytes == 0
+
+
+@pytest.mark.parametrize("overflow", list(Overflow))
+@given(
+    operations=st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 300), st.booleans()), max_size=60)
+)
+def test_nothing_is_lost_uncounted_and_memory_is_bounded(
+    overflow: Overflow, operations: list[tuple[str, int, bool]]
+) -> None:
+    limits = OutboxLimits(queue_messages=4, queue_bytes=500, total_bytes=900, quantum=64)
+    outbox = Outbox(limits)
+    put: dict[str, list[int]] = {"a": [], "b": [], "c": []}
+    got: dict[str, list[int]] = {"a": [], "b": [], "c": []}
+    refused = 0
+
+    def take() -> None:
+        item = outbox.pop()
+        if item is not None:
+            tag, _, number = item.text.decode().partition(":")
+            got[tag].append(int(number))
+
+    for number, (tag, size, pop) in enumerate(operations):
+        if outbox.put_data(tag, message(f"{tag}:{number}", size), overflow):
+            put[tag].append(number)
+        else:
+            refused += 1
+        assert outbox.bytes <= 3 * (500 + 310)
+        if pop:
+            take()
+    while outbox:
+        take()
+    for tag in "abc":
+        assert got[tag] == sorted(got[tag])
+        assert len(put[tag]) == len(got[tag]) + outbox.dropped[tag]
+    assert outbox.bytes == 0
+    assert refused == 0 or overflow is Overflow.REFUSE
