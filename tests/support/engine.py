@@ -1,0 +1,229 @@
+"""A real engine for end-to-end tests: master, robot and container task sets as separate processes."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import shutil
+import signal
+import socket
+import sys
+import tempfile
+import urllib.request
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+READY_TIMEOUT_S = 30.0
+STOP_TIMEOUT_S = 30.0
+
+
+def free_ports(count: int) -> list[int]:
+    """Find TCP ports that nobody uses now."""
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
+    ports = [sock.getsockname()[1] for sock in sockets]
+    for sock in sockets:
+        sock.close()
+    return ports
+
+
+async def until(
+    condition: Callable[[], Any | Awaitable[Any]], *, timeout: float = 15.0, what: str = "condition"
+) -> Any:
+    """Wait until ``condition`` gives something true, and return it."""
+    loop = asyncio.get_running_loop()
+    deadline = loop.time() + timeout
+    while True:
+        found = condition()
+        if isinstance(found, Awaitable):
+            found = await found
+        if found:
+            return found
+        if loop.time() > deadline:
+            raise AssertionError(f"{what}: not within {timeout:.0f} s (last: {found!r})")
+        await asyncio.sleep(0.05)
+
+
+class Program:
+    """A program of the engine as a process, its output kept in a file."""
+
+    def __init__(self, name: str, argv: list[str], env: dict[str, str], folder: Path) -> None:
+        self.name = name
+        self.argv = argv
+        self.env = env
+        self.log = folder / f"{name}.log"
+        self.process: asyncio.subprocess.Process | None = None
+
+    @property
+    def pid(self) -> int:
+        assert self.process is not None
+        return self.process.pid
+
+    @property
+    def running(self) -> bool:
+        return self.process is not None and self.process.returncode is None
+
+    def output(self) -> str:
+        return self.log.read_text(errors="replace") if self.log.exists() else ""
+
+    async def start(self, *, ready: str = " ready: ", timeout: float = READY_TIMEOUT_S) -> None:
+        offset = self.log.stat().st_size if self.log.exists() else 0
+        with self.log.open("ab") as log:
+            self.process = await asyncio.create_subprocess_exec(
+                *self.argv, stdin=asyncio.subprocess.DEVNULL, stdout=log, stderr=log, env=self.env, start_new_session=True
+            )
+
+        def is_ready() -> bool:
+            assert self.running, f"{self.name} ended with {self.process and self.process.returncode}:\n{self.output()}"
+            with self.log.open("rb") as log:
+                log.seek(offset)
+                return ready.encode() in log.read()
+
+        await until(is_ready, timeout=timeout, what=f"{self.name} is ready\n{self.output()}")
+
+    async def kill(self) -> None:
+        """Kill -9."""
+        assert self.process is not None
+        self.process.kill()
+        await self.process.wait()
+
+    async def stop(self) -> int:
+        """SIGTERM and wait."""
+        assert self.process is not None
+        with contextlib.suppress(ProcessLookupError):
+            self.process.send_signal(signal.SIGTERM)
+        try:
+            async with asyncio.timeout(STOP_TIMEOUT_S):
+                return await self.process.wait()
+        except TimeoutError:
+            self.process.kill()
+            await self.process.wait()
+            raise AssertionError(f"{self.name} did not stop on SIGTERM:\n{self.output()}") from None
+
+
+class Engine:
+    """Master, robot and container task sets on ports of their own."""
+
+    def __init__(self, folder: Path, *, runtime: str = "process", robots: int = 1) -> None:
+        self.folder = folder
+        self.http_port, self.control_port, *rest = free_ports(3 + 2 * robots)
+        self.runtime = runtime
+        self.container_link_port = rest[0]
+        self.robot_ports = [tuple(rest[1 + 2 * i : 3 + 2 * i]) for i in range(robots)]
+        self.env = {
+            **{key: value for key, value in os.environ.items() if not key.startswith(("RCE_", "ROS_"))},
+            "PYTHONUNBUFFERED": "1",
+            "XDG_RUNTIME_DIR": str(folder),
+            "RCE_SECRET": "a secret for the tests",
+        }
+        self.master = self._program(
+            "rce-master",
+            *("--http-port", self.http_port, "--control-port", self.control_port),
+            *("--state-dir", folder / "master", "--dev"),
+        )
+        self.robots = [
+            self._program(
+                "rce-robot",
+                "127.0.0.1",
+                *("--control-port", self.control_port, "--ws-port", ws, "--link-port", link, "--dev"),
+                name=f"rce-robot-{number}",
+            )
+            for number, (ws, link) in enumerate(self.robot_ports)
+        ]
+        self.container = self._program(
+            "rce-container",
+            "127.0.0.1",
+            *("--control-port", self.control_port, "--link-port", self.container_link_port),
+            *("--state-dir", folder / "container", "--runtime", runtime, "--dev"),
+        )
+
+    def _program(self, program: str, *args: object, name: str = "") -> Program:
+        argv = [str(Path(sys.executable).parent / program), *map(str, args)]
+        return Program(name or program, argv, self.env, self.folder)
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.http_port}/"
+
+    @property
+    def programs(self) -> list[Program]:
+        return [self.master, *self.robots, self.container]
+
+    async def start(self) -> None:
+        for program in self.programs:
+            await program.start()
+        await until(self.accepts_robots, what="the master hands out a robot process")
+
+    def accepts_robots(self) -> bool:
+        try:
+            self.get("/?userID=testUser&version=20130902", token="")
+        except OSError:
+            return False
+        return True
+
+    async def stop(self) -> None:
+        for program in reversed(self.programs):
+            if program.running:
+                await program.stop()
+
+    def get(self, path: str, *, token: str | None = None) -> Any:
+        """GET from the master's HTTP server; JSON comes back decoded."""
+        headers = {"Authorization": f"Bearer {self.token() if token is None else token}"} if token != "" else {}
+        with urllib.request.urlopen(  # noqa: S310
+            urllib.request.Request(self.url.rstrip("/") + path, headers=headers), timeout=10
+        ) as reply:
+            text = reply.read().decode()
+            return json.loads(text) if "json" in reply.headers.get("Content-Type", "") else text
+
+    def token(self) -> str:
+        request = urllib.request.Request(
+            f"{self.url}api/v1/login",
+            data=json.dumps({"userID": "testUser", "password": "testUser"}).encode(),
+            headers={"Content-Type": "application/json"},
+        )
+        with urllib.request.urlopen(request, timeout=10) as reply:  # noqa: S310
+            return str(json.loads(reply.read())["token"])
+
+    def processes_of(self, needle: str) -> list[psutil.Process]:
+        """Processes of this engine whose command line or environment holds ``needle``."""
+        return [process for process in engine_processes(self.folder) if needle in " ".join(process.cmdline())]
+
+
+def engine_processes(folder: Path) -> list[psutil.Process]:
+    """All processes that an engine with this folder started, whoever their parent is now."""
+    found = []
+    for process in psutil.process_iter():
+        try:
+            if str(folder) in " ".join(process.cmdline()) or process.environ().get("XDG_RUNTIME_DIR") == str(folder):
+                found.append(process)
+        except (psutil.NoSuchProcess, psutil.AccessDenied, psutil.ZombieProcess):
+            continue
+    return found
+
+
+@contextlib.asynccontextmanager
+async def running_engine(**options: Any) -> AsyncIterator[Engine]:
+    """Run an engine, and check at its end that it leaves nothing."""
+    folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
+    engine = Engine(folder, **options)
+    try:
+        await engine.start()
+        yield engine
+    except BaseException:
+        for program in engine.programs:
+            print(f"----- {program.name}\n{program.output()[-8000:]}")  # noqa: T201
+        raise
+    finally:
+        await engine.stop()
+        left = engine_processes(folder)
+        for process in left:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                process.kill()
+        mounts = [line for line in Path("/proc/mounts").read_text().splitlines() if str(folder) in line]
+        shutil.rmtree(folder, ignore_errors=True)
+    assert not left, f"processes left behind: {left}"
+    assert not mounts, f"mounts left behind: {mounts}"
