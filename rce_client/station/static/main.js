@@ -1,0 +1,113 @@
+// Joins model, view and panel with the station: a socket for what happens, HTTP for what the operator wants.
+
+import { Fleet } from "./model.js";
+import { Panel } from "./panel.js";
+import { View } from "./view.js";
+
+const fleet = new Fleet();
+const canvas = document.querySelector("#map");
+const view = new View(canvas, fleet);
+const panel = new Panel(fleet);
+const badge = document.querySelector("#link");
+const message = document.querySelector("#message");
+const toolBlock = document.querySelector("#tool-block");
+const toolGoal = document.querySelector("#tool-goal");
+
+function say(text, bad = false) {
+  message.textContent = text;
+  message.className = bad ? "bad" : "";
+}
+
+async function request(method, path, body) {
+  try {
+    const response = await fetch(path, {
+      method,
+      headers: { "Content-Type": "application/json" },
+      body: body === undefined ? undefined : JSON.stringify(body),
+    });
+    const answer = await response.json();
+    if (!response.ok) throw new Error(answer.error ?? response.statusText);
+    say(answer.message);
+  } catch (error) {
+    say(error.message, true);
+    panel.addEvent(error.message, "bad");
+  }
+}
+
+function act(cell) {
+  if (fleet.selected) {
+    const robot = fleet.selected;
+    fleet.select(robot);
+    return request("PUT", `/api/v1/robots/${robot}/goal`, { cell });
+  }
+  const blocked = fleet.blocked.has(cell) || fleet.pending.has(cell);
+  return request("PUT", `/api/v1/cells/${cell}`, { blocked: !blocked });
+}
+
+canvas.addEventListener("click", (event) => {
+  if (!fleet.map) return;
+  const [x, y] = view.worldAt(event);
+  const robot = fleet.robotAt(x, y, 0.35 * fleet.map.cell_size);
+  if (robot) return fleet.select(robot.id);
+  const cell = fleet.cellAt(x, y);
+  if (cell !== null) act(cell);
+});
+
+canvas.addEventListener("pointermove", (event) => {
+  if (fleet.map) view.cursor = fleet.cellAt(...view.worldAt(event));
+});
+canvas.addEventListener("pointerleave", () => { view.cursor = null; });
+
+canvas.addEventListener("keydown", (event) => {
+  if (!fleet.map) return;
+  const { rows, columns, y_up } = fleet.map;
+  const up = y_up ? columns : -columns;
+  const steps = { ArrowLeft: -1, ArrowRight: 1, ArrowUp: up, ArrowDown: -up };
+  if (event.key in steps) {
+    const next = (view.cursor ?? 0) + steps[event.key];
+    if (next >= 0 && next < rows * columns) view.cursor = next;
+  } else if (event.key === "Enter" && view.cursor !== null) {
+    act(view.cursor);
+  } else {
+    return;
+  }
+  event.preventDefault();
+});
+
+toolBlock.addEventListener("click", () => { if (fleet.selected) fleet.select(fleet.selected); });
+
+fleet.addEventListener("selected", () => {
+  toolBlock.setAttribute("aria-pressed", fleet.selected === null);
+  toolGoal.setAttribute("aria-pressed", fleet.selected !== null);
+  toolGoal.disabled = fleet.selected === null;
+  toolGoal.textContent = fleet.selected ? `Send ${fleet.selected}: click its goal` : "Pick a robot to send it";
+});
+
+fleet.addEventListener("map", () => {
+  canvas.style.aspectRatio = `${fleet.map.columns} / ${fleet.map.rows}`;
+});
+
+function connect(delay = 500) {
+  const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/v1/live`);
+  let opened = false;
+  socket.addEventListener("open", () => {
+    opened = true;
+    badge.textContent = "live";
+    badge.classList.add("live");
+  });
+  socket.addEventListener("message", (event) => {
+    const received = JSON.parse(event.data);
+    fleet.apply(received);
+    if (received.type === "event") panel.addEvent(received.text, received.tone);
+  });
+  socket.addEventListener("close", () => {
+    badge.textContent = "connecting";
+    badge.classList.remove("live");
+    setTimeout(connect, delay * (0.5 + Math.random()), opened ? 500 : Math.min(2 * delay, 8000));
+  });
+}
+
+connect();
+
+// For automated tests of the page.
+window.rceFleet = { fleet, view };

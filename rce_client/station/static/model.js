@@ -1,0 +1,102 @@
+// What the page knows of the fleet. Fed by messages of the station's socket; knows nothing of the screen.
+
+export const TRAIL_LENGTH = 240;
+
+export class Fleet extends EventTarget {
+  map = null;          // {rows, columns, cell_size, origin: [x, y], y_up}
+  robots = new Map();  // id -> {id, state, cell, goal, plan, granted, replans, pose, seen, trail}
+  blocked = new Set();
+  pending = new Set();
+  engine = null;
+  selected = null;
+
+  apply(message) {
+    const handler = this[`on_${message.type}`];
+    if (handler) {
+      handler.call(this, message);
+      this.dispatchEvent(new Event(message.type));
+    }
+  }
+
+  on_map(message) {
+    this.map = message;
+  }
+
+  on_state(message) {
+    this.blocked = new Set(message.blocked);
+    this.pending = new Set(message.pending);
+    const present = new Set();
+    for (const state of message.robots) {
+      present.add(state.id);
+      Object.assign(this.#robot(state.id), state);
+    }
+    for (const id of this.robots.keys()) {
+      if (!present.has(id)) this.robots.delete(id);
+    }
+    if (this.selected && !present.has(this.selected)) this.selected = null;
+  }
+
+  on_poses(message) {
+    for (const [id, [x, y, theta]] of Object.entries(message.poses)) {
+      const robot = this.#robot(id);
+      robot.pose = { x, y, theta };
+      robot.shown ??= { x, y, theta };
+      robot.seen = performance.now();
+      const last = robot.trail.at(-1);
+      if (!last || Math.hypot(last[0] - x, last[1] - y) > 0.05) {
+        robot.trail.push([x, y]);
+        if (robot.trail.length > TRAIL_LENGTH) robot.trail.shift();
+      }
+    }
+  }
+
+  on_engine(message) {
+    this.engine = message;
+  }
+
+  on_event() {}
+
+  select(id) {
+    this.selected = this.selected === id ? null : id;
+    this.dispatchEvent(new Event("selected"));
+  }
+
+  robotAt(x, y, radius) {
+    let best = null;
+    let nearest = radius;
+    for (const robot of this.robots.values()) {
+      if (!robot.pose) continue;
+      const distance = Math.hypot(robot.pose.x - x, robot.pose.y - y);
+      if (distance <= nearest) [best, nearest] = [robot, distance];
+    }
+    return best;
+  }
+
+  cellAt(x, y) {
+    const { rows, columns, cell_size, origin, y_up } = this.map;
+    const column = Math.floor((x - origin[0]) / cell_size);
+    let row = Math.floor((y - origin[1]) / cell_size);
+    if (!y_up) row = rows - 1 - row;
+    return column >= 0 && column < columns && row >= 0 && row < rows ? row * columns + column : null;
+  }
+
+  centre(cell) {
+    const { rows, columns, cell_size, origin, y_up } = this.map;
+    const row = Math.floor(cell / columns);
+    const up = y_up ? row : rows - 1 - row;
+    return [origin[0] + ((cell % columns) + 0.5) * cell_size, origin[1] + (up + 0.5) * cell_size];
+  }
+
+  #robot(id) {
+    if (!this.robots.has(id)) {
+      this.robots.set(id, { id, state: "unknown", cell: null, goal: null, plan: [], granted: [], replans: 0, pose: null, shown: null, seen: null, trail: [] });
+    }
+    return this.robots.get(id);
+  }
+}
+
+// A colour that stays with a robot: hues spread by the golden angle over the robots' numbers.
+export function colourOf(id) {
+  const number = Number(id.replace(/\D+/g, "")) || [...id].reduce((sum, c) => sum + c.charCodeAt(0), 0);
+  return `hsl(${(205 + number * 137.508) % 360} 70% 50%)`;
+}

@@ -1,0 +1,89 @@
+// The tables beside the map: robots (those in trouble first), the engine, events.
+
+import { colourOf } from "./model.js";
+
+const TROUBLE = new Set(["unreachable", "silent", "lost", "stuck", "offline"]);
+const TONE = { running: "good", connected: "good", placed: "warn", starting: "warn", requested: "warn", absent: "warn", failed: "bad", lost: "bad", exited: "bad" };
+
+function element(tag, text = "", className = "") {
+  const made = document.createElement(tag);
+  made.textContent = text;
+  if (className) made.className = className;
+  return made;
+}
+
+function stateLine(label, state, detail = "") {
+  const item = element("li");
+  item.append(element("span", `${label} `), element("span", state, TONE[state] ?? "quiet"));
+  if (detail) item.append(element("span", ` ${detail}`, "quiet"));
+  return item;
+}
+
+export class Panel {
+  constructor(fleet) {
+    this.fleet = fleet;
+    this.body = document.querySelector("#robots tbody");
+    this.engine = document.querySelector("#engine");
+    this.events = document.querySelector("#events");
+    this.summary = document.querySelector("#summary");
+    for (const type of ["state", "selected"]) fleet.addEventListener(type, () => this.drawRobots());
+    fleet.addEventListener("engine", () => this.drawEngine());
+    setInterval(() => this.drawRobots(), 1000);
+  }
+
+  drawRobots() {
+    const robots = [...this.fleet.robots.values()];
+    robots.sort((a, b) => TROUBLE.has(b.state) - TROUBLE.has(a.state) || a.id.localeCompare(b.id, "en", { numeric: true }));
+    this.body.replaceChildren(...robots.map((robot) => this.#row(robot)));
+    const busy = robots.filter((robot) => robot.plan.length > 1).length;
+    this.summary.textContent = robots.length ? `${robots.length} robots, ${busy} on the way` : "no robots yet";
+  }
+
+  #row(robot) {
+    const row = element("tr");
+    row.dataset.robot = robot.id;
+    row.setAttribute("aria-selected", robot.id === this.fleet.selected);
+    const name = element("td");
+    const dot = element("span", "", "dot");
+    dot.style.background = colourOf(robot.id);
+    name.append(dot, robot.id);
+    const age = robot.seen === null ? null : (performance.now() - robot.seen) / 1000;
+    row.append(
+      name,
+      element("td", robot.state, TROUBLE.has(robot.state) ? "bad" : ""),
+      element("td", robot.cell ?? ""),
+      element("td", robot.goal ?? ""),
+      element("td", robot.replans),
+      element("td", age === null ? "never" : age < 2 ? "now" : `${Math.round(age)} s`, age === null || age > 2 ? "warn" : "quiet"),
+    );
+    row.addEventListener("click", () => this.fleet.select(robot.id));
+    return row;
+  }
+
+  drawEngine() {
+    const { engine } = this.fleet;
+    if (engine.error) {
+      this.engine.replaceChildren(element("p", engine.error, "bad"));
+      return;
+    }
+    const list = element("ul");
+    for (const container of engine.containers) {
+      const item = stateLine(container.tag, container.state, container.machine);
+      const nodes = element("ul");
+      for (const node of container.nodes) nodes.append(stateLine(node.tag, node.state, node.detail));
+      item.append(nodes);
+      list.append(item);
+    }
+    const up = engine.connections.filter((connection) => connection.established).length;
+    list.append(stateLine("connections", `${up} of ${engine.connections.length}`, "established"));
+    this.engine.replaceChildren(list);
+  }
+
+  addEvent(text, tone = "") {
+    const item = element("li");
+    const time = element("time", new Date().toLocaleTimeString());
+    item.append(time, element("span", text, tone));
+    this.events.prepend(item);
+    while (this.events.children.length > 100) this.events.lastChild.remove();
+  }
+}

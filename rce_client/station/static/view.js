@@ -1,0 +1,174 @@
+// Draws the world on a canvas: cells, boxes, plans, trails, robots. World metres, y up; the screen's y points down.
+
+import { colourOf } from "./model.js";
+
+const MARGIN = 0.15;    // of a cell, around the map
+const SMOOTHING = 0.25; // share of the way to the newest pose that a robot is moved in one frame
+
+export class View {
+  cursor = null; // cell under the pointer or the keyboard
+
+  constructor(canvas, fleet) {
+    this.canvas = canvas;
+    this.fleet = fleet;
+    this.context = canvas.getContext("2d");
+    new ResizeObserver(() => this.#resize()).observe(canvas);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.#readColours());
+    this.#readColours();
+    this.#resize();
+    const frame = () => { this.draw(); requestAnimationFrame(frame); };
+    requestAnimationFrame(frame);
+  }
+
+  worldAt(event) {
+    const box = this.canvas.getBoundingClientRect();
+    const ratio = this.canvas.width / box.width;
+    return [
+      ((event.clientX - box.left) * ratio - this.left) / this.scale,
+      (this.bottom - (event.clientY - box.top) * ratio) / this.scale,
+    ];
+  }
+
+  // Where the middle of a cell is on the page, in CSS pixels from the canvas' corner.
+  screenOf(cell) {
+    const [x, y] = this.fleet.centre(cell);
+    const ratio = this.canvas.width / this.canvas.getBoundingClientRect().width;
+    return [(this.left + x * this.scale) / ratio, (this.bottom - y * this.scale) / ratio];
+  }
+
+  #readColours() {
+    const style = getComputedStyle(document.documentElement);
+    this.colour = Object.fromEntries(
+      ["cell", "line", "blocked", "pending", "ink", "quiet", "accent", "bad"].map((name) => [name, style.getPropertyValue(`--${name}`).trim()]),
+    );
+  }
+
+  #resize() {
+    const ratio = window.devicePixelRatio || 1;
+    const box = this.canvas.getBoundingClientRect();
+    this.canvas.width = Math.max(1, Math.round(box.width * ratio));
+    this.canvas.height = Math.max(1, Math.round(box.height * ratio));
+  }
+
+  #fit() {
+    const { rows, columns, cell_size, origin } = this.fleet.map;
+    const margin = MARGIN * cell_size;
+    const width = columns * cell_size + 2 * margin;
+    const height = rows * cell_size + 2 * margin;
+    this.scale = Math.min(this.canvas.width / width, this.canvas.height / height);
+    this.left = (this.canvas.width - width * this.scale) / 2 + (margin - origin[0]) * this.scale;
+    this.bottom = (this.canvas.height + height * this.scale) / 2 - (margin - origin[1]) * this.scale;
+  }
+
+  #x(x) { return this.left + x * this.scale; }
+  #y(y) { return this.bottom - y * this.scale; }
+
+  draw() {
+    const { context, canvas, fleet } = this;
+    context.clearRect(0, 0, canvas.width, canvas.height);
+    if (!fleet.map) return;
+    this.#fit();
+    this.#drawCells();
+    for (const robot of fleet.robots.values()) this.#drawTrail(robot);
+    for (const robot of fleet.robots.values()) this.#drawPlan(robot);
+    for (const robot of fleet.robots.values()) this.#drawRobot(robot);
+  }
+
+  #drawCells() {
+    const { context, fleet, colour } = this;
+    const side = fleet.map.cell_size * this.scale;
+    const small = side < 24;
+    const gap = small ? 0 : Math.max(1, side * 0.02);
+    context.font = `${Math.round(side * 0.16)}px system-ui, sans-serif`;
+    context.textAlign = "left";
+    context.textBaseline = "top";
+    for (let cell = 0; cell < fleet.map.rows * fleet.map.columns; cell++) {
+      const [x, y] = fleet.centre(cell);
+      const left = this.#x(x) - side / 2 + gap;
+      const top = this.#y(y) - side / 2 + gap;
+      context.fillStyle = fleet.blocked.has(cell) ? colour.blocked : fleet.pending.has(cell) ? colour.pending : colour.cell;
+      context.fillRect(left, top, side - 2 * gap, side - 2 * gap);
+      if (!small) {
+        context.fillStyle = colour.quiet;
+        context.fillText(cell, left + side * 0.05, top + side * 0.05);
+      }
+    }
+    if (this.cursor !== null) {
+      const [x, y] = fleet.centre(this.cursor);
+      context.strokeStyle = colour.accent;
+      context.lineWidth = Math.max(2, side * 0.04);
+      context.strokeRect(this.#x(x) - side / 2 + gap, this.#y(y) - side / 2 + gap, side - 2 * gap, side - 2 * gap);
+    }
+  }
+
+  #line(points) {
+    const { context } = this;
+    context.beginPath();
+    points.forEach(([x, y], index) => (index ? context.lineTo(this.#x(x), this.#y(y)) : context.moveTo(this.#x(x), this.#y(y))));
+    context.stroke();
+  }
+
+  #drawTrail(robot) {
+    if (robot.trail.length < 2) return;
+    const { context } = this;
+    context.strokeStyle = colourOf(robot.id);
+    context.globalAlpha = 0.35;
+    context.lineWidth = Math.max(1, 0.03 * this.scale);
+    this.#line(robot.trail);
+    context.globalAlpha = 1;
+  }
+
+  #drawPlan(robot) {
+    const { context, fleet } = this;
+    context.strokeStyle = context.fillStyle = colourOf(robot.id);
+    context.lineWidth = Math.max(2, 0.06 * this.scale);
+    context.lineCap = context.lineJoin = "round";
+    if (robot.plan.length > 1) {
+      context.setLineDash([0.12 * this.scale, 0.14 * this.scale]);
+      this.#line(robot.plan.map((cell) => fleet.centre(cell)));
+      context.setLineDash([]);
+    }
+    if (robot.granted.length > 1) this.#line(robot.granted.map((cell) => fleet.centre(cell)));
+    if (robot.goal !== null) {
+      const [x, y] = fleet.centre(robot.goal);
+      const half = 0.16 * fleet.map.cell_size * this.scale;
+      context.strokeRect(this.#x(x) - half, this.#y(y) - half, 2 * half, 2 * half);
+    }
+  }
+
+  #drawRobot(robot) {
+    if (!robot.pose) return;
+    const { context, fleet } = this;
+    const { pose, shown } = robot;
+    shown.x += (pose.x - shown.x) * SMOOTHING;
+    shown.y += (pose.y - shown.y) * SMOOTHING;
+    shown.theta += Math.atan2(Math.sin(pose.theta - shown.theta), Math.cos(pose.theta - shown.theta)) * SMOOTHING;
+    const radius = (fleet.map.robot_radius ?? 0.25) * this.scale;
+    context.save();
+    context.translate(this.#x(shown.x), this.#y(shown.y));
+    context.fillStyle = colourOf(robot.id);
+    context.beginPath();
+    context.arc(0, 0, radius, 0, 2 * Math.PI);
+    context.fill();
+    if (robot.id === fleet.selected) {
+      context.strokeStyle = this.colour.ink;
+      context.lineWidth = Math.max(2, radius * 0.16);
+      context.stroke();
+    }
+    context.rotate(-shown.theta);
+    context.fillStyle = "#fff";
+    context.beginPath();
+    context.moveTo(radius * 0.85, 0);
+    context.lineTo(-radius * 0.2, radius * 0.5);
+    context.lineTo(-radius * 0.2, -radius * 0.5);
+    context.fill();
+    context.restore();
+    if (this.scale * fleet.map.cell_size > 40) {
+      context.font = `600 ${Math.round(radius * 0.75)}px system-ui, sans-serif`;
+      context.textAlign = "center";
+      context.textBaseline = "bottom";
+      context.fillStyle = this.colour.ink;
+      context.fillText(robot.id, this.#x(shown.x), this.#y(shown.y) - radius * 1.1);
+    }
+  }
+}

@@ -1,0 +1,174 @@
+"""Kill -9 of every part under traffic: what must go on goes on, what must come back comes back."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+
+import psutil
+import pytest
+from support.engine import Engine, running_engine, until
+from support.stranger import ROBOT_TAGS, Stranger, check_echo, stranger, wire_echo
+
+pytestmark = [pytest.mark.e2e, pytest.mark.timeout(120)]
+
+RUNTIMES = ["process", pytest.param("namespace", marks=pytest.mark.needs("bwrap"))]
+
+
+class Traffic:
+    """Publishes numbered strings all the time and counts what comes back."""
+
+    def __init__(self, client: Stranger) -> None:
+        self.client = client
+        self.sent = 0
+        self.returned: set[int] = set()
+
+    async def run(self) -> None:
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._send())
+            group.create_task(self._count())
+
+    async def _send(self) -> None:
+        while True:
+            await self.client.publish("requestIn", "std_msgs/String", {"data": f"number {self.sent}"})
+            self.sent += 1
+            await asyncio.sleep(0.005)
+
+    async def _count(self) -> None:
+        while True:
+            text = (await self.client.receive("responseOut", timeout=60))["data"]
+            self.returned.add(int(text.split()[1]))
+
+
+@contextlib.asynccontextmanager
+async def traffic(client: Stranger) -> AsyncIterator[Traffic]:
+    running = Traffic(client)
+    task = asyncio.create_task(running.run())
+    try:
+        yield running
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+def node_pids(engine: Engine) -> set[int]:
+    return {process.pid for process in engine.processes_of("stringEcho.py") if "python" in process.name()}
+
+
+def environment_pids(engine: Engine) -> list[psutil.Process]:
+    return [process for process in engine.processes_of("rce_container.environment") if "python" in process.name()]
+
+
+async def test_master_dies_and_comes_back() -> None:
+    async with running_engine() as engine, stranger(engine.url) as client:
+        await wire_echo(client)
+        nodes = node_pids(engine)
+        async with traffic(client) as running:
+            await until(lambda: len(running.returned) > 50, what="traffic")
+            await engine.master.kill()
+            before = running.sent
+            await until(lambda: running.sent > before + 100 and before + 50 in running.returned, what="traffic without a master")
+            await engine.master.start()
+            await until(engine.accepts_robots, what="the robot process is back")
+            before = running.sent
+            await until(lambda: before + 20 in running.returned, what="traffic with the new master")
+            first, last = min(running.returned), max(running.returned)
+            assert set(range(first, last + 1)) == running.returned, "a surviving link lost messages"
+        assert node_pids(engine) == nodes
+        assert (False in [state for _, state in client.statuses]) is False
+        await client.send("CC", {"containerTag": "second"})
+        await until(
+            lambda: [c for c in engine.get("/api/v1/containers")["containers"] if c["tag"] == "second" and c["state"] == "running"],
+            what="a container made by the new master",
+        )
+        async with stranger(engine.url, robot="secondRobot") as other:
+            await other.send("DC", {"containerTag": "second"})
+
+
+async def test_robot_process_dies_and_its_robots_come_back() -> None:
+    async with running_engine(robots=2) as engine:
+        async with stranger(engine.url) as client:
+            await wire_echo(client)
+            victim = next(r for r, (ws, _) in zip(engine.robots, engine.robot_ports, strict=True) if client.socket.get_extra_info("peername")[1] == ws)
+            await victim.kill()
+        await until(engine.accepts_robots, what="another robot process")
+        nodes = node_pids(engine)
+        async with stranger(engine.url) as client:
+            await client.wait_status(dict.fromkeys(ROBOT_TAGS, True))
+            await check_echo(client, "back again")
+        assert node_pids(engine) == nodes
+
+
+@pytest.mark.parametrize("runtime", RUNTIMES)
+async def test_environment_dies_and_is_made_again(runtime: str) -> None:
+    async with running_engine(runtime=runtime) as engine, stranger(engine.url) as client:
+        await wire_echo(client)
+        old = node_pids(engine)
+        client.statuses.clear()
+        for process in environment_pids(engine):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                process.kill()
+        await client.wait_status(dict.fromkeys(ROBOT_TAGS, False), timeout=2)
+        await client.wait_status(dict.fromkeys(ROBOT_TAGS, True))
+        for tag in ROBOT_TAGS:
+            assert [state for name, state in client.statuses if name == tag] == [False, True]
+        await check_echo(client, "made again")
+        await until(lambda: not old & node_pids(engine), what="the old node is gone")
+
+
+@pytest.mark.needs("bwrap")
+async def test_whole_container_dies_and_is_made_again() -> None:
+    async with running_engine(runtime="namespace") as engine, stranger(engine.url) as client:
+        await wire_echo(client)
+        for process in engine.processes_of("rce_container.environment"):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                process.kill()
+        await client.wait_status(dict.fromkeys(ROBOT_TAGS, False), timeout=2)
+        await client.wait_status(dict.fromkeys(ROBOT_TAGS, True))
+        await check_echo(client, "made again")
+
+
+@pytest.mark.parametrize("runtime", RUNTIMES)
+async def test_manager_dies_and_adopts_its_containers(runtime: str) -> None:
+    async with running_engine(runtime=runtime) as engine, stranger(engine.url) as client:
+        await wire_echo(client)
+        nodes = node_pids(engine)
+        async with traffic(client) as running:
+            await until(lambda: len(running.returned) > 20, what="traffic")
+            await engine.container.kill()
+            before = running.sent
+            await until(lambda: before + 50 in running.returned, what="traffic without a manager")
+            await engine.container.start()
+            await until(
+                lambda: [c for c in engine.get("/api/v1/containers")["containers"] if c["state"] == "running"],
+                what="the container is adopted",
+            )
+            before = running.sent
+            await until(lambda: before + 50 in running.returned, what="traffic with the new manager")
+            first, last = min(running.returned), max(running.returned)
+            assert set(range(first, last + 1)) == running.returned, "a surviving link lost messages"
+        assert node_pids(engine) == nodes
+        assert all(state for _, state in client.statuses)
+
+
+@pytest.mark.parametrize("runtime", RUNTIMES)
+async def test_containers_end_whole_without_a_manager(runtime: str) -> None:
+    async with running_engine(runtime=runtime) as engine, stranger(engine.url) as client:
+        engine.container.argv += ["--grace", "2"]
+        await engine.container.stop()
+        await engine.container.start()
+        await wire_echo(client)
+        assert node_pids(engine)
+        await engine.container.kill()
+        await until(
+            lambda: not engine.processes_of("rce_container.environment") and not node_pids(engine),
+            timeout=30,
+            what="environment and nodes are gone",
+        )
+        left = [path for path in engine.folder.rglob("*") if path.is_socket() and "link" in path.name]
+        assert left == []
+        await engine.container.start()
+        await client.wait_status(dict.fromkeys(ROBOT_TAGS, True))
+        await check_echo(client, "made anew")
