@@ -1,0 +1,164 @@
+"""Where message and service types come from: packages, the built-in definitions, connection headers."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from importlib.resources import files
+from typing import TYPE_CHECKING
+
+from rce.ros.types.definition import SEPARATOR, Definition, parse_message, parse_service, split_full_text
+from rce.ros.types.exceptions import BadDefinition, UnknownType
+from rce.ros.types.message import MessageType, ServiceType
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rce.ros.packages import PackageIndex
+
+_NAME = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/([A-Za-z][A-Za-z0-9_]*)")
+_PART = re.compile(r"(MSG|SRV): (\S+)\n")
+
+
+class TypeRegistry:
+    """Finds types by name and makes each once.
+
+    A definition is looked for in the packages first (``PKG/msg/Type.msg``, ``PKG/srv/Type.srv``), then among the
+    built-in ones of the common ROS packages, then among those learned with :meth:`from_definition`.
+
+    Args:
+        packages: Where to look for packages; None for the built-in definitions only.
+    """
+
+    def __init__(self, packages: PackageIndex | None = None) -> None:
+        self._packages = packages
+        self._messages: dict[str, MessageType] = {}
+        self._services: dict[str, ServiceType] = {}
+        self._learned: dict[str, MessageType] = {}
+
+    def message(self, name: str) -> MessageType:
+        """Return a message type.
+
+        Args:
+            name: ``package/Type``.
+
+        Raises:
+            UnknownType: There is no definition of it, or of a type that it uses.
+            BadDefinition: Its definition, or one that it uses, is wrong.
+        """
+        found = self._messages.get(name)
+        if found is None:
+            try:
+                found = _Builder(self._definition, self._messages).build(name)
+            except UnknownType:
+                found = self._learned.get(name)
+                if found is None:
+                    raise
+        return found
+
+    def service(self, name: str) -> ServiceType:
+        """Return a service type.
+
+        Raises:
+            UnknownType: There is no definition of it, or of a type that it uses.
+            BadDefinition: Its definition, or one that it uses, is wrong.
+        """
+        found = self._services.get(name)
+        if found is None:
+            text, source = self._text(name, "srv")
+            request, response = (
+                MessageType(part, self.message) for part in parse_service(name, text, source)
+            )
+            found = self._services[name] = ServiceType(name, request, response)
+        return found
+
+    def from_definition(self, name: str, full_text: str) -> MessageType:
+        """Return the type that a full definition text describes, as a connection header carries it.
+
+        The text alone counts: types of the same names that the registry knows are not used. The type is
+        remembered, so that :meth:`message` finds it where there is no other definition.
+
+        Raises:
+            UnknownType: The text uses a type that it does not hold.
+            BadDefinition: The text cannot be read.
+        """
+        parts = dict(reversed(list(split_full_text(name, full_text))))
+
+        def definition(wanted: str) -> Definition:
+            if wanted not in parts:
+                raise UnknownType(wanted, f"the definition text of {name} does not hold it")
+            return parse_message(wanted, parts[wanted])
+
+        kind = _Builder(definition, {}).build(name)
+        known = self._learned.get(name)
+        if known is not None and known.md5sum == kind.md5sum:
+            return known
+        self._learned[name] = kind
+        return kind
+
+    def _definition(self, name: str) -> Definition:
+        text, source = self._text(name, "msg")
+        return parse_message(name, text, source)
+
+    def _text(self, name: str, kind: str) -> tuple[str, str]:
+        """Return the definition text of ``name`` and where it is from."""
+        match = _NAME.fullmatch(name)
+        if match is None:
+            raise UnknownType(name, "a type is named package/Type")
+        package, type_name = match.groups()
+        hint = "no package path is set"
+        if self._packages is not None:
+            folder = self._packages.locate(package)
+            if folder is None:
+                hint = f"no package {package} on the package path ({self._packages.describe_path()})"
+            else:
+                file = folder / kind / f"{type_name}.{kind}"
+                if file.is_file():
+                    return _read(file.read_bytes(), str(file)), str(file)
+                hint = f"there is no file {file}"
+        text = builtin_definitions().get((kind, name))
+        if text is None:
+            raise UnknownType(name, f"{hint}, and it is not among the built-in {'messages' if kind == 'msg' else 'services'}")
+        return text, name
+
+
+class _Builder:
+    """Makes a message type and those it uses; refuses types that hold themselves."""
+
+    def __init__(self, definition: Callable[[str], Definition], done: dict[str, MessageType]) -> None:
+        self._definition = definition
+        self._done = done
+        self._open: list[str] = []
+
+    def build(self, name: str) -> MessageType:
+        found = self._done.get(name)
+        if found is not None:
+            return found
+        definition = self._definition(name)
+        if name in self._open:
+            raise BadDefinition(definition.source, 0, f"the type holds itself: {' > '.join([*self._open, name])}")
+        self._open.append(name)
+        try:
+            kind = self._done[name] = MessageType(definition, self.build)
+        finally:
+            self._open.pop()
+        return kind
+
+
+def _read(data: bytes, source: str) -> str:
+    try:
+        return data.decode()
+    except UnicodeDecodeError as error:
+        raise BadDefinition(source, 0, f"is not UTF-8: {error.reason}") from error
+
+
+@cache
+def builtin_definitions() -> dict[tuple[str, str], str]:
+    """Return the definitions that ship with the package: ``("msg" | "srv", name) -> text``."""
+    text = files("rce.ros.types").joinpath("definitions.txt").read_text("utf-8")
+    found = {}
+    for part in text.split(SEPARATOR + "\n")[1:]:
+        match = _PART.match(part)
+        assert match is not None, part[:80]
+        found[match[1].lower(), match[2]] = part[match.end() :]
+    return found
