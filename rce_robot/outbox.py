@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from dataclasses import dataclass
 from enum import Enum
+from typing import Protocol
 
 Buffer = bytes | bytearray | memoryview
 
@@ -27,18 +28,37 @@ class Overflow(Enum):
     """Take no more; the sender is told. Services."""
 
 
+class Queued(Protocol):
+    """What a queue holds."""
+
+    @property
+    def size(self) -> int:
+        """Bytes that it counts in the queue's limits."""
+
+    def render(self) -> Outgoing | None:
+        """Make it ready to be sent; None if that turns out to be impossible.
+
+        Called when its turn has come: a message that is dropped in the queue costs no conversion.
+        """
+
+
 @dataclass(frozen=True, slots=True)
 class Outgoing:
     """One message as it goes over the WebSocket: a JSON text and the binary frames it names."""
 
     text: bytes
     """UTF-8."""
-    binaries: tuple[Buffer, ...] = ()
+    binaries: tuple[tuple[bytes, Buffer], ...] = ()
+    """Payloads of binary frames, each in two parts, so that an id can go before bytes that nobody copies."""
 
     @property
     def size(self) -> int:
         """Payload bytes of all its frames."""
-        return len(self.text) + sum(len(binary) for binary in self.binaries)
+        return len(self.text) + sum(len(head) + len(body) for head, body in self.binaries)
+
+    def render(self) -> Outgoing:
+        """Return itself; it is ready."""
+        return self
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,15 +85,15 @@ class _Flow:
     def __init__(self, tag: str, overflow: Overflow) -> None:
         self.tag = tag
         self.overflow = overflow
-        self.messages: deque[tuple[Outgoing, int]] = deque()
+        self.messages: deque[tuple[Queued, int]] = deque()
         self.bytes = 0
         self.credit = 0
 
-    def push(self, message: Outgoing, size: int) -> None:
+    def push(self, message: Queued, size: int) -> None:
         self.messages.append((message, size))
         self.bytes += size
 
-    def pop(self) -> tuple[Outgoing, int]:
+    def pop(self) -> tuple[Queued, int]:
         message, size = self.messages.popleft()
         self.bytes -= size
         return message, size
@@ -86,16 +106,16 @@ class Outbox:
     flows' bytes; no queue is over its limits by more than one message.
     """
 
-    def __init__(self, limits: OutboxLimits = OutboxLimits()) -> None:
+    def __init__(self, limits: OutboxLimits = OutboxLimits(), dropped: Counter[str] | None = None) -> None:
         self._limits = limits
-        self._control: deque[tuple[Outgoing, int]] = deque()
+        self._control: deque[tuple[Queued, int]] = deque()
         self._control_bytes = 0
-        self._states: dict[str, Outgoing] = {}
+        self._states: dict[str, Queued] = {}
         self._flows: dict[str, _Flow] = {}
         self._ring: deque[_Flow] = deque()
         self._data_bytes = 0
-        self.dropped: Counter[str] = Counter()
-        """Interface tag to the number of its messages that were thrown away."""
+        self.dropped: Counter[str] = Counter() if dropped is None else dropped
+        """Interface tag to the number of its messages that were thrown away; may outlive the outbox."""
 
     def __bool__(self) -> bool:
         return bool(self._states or self._control or self._ring)
@@ -105,11 +125,11 @@ class Outbox:
         """Bytes that wait in both lanes."""
         return self._control_bytes + self._data_bytes
 
-    def put_state(self, key: str, message: Outgoing) -> None:
+    def put_state(self, key: str, message: Queued) -> None:
         """Queue a statement that makes an earlier, unsent one of the same ``key`` obsolete (``ST``)."""
         self._states[key] = message
 
-    def put_control(self, message: Outgoing) -> bool:
+    def put_control(self, message: Queued) -> bool:
         """Queue a small urgent message.
 
         Returns:
@@ -125,7 +145,7 @@ class Outbox:
         self._control_bytes += size
         return True
 
-    def put_data(self, tag: str, message: Outgoing, overflow: Overflow = Overflow.DROP_OLDEST) -> bool:
+    def put_data(self, tag: str, message: Queued, overflow: Overflow = Overflow.DROP_OLDEST) -> bool:
         """Queue a message of the interface ``tag``; its first message settles the queue's ``overflow``.
 
         Returns:
@@ -147,7 +167,7 @@ class Outbox:
         self._data_bytes += size
         return True
 
-    def pop(self) -> Outgoing | None:
+    def pop(self) -> Queued | None:
         """Take the message to send next, None if nothing waits."""
         if self._states:
             key = next(iter(self._states))
@@ -190,7 +210,7 @@ class Outbox:
             self._ring.remove(flow)
             flow.credit = 0
 
-    def _pop_data(self) -> Outgoing:
+    def _pop_data(self) -> Queued:
         ring = self._ring
         while True:
             flow = ring[0]

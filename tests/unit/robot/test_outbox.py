@@ -6,17 +6,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce_robot.outbox import Outbox, OutboxLimits, Outgoing, Overflow
+from rce_robot.outbox import Outbox, OutboxLimits, Outgoing, Overflow, Queued
 
 
 def message(text: str, extra: int = 0) -> Outgoing:
-    return Outgoing(text.encode(), (bytes(extra),) if extra else ())
+    return Outgoing(text.encode(), ((b"", bytes(extra)),) if extra else ())
+
+
+def text_of(item: Queued) -> str:
+    rendered = item.render()
+    assert rendered is not None
+    return rendered.text.decode()
 
 
 def drain(outbox: Outbox) -> list[str]:
     texts = []
     while (item := outbox.pop()) is not None:
-        texts.append(item.text.decode())
+        texts.append(text_of(item))
     return texts
 
 
@@ -132,7 +138,7 @@ def test_nothing_is_lost_uncounted_and_memory_is_bounded(
     def take() -> None:
         item = outbox.pop()
         if item is not None:
-            tag, _, number = item.text.decode().partition(":")
+            tag, _, number = text_of(item).partition(":")
             got[tag].append(int(number))
 
     for number, (tag, size, pop) in enumerate(operations):

@@ -1,0 +1,69 @@
+"""When to try again, and whether to: full-jitter delays and the judgement of failures. Pure."""
+
+from __future__ import annotations
+
+import random
+import ssl
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from websockets.exceptions import InvalidHandshake, InvalidStatus, WebSocketException
+
+from rce_client.exceptions import ClientError, RefusedError, UnavailableError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+RETRIED_STATUSES = frozenset((408, 409, 425, 429, 500, 502, 503, 504))
+"""HTTP statuses that another attempt may clear: 409 is a former connection that has not ended yet."""
+
+
+@dataclass(frozen=True, slots=True)
+class Backoff:
+    """Delays between attempts: a random part of a bound that doubles (*full jitter*).
+
+    A fleet that lost its engine at the same moment comes back spread out in time.
+    """
+
+    first: float = 0.2
+    """Bound of the first delay in seconds."""
+    factor: float = 2.0
+    cap: float = 15.0
+    """Largest bound in seconds."""
+
+    def delays(self, rng: random.Random | None = None) -> Iterator[float]:
+        """Yield delays in seconds, for ever."""
+        rng = rng or random.Random()  # noqa: S311 - spreads load, guards nothing
+        bound = self.first
+        while True:
+            yield rng.uniform(0.0, bound)
+            bound = min(self.cap, bound * self.factor)
+
+
+def judge_status(status: int, reason: str) -> ClientError:
+    """Return the error for an HTTP answer that is not the wanted one."""
+    if status in RETRIED_STATUSES:
+        return UnavailableError(reason, status)
+    return RefusedError(status, reason)
+
+
+def judge(error: Exception) -> ClientError:
+    """Map whatever an attempt to connect raised.
+
+    Returns:
+        :class:`UnavailableError` if another attempt is worth it, else :class:`RefusedError`; a
+        :class:`ClientError` is returned as it is.
+    """
+    if isinstance(error, ClientError):
+        return error
+    if isinstance(error, InvalidStatus):
+        response = error.response
+        body = bytes(response.body or b"").decode(errors="replace").strip()
+        return judge_status(response.status_code, body or response.reason_phrase)
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return RefusedError(0, f"the engine's certificate is not trusted: {error.verify_message}")
+    if isinstance(error, TimeoutError):
+        return UnavailableError("no answer in time")
+    if isinstance(error, (OSError, EOFError, InvalidHandshake, WebSocketException)):
+        return UnavailableError(str(error) or type(error).__name__)
+    return RefusedError(0, f"{type(error).__name__}: {error}")

@@ -1,0 +1,132 @@
+"""What a client has asked the engine for: the memory that a reconnect restores from. Pure."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeVar
+
+from rce.protocol.messages import (
+    AddInterface,
+    AddNode,
+    ConfigureComponents,
+    ConfigureConnections,
+    Connection,
+    CreateContainer,
+    DeleteParam,
+    DestroyContainer,
+    RemoveInterface,
+    RemoveNode,
+    SetParam,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from rce.protocol.messages import Request
+
+Item = TypeVar("Item")
+
+
+class Desired:
+    """Everything that was made and not removed again.
+
+    Invariant: what belongs to a container or an interface is forgotten with it; so what :meth:`restore`
+    returns never names something that it does not make itself, unless somebody else made it.
+    """
+
+    def __init__(self) -> None:
+        self.containers: dict[str, CreateContainer] = {}
+        self.nodes: dict[tuple[str, str], AddNode] = {}
+        """By container tag and node tag."""
+        self.parameters: dict[tuple[str, str], SetParam] = {}
+        """By container tag and name."""
+        self.interfaces: dict[tuple[str, str], AddInterface] = {}
+        """By endpoint tag and interface tag."""
+        self.connections: dict[frozenset[str], Connection] = {}
+        """By the two interfaces' paths; which of them is named first means nothing."""
+
+    def apply(self, request: Request) -> None:
+        """Remember a request that goes to the engine."""
+        match request:
+            case CreateContainer():
+                self.containers[request.container_tag] = request
+            case DestroyContainer():
+                self._forget_container(request.container_tag)
+            case ConfigureComponents():
+                self._configure(request)
+            case ConfigureConnections():
+                for item in request.disconnect:
+                    self.connections.pop(frozenset((item.tag_a, item.tag_b)), None)
+                for item in request.connect:
+                    self.connections[frozenset((item.tag_a, item.tag_b))] = item
+
+    def restore(self) -> list[Request]:
+        """Return the requests that make everything again; the engine takes what is there already silently."""
+        requests: list[Request] = list(self.containers.values())
+        if self.nodes or self.parameters or self.interfaces:
+            requests.append(
+                ConfigureComponents(
+                    set_param=tuple(self.parameters.values()),
+                    add_interfaces=tuple(self.interfaces.values()),
+                    add_nodes=tuple(self.nodes.values()),
+                )
+            )
+        if self.connections:
+            requests.append(ConfigureConnections(connect=tuple(self.connections.values())))
+        return requests
+
+    def undo(self) -> list[Request]:
+        """Return the requests that remove everything, in an order in which each still finds what it names."""
+        requests: list[Request] = []
+        if self.connections:
+            requests.append(ConfigureConnections(disconnect=tuple(self.connections.values())))
+        components = ConfigureComponents(
+            remove_nodes=tuple(
+                RemoveNode(container_tag=item.container_tag, node_tag=item.node_tag)
+                for item in self._outside(self.nodes)
+            ),
+            remove_interfaces=tuple(
+                RemoveInterface(endpoint_tag=item.endpoint_tag, interface_tag=item.interface_tag)
+                for item in self._outside(self.interfaces)
+            ),
+            delete_param=tuple(
+                DeleteParam(container_tag=item.container_tag, name=item.name) for item in self._outside(self.parameters)
+            ),
+        )
+        if components != ConfigureComponents():
+            requests.append(components)
+        requests += [DestroyContainer(container_tag=tag) for tag in self.containers]
+        return requests
+
+    def _outside(self, items: dict[tuple[str, str], Item]) -> Iterable[Item]:
+        """Yield what does not vanish with a container of ours."""
+        return (item for (endpoint, _), item in items.items() if endpoint not in self.containers)
+
+    def _configure(self, request: ConfigureComponents) -> None:
+        for node in request.remove_nodes:
+            self.nodes.pop((node.container_tag, node.node_tag), None)
+        for removed in request.remove_interfaces:
+            self.interfaces.pop((removed.endpoint_tag, removed.interface_tag), None)
+            self._forget_connections(lambda path: path == f"{removed.endpoint_tag}/{removed.interface_tag}")
+        for deleted in request.delete_param:
+            self.parameters.pop((deleted.container_tag, deleted.name), None)
+        for parameter in request.set_param:
+            self.parameters[parameter.container_tag, parameter.name] = parameter
+        for interface in request.add_interfaces:
+            self.interfaces[interface.endpoint_tag, interface.interface_tag] = interface
+        for added in request.add_nodes:
+            self.nodes[added.container_tag, added.node_tag] = added
+
+    def _forget_container(self, tag: str) -> None:
+        self.containers.pop(tag, None)
+        for items in (self.nodes, self.parameters, self.interfaces):
+            _discard_of(items, tag)
+        self._forget_connections(lambda path: path.startswith(f"{tag}/"))
+
+    def _forget_connections(self, names: Callable[[str], bool]) -> None:
+        for pair in [pair for pair in self.connections if any(names(path) for path in pair)]:
+            del self.connections[pair]
+
+
+def _discard_of(items: dict[tuple[str, str], Item], endpoint: str) -> None:
+    for key in [key for key in items if key[0] == endpoint]:
+        del items[key]

@@ -1,0 +1,113 @@
+"""The first step of a client: ask the master over HTTP where its robot endpoint is.
+
+One small request per connection does not justify an HTTP client's start-up time on a robot, so this is
+``h11`` (sans-I/O) on an asyncio stream: cancellable at any point, TLS by the stream.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import TYPE_CHECKING
+from urllib.parse import urlencode, urlsplit
+
+import h11
+
+from rce_client.backoff import judge, judge_status
+from rce_client.exceptions import RefusedError, UnavailableError
+
+if TYPE_CHECKING:
+    import ssl
+
+VERSION = "20130902"
+"""Version of the client protocol, a date."""
+
+_MAX_BODY = 65536
+_PORTS = {"http": 80, "https": 443}
+
+
+async def locate(
+    url: str,
+    user: str,
+    *,
+    version: str = VERSION,
+    tls: ssl.SSLContext | None = None,
+    timeout: float = 10.0,  # noqa: ASYNC109 - one deadline for all phases
+) -> str:
+    """Ask the master at ``url`` for the WebSocket URL of a robot endpoint.
+
+    Args:
+        url: The master, ``http://HOST:PORT/`` or ``https://``.
+        user: User ID.
+        version: Protocol version that this client speaks.
+        tls: TLS settings for ``https``; the system's if None.
+        timeout: Seconds for the whole exchange.
+
+    Raises:
+        RefusedError: The master does not take this client, or the URL is none.
+        UnavailableError: It may on another attempt.
+    """
+    parts = urlsplit(url)
+    try:
+        port = parts.port or _PORTS[parts.scheme]
+    except (KeyError, ValueError) as error:
+        raise RefusedError(0, f"{url!r} is not an http or https URL") from error
+    if not parts.hostname:
+        raise RefusedError(0, f"{url!r} names no host")
+    target = f"{parts.path or '/'}?{urlencode({'userID': user, 'version': version})}"
+    try:
+        async with asyncio.timeout(timeout):
+            reader, writer = await asyncio.open_connection(
+                parts.hostname, port, ssl=(tls or True) if parts.scheme == "https" else None
+            )
+            try:
+                status, body = await _get(reader, writer, parts.netloc.rpartition("@")[2], target)
+            finally:
+                writer.close()
+    except (OSError, EOFError, h11.ProtocolError) as error:
+        if isinstance(error, h11.ProtocolError):
+            raise UnavailableError(f"{url} does not speak HTTP: {error}") from error
+        raise judge(error) from error
+    return _read_answer(url, status, body)
+
+
+async def _get(
+    reader: asyncio.StreamReader, writer: asyncio.StreamWriter, host: str, target: str
+) -> tuple[int, bytes]:
+    """Do one GET request.
+
+    Returns:
+        Status and body.
+    """
+    connection = h11.Connection(h11.CLIENT)
+    headers = [("Host", host), ("Accept", "application/json"), ("Connection", "close")]
+    writer.write(connection.send(h11.Request(method="GET", target=target, headers=headers)) or b"")
+    writer.write(connection.send(h11.EndOfMessage()) or b"")
+    status = 0
+    body = bytearray()
+    while True:
+        event = connection.next_event()
+        if event is h11.NEED_DATA:
+            connection.receive_data(await reader.read(65536))
+        elif isinstance(event, h11.Response):
+            status = event.status_code
+        elif isinstance(event, h11.Data):
+            body += event.data
+            if len(body) > _MAX_BODY:
+                raise UnavailableError("the master's answer is too long")
+        elif isinstance(event, (h11.EndOfMessage, h11.ConnectionClosed)):
+            return status, bytes(body)
+
+
+def _read_answer(url: str, status: int, body: bytes) -> str:
+    """Return the WebSocket URL in the master's answer, or raise what the answer means."""
+    text = body.decode(errors="replace").strip()
+    if status != 200:
+        raise judge_status(status, text or f"{url} answered {status}")
+    try:
+        found = json.loads(text)["url"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise UnavailableError(f"{url} did not answer as a master does") from error
+    if not isinstance(found, str) or urlsplit(found).scheme not in ("ws", "wss"):
+        raise UnavailableError(f"the master gave {found!r}, which is not a WebSocket URL")
+    return found

@@ -1,0 +1,73 @@
+"""What can go wrong at the robot's side of the engine.
+
+::
+
+    ClientError
+    +-- RefusedError          the engine says no, and asking again will not help (credentials, version)
+    +-- UnavailableError      nobody answers, or not now: worth another try
+    |   +-- LostError         the connection broke
+    +-- NotConnectedError     nothing can be sent at this moment
+    +-- InterfaceError        an interface cannot be used as the program tries to
+    +-- CallError             a service call failed
+        +-- CallTimeoutError  ... because no answer came in time
+"""
+
+from __future__ import annotations
+
+
+class ClientError(Exception):
+    """Base of all faults of :mod:`rce_client`."""
+
+
+class RefusedError(ClientError):
+    """The engine refuses this client.
+
+    Attributes:
+        status: HTTP status.
+        reason: What the engine said.
+    """
+
+    def __init__(self, status: int, reason: str) -> None:
+        super().__init__(status, reason)
+        self.status = status
+        self.reason = reason
+
+    def __str__(self) -> str:
+        return f"refused ({self.status}): {self.reason}"
+
+
+class UnavailableError(ClientError):
+    """The engine cannot be reached or has no room now.
+
+    Attributes:
+        reason: What happened.
+        status: HTTP status, 0 if there was no answer.
+    """
+
+    def __init__(self, reason: str, status: int = 0) -> None:
+        super().__init__(reason, status)
+        self.reason = reason
+        self.status = status
+
+    def __str__(self) -> str:
+        return f"unavailable ({self.status}): {self.reason}" if self.status else self.reason
+
+
+class LostError(UnavailableError):
+    """The connection broke."""
+
+
+class NotConnectedError(ClientError):
+    """Nothing can be sent: the connection is away, or closed for good."""
+
+
+class InterfaceError(ClientError):
+    """An interface is used in a way that it cannot be."""
+
+
+class CallError(ClientError):
+    """A service call failed; the text is the engine's or the provider's."""
+
+
+class CallTimeoutError(CallError, TimeoutError):
+    """No answer to a service call came in time. The call may have been carried out."""
