@@ -1,0 +1,62 @@
+"""What can go wrong in the fleet room.
+
+::
+
+    FleetError
+    +-- MapError            a map or scenario file that cannot be read
+    +-- ScenarioError       no scenario of the wanted size exists on the map
+    +-- OccupiedError       a box cannot stand where a robot is
+    +-- TransitionError     an event that the life cycle of a robot does not allow
+    +-- InvariantError      the planner's books contradict each other: a bug
+"""
+
+from __future__ import annotations
+
+
+class FleetError(Exception):
+    """Base of everything that this room raises on purpose."""
+
+
+class MapError(FleetError):
+    """A map or scenario file cannot be read.
+
+    Attributes:
+        line: Number of the faulty line, from 1; 0 if the file as a whole is at fault.
+    """
+
+    def __init__(self, reason: str, *, line: int = 0) -> None:
+        self.reason = reason
+        self.line = line
+        super().__init__(reason, line)
+
+    def __str__(self) -> str:
+        return f"line {self.line}: {self.reason}" if self.line else self.reason
+
+
+class ScenarioError(FleetError):
+    """No scenario of the wanted size exists on the map."""
+
+
+class OccupiedError(FleetError):
+    """A box cannot stand where a robot is.
+
+    Attributes:
+        cell: Where the box should have stood.
+        robots: Ids of the robots in its way.
+    """
+
+    def __init__(self, cell: int, robots: tuple[str, ...]) -> None:
+        self.cell = cell
+        self.robots = robots
+        super().__init__(cell, robots)
+
+    def __str__(self) -> str:
+        return f"no box can stand in cell {self.cell}: {', '.join(self.robots)} is in its way"
+
+
+class TransitionError(FleetError):
+    """An event that the life cycle of a robot does not allow; nothing was changed."""
+
+
+class InvariantError(FleetError):
+    """The planner's books contradict each other. Always a bug, never a matter of input."""

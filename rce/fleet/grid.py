@@ -1,0 +1,156 @@
+"""The map of cells that robots drive on.
+
+Cells are numbered row by row from 0: ``cell = row * columns + column``. Columns grow along x, rows
+along y, and cell 0 begins at ``origin``. This is the layout of ``nav_msgs/OccupancyGrid``: with one
+map pixel per cell, the index in its ``data`` is the cell number. A page that draws row 0 on top
+therefore mirrors y (and headings with it).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from math import floor
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator
+
+
+@dataclass(frozen=True)
+class GridMap:
+    """Cells in rows and columns, some of them blocked. Immutable; changes make a new map.
+
+    Attributes:
+        rows: Number of rows, along y.
+        columns: Number of columns, along x.
+        cell_size: Edge of a cell, metres.
+        origin: Outer corner of cell 0, ``(x, y)`` in metres.
+        blocked: Cells that nothing can enter.
+    """
+
+    rows: int = 8
+    columns: int = 8
+    cell_size: float = 1.0
+    origin: tuple[float, float] = (0.0, 0.0)
+    blocked: frozenset[int] = frozenset()
+
+    def __post_init__(self) -> None:
+        if self.rows < 1 or self.columns < 1:
+            raise ValueError(f"a map needs rows and columns, not {self.rows} x {self.columns}")
+        if not self.cell_size > 0:
+            raise ValueError(f"cell_size must be positive, not {self.cell_size}")
+        outside = [cell for cell in self.blocked if cell not in self]
+        if outside:
+            raise ValueError(f"blocked cells outside of the map: {sorted(outside)}")
+
+    def __len__(self) -> int:
+        return self.rows * self.columns
+
+    def __contains__(self, cell: object) -> bool:
+        return isinstance(cell, int) and 0 <= cell < self.rows * self.columns
+
+    @property
+    def free(self) -> list[int]:
+        """Cells that can be entered, ascending."""
+        return [cell for cell in range(len(self)) if cell not in self.blocked]
+
+    def with_blocked(self, cells: Iterable[int]) -> GridMap:
+        """The same map with exactly these cells blocked."""
+        return replace(self, blocked=frozenset(cells))
+
+    # -- numbers, places, metres ----------------------------------------------------------------
+
+    def cell(self, row: int, column: int) -> int:
+        """Number of the cell at ``row`` and ``column``."""
+        return row * self.columns + column
+
+    def place(self, cell: int) -> tuple[int, int]:
+        """``(row, column)`` of a cell."""
+        return divmod(cell, self.columns)
+
+    def centre(self, cell: int) -> tuple[float, float]:
+        """Centre of a cell, ``(x, y)`` in metres."""
+        row, column = self.place(cell)
+        return (
+            self.origin[0] + (column + 0.5) * self.cell_size,
+            self.origin[1] + (row + 0.5) * self.cell_size,
+        )
+
+    def cell_at(self, x: float, y: float) -> int | None:
+        """Number of the cell that holds a point in metres; ``None`` outside of the map."""
+        column = floor((x - self.origin[0]) / self.cell_size)
+        row = floor((y - self.origin[1]) / self.cell_size)
+        if 0 <= row < self.rows and 0 <= column < self.columns:
+            return self.cell(row, column)
+        return None
+
+    def cells_touched(self, x: float, y: float, radius: float) -> set[int]:
+        """Cells of the map that a disc overlaps; all in metres."""
+        left = floor((x - radius - self.origin[0]) / self.cell_size)
+        right = floor((x + radius - self.origin[0]) / self.cell_size)
+        low = floor((y - radius - self.origin[1]) / self.cell_size)
+        high = floor((y + radius - self.origin[1]) / self.cell_size)
+        touched = set()
+        for row in range(max(low, 0), min(high, self.rows - 1) + 1):
+            for column in range(max(left, 0), min(right, self.columns - 1) + 1):
+                cell = self.cell(row, column)
+                cx, cy = self.centre(cell)
+                dx = max(abs(x - cx) - self.cell_size / 2, 0.0)
+                dy = max(abs(y - cy) - self.cell_size / 2, 0.0)
+                if dx * dx + dy * dy < radius * radius:
+                    touched.add(cell)
+        return touched
+
+    # -- neighbourhood ----------------------------------------------------------------------------
+
+    def around(self, cell: int) -> Iterator[int]:
+        """Cells of the map that share an edge with ``cell``, blocked or not, ascending."""
+        row, column = self.place(cell)
+        if row > 0:
+            yield cell - self.columns
+        if column > 0:
+            yield cell - 1
+        if column < self.columns - 1:
+            yield cell + 1
+        if row < self.rows - 1:
+            yield cell + self.columns
+
+    @cached_property
+    def neighbours(self) -> tuple[tuple[int, ...], ...]:
+        """For every cell, blocked ones too, the free cells that share an edge with it."""
+        blocked = self.blocked
+        return tuple(
+            tuple(other for other in self.around(cell) if other not in blocked) for cell in range(len(self))
+        )
+
+    def adjacent(self, a: int, b: int) -> bool:
+        """Whether two cells share an edge."""
+        (row_a, column_a), (row_b, column_b) = self.place(a), self.place(b)
+        return abs(row_a - row_b) + abs(column_a - column_b) == 1
+
+    def is_path(self, cells: Iterable[int]) -> bool:
+        """Whether every cell shares an edge with the one before it."""
+        return all(self.adjacent(a, b) for a, b in pairwise(cells))
+
+    # -- connectivity -----------------------------------------------------------------------------
+
+    def reachable(self, start: int) -> set[int]:
+        """Free cells that can be reached from ``start``, with ``start`` itself."""
+        seen = {start}
+        queue = deque(seen)
+        while queue:
+            for other in self.neighbours[queue.popleft()]:
+                if other not in seen:
+                    seen.add(other)
+                    queue.append(other)
+        return seen
+
+    def connected(self, cells: Collection[int] | None = None) -> bool:
+        """Whether these free cells (by default all) can be reached from one another over free cells."""
+        wanted = set(self.free if cells is None else cells)
+        if not wanted:
+            return True
+        return wanted.isdisjoint(self.blocked) and wanted <= self.reachable(next(iter(wanted)))
