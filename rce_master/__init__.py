@@ -1,0 +1,1 @@
+"""The Master Task Set: users, desired state, placement, reconciliation, HTTP."""

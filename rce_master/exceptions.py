@@ -1,0 +1,117 @@
+"""What can go wrong in the master.
+
+::
+
+    MasterError
+    +-- Refused                 a request was not done; the text says what was wrong and how to mend it
+    |   +-- Invalid             it can never be done like this
+    |   +-- NotFound            it names something that is not there
+    |   +-- Conflict            it contradicts what is there
+    |   +-- LimitReached        there are too many already
+    |   +-- Forbidden           this user may not do it
+    +-- AuthError
+    |   +-- WrongCredentials    unknown user, wrong password, unknown or expired token
+    |   +-- TooManyFailures     too many wrong passwords; wait
+    +-- InvalidTransition       an event that a life cycle does not know in its present state
+    +-- StoreError              the store cannot be read or written
+    |   +-- StoreBusy           another process owns the state folder
+    +-- TaskSetAway             the task set that is to be asked is not there
+"""
+
+from __future__ import annotations
+
+
+class MasterError(Exception):
+    """Base of all errors of the master."""
+
+
+class Refused(MasterError):  # noqa: N818
+    """A request was not done and nothing was changed by it.
+
+    Attributes:
+        status: The HTTP status that tells the same.
+    """
+
+    status = 400
+
+
+class Invalid(Refused):
+    """The request can never be done like this."""
+
+    status = 422
+
+
+class NotFound(Refused):
+    """The request names something that is not there."""
+
+    status = 404
+
+
+class Conflict(Refused):
+    """The request contradicts what is there."""
+
+    status = 409
+
+
+class LimitReached(Refused):
+    """There are too many of the kind already."""
+
+    status = 409
+
+
+class Forbidden(Refused):
+    """The user may not do it."""
+
+    status = 403
+
+
+class AuthError(MasterError):
+    """Somebody could not prove who they are."""
+
+
+class WrongCredentials(AuthError):  # noqa: N818
+    """Unknown user, wrong password, unknown or expired token: deliberately not told apart."""
+
+
+class TooManyFailures(AuthError):  # noqa: N818
+    """Too many wrong passwords for this user.
+
+    Attributes:
+        retry_after: Seconds until the next attempt is looked at.
+    """
+
+    def __init__(self, retry_after: float) -> None:
+        self.retry_after = retry_after
+        super().__init__(retry_after)
+
+    def __str__(self) -> str:
+        return f"too many failed logins; try again in {self.retry_after:.0f} s"
+
+
+class InvalidTransition(MasterError):  # noqa: N818
+    """An event that a life cycle does not know in its present state.
+
+    Attributes:
+        state: The present state.
+        event: The event.
+    """
+
+    def __init__(self, state: str, event: str) -> None:
+        self.state = state
+        self.event = event
+        super().__init__(state, event)
+
+    def __str__(self) -> str:
+        return f"{self.event} is impossible while {self.state}"
+
+
+class StoreError(MasterError):
+    """The store cannot be read or written."""
+
+
+class StoreBusy(StoreError):  # noqa: N818
+    """Another process owns the state folder."""
+
+
+class TaskSetAway(MasterError):  # noqa: N818
+    """The task set that is to be asked is not connected, or did not answer in time."""

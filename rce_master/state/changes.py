@@ -1,0 +1,225 @@
+"""What a command did: the journal of one transaction and all that follows from it outside the core."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from msgspec.structs import replace
+
+from rce_master.state.records import (
+    Container,
+    ContainerLive,
+    Counter,
+    Endpoint,
+    Link,
+    Presence,
+    Robot,
+    RobotLive,
+    TaskSet,
+    Token,
+    Tombstone,
+    User,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from rce.control.messages import TaskSetKind
+    from rce_master.state.settings import StateSettings
+    from rce_master.state.tables import Table, Tables
+
+R = TypeVar("R")
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A record as the store keeps it."""
+
+    table: str
+    key: str
+    body: bytes | None
+    """None: remove it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Withdrawal:
+    """An endpoint that a task set is to drop."""
+
+    process: str
+    id: str
+    revision: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """A text for a robot (``user/tag``) or for all connected robots of a user (``user``)."""
+
+    to: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Happening:
+    """Something that people want to know of; becomes an event of the API."""
+
+    kind: str
+    user: str
+    """Empty: of interest to administrators only."""
+    subject: str
+    """What it is about, such as an endpoint id."""
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Write:
+    table: Table[Any]
+    key: str
+    before: Any
+
+
+@dataclass(slots=True)
+class Changes:
+    """All that one command changed and that has to follow."""
+
+    touched: dict[str, None] = field(default_factory=dict)
+    """Ids of the endpoints whose spec changed and that are still desired."""
+    withdrawals: list[Withdrawal] = field(default_factory=list)
+    notices: list[Notice] = field(default_factory=list)
+    happenings: list[Happening] = field(default_factory=list)
+    arrived: str = ""
+    """Process name of the task set that is to be synchronised."""
+    _writes: list[_Write] = field(default_factory=list)
+
+    def rows(self) -> list[Row]:
+        """Tell what the store has to keep, each key once."""
+        keys = {(w.table.name, w.key): w for w in self._writes if w.table.persistent}
+        return [_row(write) for write in keys.values()]
+
+    def revert(self) -> None:
+        """Undo everything. Changes must be reverted in the reverse order of their making."""
+        for write in reversed(self._writes):
+            write.table.assign(write.key, write.before)
+        self._writes.clear()
+
+    def record(self, table: Table[Any], key: str, before: Any) -> None:
+        """Note what was there before a write."""
+        self._writes.append(_Write(table, key, before))
+
+
+def _row(write: _Write) -> Row:
+    record = write.table.get(write.key)
+    return Row(write.table.name, write.key, None if record is None else write.table.encode(record))
+
+
+class Transaction:
+    """Access to the tables for one command; whatever is written through it can be undone.
+
+    Args:
+        tables: The tables.
+        now: Seconds of a clock that never goes back.
+        settings: Limits and grace times.
+        make_token: Makes a secret for a link.
+    """
+
+    def __init__(
+        self, tables: Tables, now: float, settings: StateSettings, make_token: Callable[[], str]
+    ) -> None:
+        self.tables = tables
+        self.now = now
+        self.settings = settings
+        self.changes = Changes()
+        self._make_token = make_token
+
+    def put(
+        self, record: User | Token | Endpoint | TaskSet | RobotLive | ContainerLive | Presence | Tombstone
+    ) -> None:
+        """Write a record into its table."""
+        self._assign(self._table_of(record), record)
+
+    def put_link(self, link: Link) -> None:
+        """Write a link; one without connections is removed. Both ends are touched."""
+        if link.connections:
+            self._assign(self.tables.links, link)
+        else:
+            self.delete(self.tables.links, link.id)
+        self.touch(link.a)
+        self.touch(link.b)
+
+    def delete(self, table: Table[Any], key: str) -> None:
+        """Remove a record if it is there."""
+        if key in table:
+            self.changes.record(table, key, table[key])
+            table.assign(key, None)
+
+    def touch(self, endpoint: str) -> None:
+        """Note that an endpoint's spec changed."""
+        self.changes.touched[endpoint] = None
+
+    def next_number(self, counter: str) -> int:
+        """Take the next number of a counter."""
+        found = self.tables.counters.get(counter)
+        value = (found.value if found else 0) + 1
+        self._assign(self.tables.counters, Counter(name=counter, value=value))
+        return value
+
+    def raise_counter(self, counter: str, value: int) -> None:
+        """Make a counter go on above a value."""
+        found = self.tables.counters.get(counter)
+        if value > (found.value if found else 0):
+            self._assign(self.tables.counters, Counter(name=counter, value=value))
+
+    def new_token(self) -> str:
+        """Make a secret for a link."""
+        return self._make_token()
+
+    def withdraw(self, process: str, endpoint: str, reason: str) -> None:
+        """Have a task set drop an endpoint."""
+        self.changes.withdrawals.append(Withdrawal(process, endpoint, self.next_number("revision"), reason))
+
+    def notify(self, to: str, text: str) -> None:
+        """Have an ``ER`` sent to a robot or to all robots of a user."""
+        self.changes.notices.append(Notice(to, text))
+
+    def happen(self, kind: str, subject: str, text: str = "", *, user: str | None = None) -> None:
+        """Note an event. Without ``user``, the subject is an endpoint id that tells it."""
+        owner = subject.partition("/")[0] if user is None else user
+        self.changes.happenings.append(Happening(kind, owner, subject, text))
+
+    def seal(self) -> Changes:
+        """Give every touched endpoint its new revision and hand out what was done."""
+        touched = self.changes.touched
+        self.changes.touched = {}
+        for id_ in touched:
+            endpoint = self.tables.endpoints.get(id_)
+            if endpoint is not None:
+                self.put(replace(endpoint, revision=self.next_number("revision")))
+                self.changes.touched[id_] = None
+        return self.changes
+
+    def connected_task_sets(self, kind: TaskSetKind) -> Iterable[TaskSet]:
+        """List the task sets of a kind that are connected."""
+        return (s for s in self.tables.task_sets if s.kind is kind and self.tables.is_connected(s.process))
+
+    def _assign(self, table: Table[R], record: R) -> None:
+        key = table.key(record)
+        before = table.get(key)
+        if before != record:
+            self.changes.record(table, key, before)
+            table.assign(key, record)
+
+    def _table_of(self, record: Any) -> Table[Any]:
+        tables = self.tables
+        by_type: dict[type, Table[Any]] = {
+            User: tables.users,
+            Token: tables.tokens,
+            Robot: tables.endpoints,
+            Container: tables.endpoints,
+            TaskSet: tables.task_sets,
+            RobotLive: tables.live,
+            ContainerLive: tables.live,
+            Presence: tables.presence,
+            Tombstone: tables.tombstones,
+        }
+        return by_type[type(record)]

@@ -1,0 +1,249 @@
+"""Everything that can be asked of the state or happen to it.
+
+Commands are values: what they mean is in the module that handles them (``users``, ``task_sets``, ``robots``,
+``containers``, ``wiring``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+from rce.control.model import Resources
+
+if TYPE_CHECKING:
+    from rce.control.messages import Hello
+    from rce.control.model import EndpointStatus, InterfaceSpec, NodeSpec, ParameterValue
+    from rce_master.state.records import Token, User
+
+
+_NO_WISHES = Resources()
+
+# Users
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AddUser:
+    """Make a user; refused if there is one of the name."""
+
+    user: User
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetPassword:
+    """Change a user's password; ends their tokens."""
+
+    name: str
+    password: str
+    """argon2 hash."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RemoveUser:
+    """Remove a user with all robots, containers and tokens."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AddToken:
+    """Keep a bearer token; forgets expired ones of the same user."""
+
+    token: Token
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RemoveToken:
+    """Forget a bearer token."""
+
+    digest: str
+
+
+# Task sets
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TaskSetArrived:
+    """A task set connected."""
+
+    hello: Hello
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TaskSetLeft:
+    """A task set's channel ended."""
+
+    process: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatusReported:
+    """A task set reported an endpoint."""
+
+    process: str
+    status: EndpointStatus
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EndpointGone:
+    """A task set ended an endpoint."""
+
+    process: str
+    id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FaultReported:
+    """A task set reported a fault."""
+
+    id: str
+    text: str
+    robot: str = ""
+    """Endpoint id of the robot to tell; all of the user if empty."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RobotLogin:
+    """A robot whose password was right wants to connect at a task set."""
+
+    process: str
+    id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RobotLeft:
+    """A robot's connection ended."""
+
+    process: str
+    id: str
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tick:
+    """Time passed: grace times end, waiting containers are placed."""
+
+
+# What users ask for. ``user`` is who owns the endpoints; tags are the user's.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CreateContainer:
+    """``CC``."""
+
+    user: str
+    tag: str
+    resources: Resources = _NO_WISHES
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DestroyContainer:
+    """``DC``."""
+
+    user: str
+    tag: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AddNode:
+    """Start a node in a container."""
+
+    user: str
+    container: str
+    node: NodeSpec
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RemoveNode:
+    """Stop a node."""
+
+    user: str
+    container: str
+    tag: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetParameter:
+    """Set a parameter of a container; a value that is there is replaced."""
+
+    user: str
+    container: str
+    name: str
+    value: ParameterValue
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeleteParameter:
+    """Delete a parameter of a container."""
+
+    user: str
+    container: str
+    name: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AddInterface:
+    """Make an interface of a robot or a container."""
+
+    user: str
+    endpoint: str
+    interface: InterfaceSpec
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RemoveInterface:
+    """Remove an interface with its connections."""
+
+    user: str
+    endpoint: str
+    tag: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Connect:
+    """Join two interfaces, each written ``ENDPOINT/INTERFACE``."""
+
+    user: str
+    tag_a: str
+    tag_b: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Disconnect:
+    """Part two interfaces, each written ``ENDPOINT/INTERFACE``."""
+
+    user: str
+    tag_a: str
+    tag_b: str
+
+
+Request: TypeAlias = (
+    CreateContainer
+    | DestroyContainer
+    | AddNode
+    | RemoveNode
+    | SetParameter
+    | DeleteParameter
+    | AddInterface
+    | RemoveInterface
+    | Connect
+    | Disconnect
+)
+"""What users ask for."""
+
+Command: TypeAlias = (
+    AddUser
+    | SetPassword
+    | RemoveUser
+    | AddToken
+    | RemoveToken
+    | TaskSetArrived
+    | TaskSetLeft
+    | StatusReported
+    | EndpointGone
+    | FaultReported
+    | RobotLogin
+    | RobotLeft
+    | Tick
+    | Request
+)

@@ -1,0 +1,287 @@
+"""Containers: what users ask of them, where they are placed, what is reported of them."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from msgspec.structs import replace
+
+from rce.control.messages import TaskSetKind
+from rce.control.model import (
+    EndpointState,
+    EndpointStatus,
+    LinkAddress,
+    NodeState,
+    NodeStatus,
+    ParameterValue,
+)
+from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
+from rce_master.state import endpoints
+from rce_master.state.lifecycle import ContainerEvent, ContainerPhase, next_phase
+from rce_master.state.records import Container, ContainerLive, TaskSet, tombstone_key
+
+if TYPE_CHECKING:
+    from rce_master.state.changes import Transaction
+    from rce_master.state.commands import (
+        AddNode,
+        CreateContainer,
+        DeleteParameter,
+        DestroyContainer,
+        RemoveNode,
+        SetParameter,
+    )
+
+_INT32 = 2**31
+
+_EVENTS = {
+    EndpointState.STARTING: ContainerEvent.STARTING,
+    EndpointState.RUNNING: ContainerEvent.RUNNING,
+    EndpointState.ABSENT: ContainerEvent.STARTING,
+    EndpointState.STOPPING: ContainerEvent.STOPPING,
+    EndpointState.FAILED: ContainerEvent.FAILED,
+}
+
+
+# What users ask for
+
+
+def create_container(tx: Transaction, command: CreateContainer) -> None:
+    """Make a container; the same one again is accepted silently."""
+    id_ = f"{command.user}/{command.tag}"
+    there = tx.tables.endpoints.get(id_)
+    if isinstance(there, Container):
+        if there.resources != command.resources:
+            raise Conflict(
+                f"container {command.tag!r} exists with other settings; destroy it first or use another tag"
+            )
+        return
+    if there is not None:
+        raise Conflict(f"{command.tag!r} is a robot already; a container needs another tag")
+    if len(tx.tables.containers(command.user)) >= tx.settings.max_containers:
+        raise LimitReached(f"you have {tx.settings.max_containers} containers already; destroy one first")
+    tx.put(Container(id=id_, resources=command.resources))
+    tx.put(ContainerLive(id=id_, phase=ContainerPhase.REQUESTED, since=tx.now))
+    tx.touch(id_)
+    tx.happen("container_requested", id_)
+
+
+def destroy_container(tx: Transaction, command: DestroyContainer) -> None:
+    """Remove a container with all that is in it and connected to it."""
+    container = _find(tx, command.user, command.tag)
+    endpoints.remove(tx, container.id, "destroyed by its user")
+    tx.happen("container_destroyed", container.id)
+
+
+def add_node(tx: Transaction, command: AddNode) -> None:
+    """Add a node; the same one again is accepted silently."""
+    container = _find(tx, command.user, command.container)
+    node = command.node
+    there = container.nodes.get(node.tag)
+    if there == node:
+        return
+    if there is not None:
+        raise Conflict(
+            f"node {node.tag!r} of container {container.tag!r} exists with other settings; remove it first"
+        )
+    if len(container.nodes) >= tx.settings.max_nodes:
+        raise LimitReached(f"container {container.tag!r} has {tx.settings.max_nodes} nodes already")
+    tx.put(replace(container, nodes={**container.nodes, node.tag: node}))
+    tx.touch(container.id)
+
+
+def remove_node(tx: Transaction, command: RemoveNode) -> None:
+    """Remove a node."""
+    container = _find(tx, command.user, command.container)
+    if command.tag not in container.nodes:
+        raise NotFound(f"container {container.tag!r} has no node {command.tag!r}")
+    tx.put(replace(container, nodes={t: n for t, n in container.nodes.items() if t != command.tag}))
+    tx.touch(container.id)
+
+
+def set_parameter(tx: Transaction, command: SetParameter) -> None:
+    """Set a parameter, whatever it was before."""
+    container = _find(tx, command.user, command.container)
+    _check_value(command.name, command.value)
+    there = container.parameters.get(command.name)
+    if there == command.value and type(there) is type(command.value):
+        return
+    if there is None and len(container.parameters) >= tx.settings.max_parameters:
+        raise LimitReached(f"container {container.tag!r} has {tx.settings.max_parameters} parameters already")
+    # Taken out first: 1 and True are equal, and an equal value must still replace the old one.
+    kept = {n: v for n, v in container.parameters.items() if n != command.name}
+    tx.put(replace(container, parameters=kept))
+    tx.put(replace(container, parameters={**kept, command.name: command.value}))
+    tx.touch(container.id)
+
+
+def delete_parameter(tx: Transaction, command: DeleteParameter) -> None:
+    """Delete a parameter."""
+    container = _find(tx, command.user, command.container)
+    if command.name not in container.parameters:
+        raise NotFound(f"container {container.tag!r} has no parameter {command.name!r}")
+    kept = {n: v for n, v in container.parameters.items() if n != command.name}
+    tx.put(replace(container, parameters=kept))
+    tx.touch(container.id)
+
+
+def _check_value(name: str, value: ParameterValue) -> None:
+    for item in value if isinstance(value, list) else [value]:
+        if isinstance(item, int) and not -_INT32 <= item < _INT32:
+            raise Invalid(f"parameter {name!r}: {item} does not fit into 32 bits, which is all that ROS has")
+        if isinstance(item, float) and not math.isfinite(item):
+            raise Invalid(f"parameter {name!r}: {item} is not a finite number")
+
+
+def _find(tx: Transaction, user: str, tag: str) -> Container:
+    found = tx.tables.endpoints.get(f"{user}/{tag}")
+    if isinstance(found, Container):
+        return found
+    if found is not None:
+        raise Invalid(f"{tag!r} is a robot, not a container")
+    raise NotFound(f"there is no container {tag!r}; create it first")
+
+
+# Placement
+
+
+def place_waiting(tx: Transaction) -> None:
+    """Place every container that is placed nowhere and for which there is a machine."""
+    for endpoint in tx.tables.endpoints.by("task_set", ""):
+        if isinstance(endpoint, Container):
+            task_set = _choose(tx, endpoint)
+            if task_set is not None:
+                bind(tx, endpoint, task_set.process)
+
+
+def bind(tx: Transaction, container: Container, process: str) -> None:
+    """Make a task set responsible for a container."""
+    tx.put(replace(container, task_set=process))
+    _happened(tx, container.id, ContainerEvent.PLACE)
+    tx.touch(container.id)
+
+
+def _choose(tx: Transaction, container: Container) -> TaskSet | None:
+    fitting = [
+        task_set
+        for task_set in tx.connected_task_sets(TaskSetKind.CONTAINER)
+        if _fits(tx, container, task_set)
+    ]
+    return min(
+        fitting, key=lambda s: (tx.tables.endpoints.count("task_set", s.process), s.process), default=None
+    )
+
+
+def _fits(tx: Transaction, container: Container, task_set: TaskSet) -> bool:
+    if tombstone_key(task_set.process, container.id) in tx.tables.tombstones:
+        return False
+    wished = container.resources
+    if not set(wished.special_features) <= set(task_set.machine.labels):
+        return False
+    if not wished.memory or not task_set.machine.memory:
+        return True
+    promised = sum(
+        e.resources.memory
+        for e in tx.tables.endpoints.by("task_set", task_set.process)
+        if isinstance(e, Container)
+    )
+    return promised + wished.memory <= task_set.machine.memory
+
+
+def tell_waiting(tx: Transaction) -> None:
+    """Tell users once of containers that have been waiting for a machine for long."""
+    for endpoint in tx.tables.endpoints.by("task_set", ""):
+        live = tx.tables.live[endpoint.id]
+        if not isinstance(endpoint, Container) or not isinstance(live, ContainerLive) or live.told:
+            continue
+        if tx.now - live.since >= tx.settings.placement_patience:
+            text = _why_waiting(tx, endpoint)
+            tx.put(replace(live, told=True))
+            tx.notify(endpoint.user, text)
+            tx.happen("container_waiting", endpoint.id, text)
+
+
+def _why_waiting(tx: Transaction, container: Container) -> str:
+    there = list(tx.connected_task_sets(TaskSetKind.CONTAINER))
+    start = f"container {container.tag!r} waits for a machine and starts as soon as there is one: "
+    if not there:
+        return start + "no container task set is connected"
+    features = container.resources.special_features
+    if features and not any(set(features) <= set(s.machine.labels) for s in there):
+        return start + f"none offers {', '.join(features)}"
+    return start + "none has room for it"
+
+
+# What task sets report
+
+
+def lose(tx: Transaction, container: Container) -> None:
+    """Give a container up at a task set that stayed away."""
+    text = f"container {container.tag!r} was lost with its machine {container.task_set!r}"
+    _unbind(tx, container, ContainerEvent.LOSE)
+    tx.notify(container.user, text)
+    tx.happen("container_lost", container.id, text)
+
+
+def ended(tx: Transaction, container: Container) -> None:
+    """Note that a container's task set ended it though it is desired; it is placed anew."""
+    _unbind(tx, container, ContainerEvent.WITHDRAW)
+    tx.happen("container_gone", container.id, "its task set ended it; it is placed anew")
+
+
+def _unbind(tx: Transaction, container: Container, event: ContainerEvent) -> None:
+    _move(tx, container, LinkAddress())
+    tx.put(replace(tx.tables.endpoints[container.id], task_set=""))
+    _happened(tx, container.id, event)
+    tx.put(replace(tx.tables.container_live(container.id), status=None))
+
+
+def missing(tx: Transaction, container: Container) -> None:
+    """Note that a task set came back without a container that is placed there; it makes it again."""
+    live = tx.tables.container_live(container.id)
+    if live.phase is not ContainerPhase.PLACED:
+        _happened(tx, container.id, ContainerEvent.PLACE)
+    tx.put(replace(tx.tables.container_live(container.id), status=None))
+    _move(tx, container, LinkAddress())
+
+
+def reported(tx: Transaction, container: Container, status: EndpointStatus) -> None:
+    """Note what its task set reports of a container."""
+    before = tx.tables.container_live(container.id)
+    event = _EVENTS[status.state]
+    if next_phase(before.phase, event) is not before.phase:
+        _happened(tx, container.id, event)
+        tx.happen(f"container_{event.value}", container.id, status.detail)
+    elif before.status and before.status.incarnation != status.incarnation:
+        tx.happen("container_restarted", container.id, status.detail)
+    _compare_nodes(tx, container.id, before.status, status)
+    tx.put(replace(tx.tables.container_live(container.id), status=status))
+    _move(tx, container, status.address)
+
+
+def _compare_nodes(tx: Transaction, id_: str, before: EndpointStatus | None, now: EndpointStatus) -> None:
+    old = {node.tag: node for node in before.nodes} if before else {}
+    for node in now.nodes:
+        was = old.get(node.tag)
+        if was is None or (was.state, was.pid) != (node.state, node.pid):
+            tx.happen(f"node_{node.state.value}", f"{id_}/{node.tag}", _node_text(node))
+
+
+def _node_text(node: NodeStatus) -> str:
+    if node.state is NodeState.FAILED and node.exit_code is not None and not node.detail:
+        how = f"signal {-node.exit_code}" if node.exit_code < 0 else f"exit code {node.exit_code}"
+        return f"ended by {how}"
+    return node.detail
+
+
+def _move(tx: Transaction, container: Container, address: LinkAddress) -> None:
+    current = tx.tables.endpoints[container.id]
+    assert isinstance(current, Container)
+    if current.address != address:
+        tx.put(replace(current, address=address))
+        endpoints.touch_dialers(tx, container.id)
+
+
+def _happened(tx: Transaction, id_: str, event: ContainerEvent) -> None:
+    live = tx.tables.container_live(id_)
+    tx.put(replace(live, phase=next_phase(live.phase, event), since=tx.now, told=False))

@@ -1,0 +1,132 @@
+"""The state: applies commands, one after the other, each wholly or not at all."""
+
+from __future__ import annotations
+
+import secrets
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from rce_master.exceptions import StoreError
+from rce_master.state import commands, containers, robots, task_sets, users, wiring
+from rce_master.state.changes import Changes, Transaction
+from rce_master.state.invariants import validate
+from rce_master.state.settings import StateSettings
+from rce_master.state.specs import build_spec
+from rce_master.state.tables import Snapshot, Tables
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rce.control.model import EndpointSpec
+
+_HANDLERS: dict[type, Callable[[Transaction, Any], None]] = {
+    commands.AddUser: users.add_user,
+    commands.SetPassword: users.set_password,
+    commands.RemoveUser: users.remove_user,
+    commands.AddToken: users.add_token,
+    commands.RemoveToken: users.remove_token,
+    commands.TaskSetArrived: task_sets.arrived,
+    commands.TaskSetLeft: task_sets.left,
+    commands.StatusReported: task_sets.status_reported,
+    commands.EndpointGone: task_sets.gone,
+    commands.FaultReported: task_sets.fault,
+    commands.RobotLogin: robots.login,
+    commands.RobotLeft: robots.left,
+    commands.Tick: task_sets.tick,
+    commands.DestroyContainer: containers.destroy_container,
+    commands.AddNode: containers.add_node,
+    commands.RemoveNode: containers.remove_node,
+    commands.SetParameter: containers.set_parameter,
+    commands.DeleteParameter: containers.delete_parameter,
+    commands.AddInterface: wiring.add_interface,
+    commands.RemoveInterface: wiring.remove_interface,
+    commands.Connect: wiring.connect,
+    commands.Disconnect: wiring.disconnect,
+}
+
+
+def _create_and_place(tx: Transaction, command: commands.CreateContainer) -> None:
+    containers.create_container(tx, command)
+    containers.place_waiting(tx)
+
+
+_HANDLERS[commands.CreateContainer] = _create_and_place
+
+
+def _new_token() -> str:
+    return secrets.token_hex(24)
+
+
+class State:
+    """Users, task sets, robots, containers and how they are wired, desired and observed.
+
+    No I/O, no clock, no task: the time comes with every command.
+
+    Args:
+        settings: Grace times and limits.
+        make_token: Makes the secret of a link.
+    """
+
+    def __init__(
+        self, settings: StateSettings | None = None, *, make_token: Callable[[], str] = _new_token
+    ) -> None:
+        self.tables = Tables()
+        self.settings = settings or StateSettings()
+        self._make_token = make_token
+
+    @classmethod
+    def load(cls, snapshot: Snapshot, now: float, settings: StateSettings | None = None) -> State:
+        """Go on from what the store holds.
+
+        Raises:
+            StoreError: A record cannot be read.
+        """
+        state = cls(settings)
+        try:
+            for table in state.tables.all:
+                table.load(snapshot.get(table.name, {}))
+        except msgspec.MsgspecError as error:
+            raise StoreError(f"a record in the store cannot be read: {error}") from error
+        task_sets.restart(state._begin(now))
+        return state
+
+    def apply(self, command: commands.Command, now: float) -> Changes:
+        """Apply a command.
+
+        Args:
+            command: What is asked or happened.
+            now: Seconds of a clock that never goes back.
+
+        Returns:
+            What changed and what has to follow.
+
+        Raises:
+            Refused: It cannot be done; nothing changed.
+        """
+        tx = self._begin(now)
+        try:
+            _HANDLERS[type(command)](tx, command)
+            return tx.seal()
+        except BaseException:
+            tx.changes.revert()
+            raise
+
+    def spec(self, endpoint: str) -> EndpointSpec:
+        """Tell what is desired of an endpoint.
+
+        Raises:
+            KeyError: There is no such endpoint.
+        """
+        return build_spec(self.tables, endpoint)
+
+    def validate(self) -> None:
+        """Check all invariants.
+
+        Raises:
+            AssertionError: One does not hold; the text says which.
+        """
+        validate(self.tables)
+
+    def _begin(self, now: float) -> Transaction:
+        return Transaction(self.tables, now, self.settings, self._make_token)

@@ -1,0 +1,62 @@
+"""What robots and containers have in common: removal, addresses, who dials whom."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from msgspec.structs import replace
+
+from rce.control.model import EndpointKind, LinkAddress
+from rce_master.state.records import Container, Endpoint, Link, Robot, Tombstone
+
+if TYPE_CHECKING:
+    from rce_master.state.changes import Transaction
+    from rce_master.state.tables import Tables
+
+
+def remove(tx: Transaction, id_: str, reason: str) -> None:
+    """Remove an endpoint with its links and have its task set drop it."""
+    endpoint = tx.tables.endpoints[id_]
+    for link in tx.tables.links.by("endpoint", id_):
+        tx.put_link(replace(link, connections={}))
+    tx.delete(tx.tables.endpoints, id_)
+    tx.delete(tx.tables.live, id_)
+    if endpoint.task_set:
+        withdraw(tx, endpoint, reason)
+
+
+def withdraw(tx: Transaction, endpoint: Endpoint, reason: str) -> None:
+    """Have the endpoint's present task set drop it.
+
+    A task set that is away learns it from ``Sync`` when it comes back.
+    """
+    if not tx.tables.is_connected(endpoint.task_set):
+        return
+    tx.withdraw(endpoint.task_set, endpoint.id, reason)
+    if isinstance(endpoint, Container):
+        tx.put(Tombstone(process=endpoint.task_set, id=endpoint.id))
+
+
+def dials(tables: Tables, link: Link, endpoint: str) -> bool:
+    """Tell whether this end of a link dials: a robot's end the container's, else the smaller id."""
+    kind = tables.endpoints[endpoint].kind
+    peer_kind = tables.endpoints[link.peer(endpoint)].kind
+    if kind is peer_kind:
+        return endpoint == link.a
+    return kind is EndpointKind.ROBOT
+
+
+def address(tables: Tables, id_: str) -> LinkAddress:
+    """Tell where an endpoint accepts links; empty while it is not up."""
+    endpoint = tables.endpoints[id_]
+    if isinstance(endpoint, Robot):
+        task_set = tables.task_sets.get(endpoint.task_set)
+        return task_set.address if task_set else LinkAddress()
+    return endpoint.address
+
+
+def touch_dialers(tx: Transaction, id_: str) -> None:
+    """Touch all endpoints that dial this one: its address changed."""
+    for link in tx.tables.links.by("endpoint", id_):
+        if not dials(tx.tables, link, id_):
+            tx.touch(link.peer(id_))

@@ -1,0 +1,132 @@
+"""The life cycles of a robot's session and of a container, each a literal transition table.
+
+Robot session:
+
+- *offline*: The robot is unknown; it has no endpoint.
+- *connected*: A task set holds its WebSocket connection.
+- *absent*: Its connection dropped, or its task set is away. The endpoint, with all interfaces and
+  connections, is kept for the grace time.
+
+Container:
+
+- *requested*: Desired, and placed nowhere yet.
+- *placed*: A task set was told to make it, and has not reported it since.
+- *starting*, *running*, *failed*, *stopping*: What its task set reports.
+- *lost*: Its task set stayed away beyond the grace time. Placed anew as soon as there is somewhere to go;
+  bound again if the task set comes back with it first.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+from rce_master.exceptions import InvalidTransition
+
+
+class RobotSession(Enum):
+    """Where a robot is in its life."""
+
+    OFFLINE = "offline"
+    CONNECTED = "connected"
+    ABSENT = "absent"
+
+
+class RobotEvent(Enum):
+    """What can happen to a robot."""
+
+    LOGIN = "login"
+    """It logged in, or its task set came back with it still connected."""
+    LEAVE = "leave"
+    """Its connection ended, or its task set went away."""
+    EXPIRE = "expire"
+    """The grace time is over."""
+
+
+class ContainerPhase(Enum):
+    """Where a container is in its life."""
+
+    REQUESTED = "requested"
+    PLACED = "placed"
+    STARTING = "starting"
+    RUNNING = "running"
+    FAILED = "failed"
+    STOPPING = "stopping"
+    LOST = "lost"
+
+    @property
+    def is_placed(self) -> bool:
+        """Whether a task set is responsible for it."""
+        return self not in (ContainerPhase.REQUESTED, ContainerPhase.LOST)
+
+
+class ContainerEvent(Enum):
+    """What can happen to a container."""
+
+    PLACE = "place"
+    """A task set is told to make it."""
+    STARTING = "starting"
+    RUNNING = "running"
+    FAILED = "failed"
+    STOPPING = "stopping"
+    WITHDRAW = "withdraw"
+    """Its task set ended it though it is desired."""
+    LOSE = "lose"
+    """Its task set stayed away beyond the grace time."""
+
+
+_ROBOT: dict[RobotSession, dict[RobotEvent, RobotSession]] = {
+    RobotSession.OFFLINE: {
+        RobotEvent.LOGIN: RobotSession.CONNECTED,
+    },
+    RobotSession.CONNECTED: {
+        RobotEvent.LEAVE: RobotSession.ABSENT,
+    },
+    RobotSession.ABSENT: {
+        RobotEvent.LOGIN: RobotSession.CONNECTED,
+        RobotEvent.EXPIRE: RobotSession.OFFLINE,
+    },
+}
+
+_REPORTED: dict[ContainerEvent, ContainerPhase] = {
+    ContainerEvent.PLACE: ContainerPhase.PLACED,
+    ContainerEvent.STARTING: ContainerPhase.STARTING,
+    ContainerEvent.RUNNING: ContainerPhase.RUNNING,
+    ContainerEvent.FAILED: ContainerPhase.FAILED,
+    ContainerEvent.STOPPING: ContainerPhase.STOPPING,
+    ContainerEvent.WITHDRAW: ContainerPhase.REQUESTED,
+    ContainerEvent.LOSE: ContainerPhase.LOST,
+}
+
+_CONTAINER: dict[ContainerPhase, dict[ContainerEvent, ContainerPhase]] = {
+    ContainerPhase.REQUESTED: {ContainerEvent.PLACE: ContainerPhase.PLACED},
+    ContainerPhase.PLACED: _REPORTED,
+    ContainerPhase.STARTING: _REPORTED,
+    ContainerPhase.RUNNING: _REPORTED,
+    ContainerPhase.FAILED: _REPORTED,
+    ContainerPhase.STOPPING: _REPORTED,
+    ContainerPhase.LOST: {ContainerEvent.PLACE: ContainerPhase.PLACED},
+}
+
+
+def next_session(session: RobotSession, event: RobotEvent) -> RobotSession:
+    """Tell a robot's session after an event.
+
+    Raises:
+        InvalidTransition: The event cannot happen now.
+    """
+    try:
+        return _ROBOT[session][event]
+    except KeyError:
+        raise InvalidTransition(session.value, event.value) from None
+
+
+def next_phase(phase: ContainerPhase, event: ContainerEvent) -> ContainerPhase:
+    """Tell a container's phase after an event.
+
+    Raises:
+        InvalidTransition: The event cannot happen now.
+    """
+    try:
+        return _CONTAINER[phase][event]
+    except KeyError:
+        raise InvalidTransition(phase.value, event.value) from None

@@ -1,0 +1,200 @@
+"""The records that the state is made of. All are immutable: a change replaces a record.
+
+Persistent records go to the store; the others (what is observed now) are made anew after a restart.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import TypeAlias
+
+from msgspec import Struct
+
+from rce.control.messages import MachineInfo, TaskSetKind  # noqa: TC001 - msgspec reads the annotations
+from rce.control.model import (
+    EndpointKind,
+    EndpointStatus,
+    InterfaceSpec,
+    LinkAddress,
+    NodeSpec,
+    ParameterValue,
+    Resources,
+)
+from rce_master.state.lifecycle import ContainerPhase, RobotSession  # noqa: TC001 - msgspec reads the annotations
+
+
+class UserRole(Enum):
+    """What a user may do."""
+
+    USER = "user"
+    """Their own robots and containers."""
+    ADMIN = "admin"
+    """Everything of everybody."""
+
+
+class User(Struct, frozen=True, kw_only=True):
+    """Somebody who may log in."""
+
+    name: str
+    role: UserRole
+    password: str
+    """argon2 over the SHA-256 hex of the password."""
+    created: float
+    """Seconds since 1970."""
+
+
+class Token(Struct, frozen=True, kw_only=True):
+    """A bearer token; only its digest is kept."""
+
+    digest: str
+    """SHA-256 hex of the token."""
+    user: str
+    label: str
+    created: float
+    expires: float
+    """Seconds since 1970."""
+
+
+class _Endpoint(Struct, frozen=True, kw_only=True):
+    """What robots and containers have in common."""
+
+    id: str
+    """``user/tag``."""
+    revision: int = 0
+    task_set: str = ""
+    """Process name of the task set that is responsible; empty: none."""
+    interfaces: dict[str, InterfaceSpec] = {}
+    """By tag."""
+
+    @property
+    def user(self) -> str:
+        """The user it belongs to."""
+        return self.id.partition("/")[0]
+
+    @property
+    def tag(self) -> str:
+        """Its name among the user's robots and containers."""
+        return self.id.partition("/")[2]
+
+
+class Robot(_Endpoint, frozen=True, kw_only=True, tag=True):
+    """A robot that logged in and is kept until its grace time is over."""
+
+    @property
+    def kind(self) -> EndpointKind:
+        """What an endpoint this is."""
+        return EndpointKind.ROBOT
+
+
+class Container(_Endpoint, frozen=True, kw_only=True, tag=True):
+    """A desired container."""
+
+    resources: Resources = Resources()
+    nodes: dict[str, NodeSpec] = {}
+    """By tag."""
+    parameters: dict[str, ParameterValue] = {}
+    """By name."""
+    address: LinkAddress = LinkAddress()
+    """Where it last accepted links; kept so that a restarted master desires what it desired before."""
+
+    @property
+    def kind(self) -> EndpointKind:
+        """What an endpoint this is."""
+        return EndpointKind.CONTAINER
+
+
+Endpoint: TypeAlias = Robot | Container
+
+
+class Connection(Struct, frozen=True, kw_only=True):
+    """A connection of an interface of a link's endpoint ``a`` with one of its endpoint ``b``."""
+
+    id: int
+    interface_a: str
+    interface_b: str
+
+
+class Link(Struct, frozen=True, kw_only=True):
+    """What joins two endpoints of a user; it is there while it has a connection."""
+
+    id: str
+    a: str
+    """Endpoint id; always the smaller one of the two."""
+    b: str
+    token: str
+    connections: dict[int, Connection] = {}
+    """By id, which is the channel number."""
+
+    def peer(self, endpoint: str) -> str:
+        """Tell the other endpoint's id."""
+        return self.b if endpoint == self.a else self.a
+
+
+class TaskSet(Struct, frozen=True, kw_only=True):
+    """A task set that is there, or was there a short while ago."""
+
+    process: str
+    kind: TaskSetKind
+    machine: MachineInfo
+    url: str = ""
+    address: LinkAddress = LinkAddress()
+
+
+class Counter(Struct, frozen=True, kw_only=True):
+    """A number that only grows: what it gave out is never given out again."""
+
+    name: str
+    value: int
+
+
+class RobotLive(Struct, frozen=True, kw_only=True):
+    """What is observed of a robot."""
+
+    id: str
+    session: RobotSession
+    since: float
+    """When the session became so; seconds of the clock that commands are applied with."""
+    status: EndpointStatus | None = None
+
+
+class ContainerLive(Struct, frozen=True, kw_only=True):
+    """What is observed of a container."""
+
+    id: str
+    phase: ContainerPhase
+    since: float
+    """When the phase became so; seconds of the clock that commands are applied with."""
+    status: EndpointStatus | None = None
+    told: bool = False
+    """Whether its user was told that there is nowhere to place it."""
+
+
+Live: TypeAlias = RobotLive | ContainerLive
+
+
+class Presence(Struct, frozen=True, kw_only=True):
+    """Whether a task set is connected."""
+
+    process: str
+    connected: bool
+    since: float
+
+
+class Tombstone(Struct, frozen=True, kw_only=True):
+    """A container that a task set was told to drop and has not reported gone.
+
+    Until it is gone, the same container is not placed at that task set again.
+    """
+
+    process: str
+    id: str
+
+    @property
+    def key(self) -> str:
+        """Its key."""
+        return tombstone_key(self.process, self.id)
+
+
+def tombstone_key(process: str, endpoint: str) -> str:
+    """Tell the key of a tombstone."""
+    return f"{process} {endpoint}"

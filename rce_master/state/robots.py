@@ -1,0 +1,103 @@
+"""Robots: login, absence, the end of the grace time."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from msgspec.structs import replace
+
+from rce.control.messages import TaskSetKind
+from rce.control.model import EndpointState, EndpointStatus
+from rce.protocol.names import EndpointId
+from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
+from rce_master.state import endpoints
+from rce_master.state.lifecycle import RobotEvent, RobotSession, next_session
+from rce_master.state.records import Robot, RobotLive
+
+if TYPE_CHECKING:
+    from rce_master.state.changes import Transaction
+    from rce_master.state.commands import RobotLeft, RobotLogin
+
+
+def login(tx: Transaction, command: RobotLogin) -> None:
+    """Let a robot in at a task set."""
+    try:
+        name = EndpointId.parse(command.id)
+    except ValueError as error:
+        raise Invalid(str(error)) from None
+    if name.user not in tx.tables.users:
+        raise NotFound(f"there is no user {name.user!r}")
+    task_set = tx.tables.task_sets.get(command.process)
+    if (
+        task_set is None
+        or task_set.kind is not TaskSetKind.ROBOT
+        or not tx.tables.is_connected(command.process)
+    ):
+        raise Conflict(f"{command.process!r} is no connected robot task set")
+    there = tx.tables.endpoints.get(command.id)
+    if there is None:
+        _new(tx, name)
+    elif not isinstance(there, Robot):
+        raise Conflict(f"{name.tag!r} is a container of user {name.user!r}; a robot needs another robotID")
+    _enter(tx, command.id, command.process)
+    tx.happen("robot_connected", command.id, f"at {command.process}")
+
+
+def _new(tx: Transaction, name: EndpointId) -> None:
+    if len(tx.tables.robots(name.user)) >= tx.settings.max_robots:
+        raise LimitReached(f"user {name.user!r} has {tx.settings.max_robots} robots already")
+    tx.put(Robot(id=str(name)))
+    tx.put(RobotLive(id=str(name), session=RobotSession.OFFLINE, since=tx.now))
+    tx.touch(str(name))
+
+
+def _enter(tx: Transaction, id_: str, process: str) -> None:
+    robot = tx.tables.robot(id_)
+    assert robot is not None
+    live = tx.tables.robot_live(id_)
+    if live.session is RobotSession.CONNECTED:
+        raise Conflict(f"robot {robot.tag!r} is connected already; a robotID can be used once at a time")
+    if robot.task_set != process:
+        if robot.task_set:
+            endpoints.withdraw(tx, robot, "the robot connected elsewhere")
+        tx.put(replace(robot, task_set=process))
+        tx.touch(id_)
+        endpoints.touch_dialers(tx, id_)
+    tx.put(replace(live, session=next_session(live.session, RobotEvent.LOGIN), since=tx.now, status=None))
+
+
+def left(tx: Transaction, command: RobotLeft) -> None:
+    """Note that a robot's connection ended."""
+    robot = tx.tables.robot(command.id)
+    if robot is not None and robot.task_set == command.process:
+        leave(tx, robot, command.reason)
+
+
+def leave(tx: Transaction, robot: Robot, reason: str) -> None:
+    """Begin a robot's grace time."""
+    live = tx.tables.robot_live(robot.id)
+    if live.session is RobotSession.CONNECTED:
+        tx.put(replace(live, session=next_session(live.session, RobotEvent.LEAVE), since=tx.now, status=None))
+        tx.happen("robot_left", robot.id, reason)
+
+
+def reported(tx: Transaction, robot: Robot, status: EndpointStatus) -> None:
+    """Note what its task set reports of a robot."""
+    live = tx.tables.robot_live(robot.id)
+    if status.state is EndpointState.RUNNING and live.session is RobotSession.ABSENT:
+        live = replace(live, session=next_session(live.session, RobotEvent.LOGIN), since=tx.now)
+        tx.happen("robot_connected", robot.id, f"still at {robot.task_set}")
+    elif status.state is EndpointState.ABSENT:
+        leave(tx, robot, status.detail)
+        live = tx.tables.robot_live(robot.id)
+    tx.put(replace(live, status=status))
+
+
+def expire(tx: Transaction) -> None:
+    """Remove the robots whose grace time is over."""
+    for robot in tx.tables.robots():
+        live = tx.tables.robot_live(robot.id)
+        if live.session is RobotSession.ABSENT and tx.now - live.since >= tx.settings.robot_grace:
+            next_session(live.session, RobotEvent.EXPIRE)
+            endpoints.remove(tx, robot.id, "the robot stayed away")
+            tx.happen("robot_gone", robot.id, "its interfaces and connections were removed")

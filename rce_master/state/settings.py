@@ -1,0 +1,29 @@
+"""Grace times and limits of the state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class StateSettings:
+    """Grace times in seconds, and how many of each a user may have."""
+
+    robot_grace: float = 60.0
+    """How long a robot's interfaces and connections are kept after its connection dropped."""
+    container_grace: float = 30.0
+    """How long a container task set may be away until its containers are placed elsewhere."""
+    placement_patience: float = 10.0
+    """How long a container waits for a machine until its user is told."""
+    max_robots: int = 2000
+    """Of one user."""
+    max_containers: int = 1000
+    """Of one user."""
+    max_nodes: int = 500
+    """In one container."""
+    max_parameters: int = 5000
+    """In one container."""
+    max_interfaces: int = 1000
+    """Of one endpoint."""
+    max_connections: int = 4000
+    """Of one endpoint."""

@@ -1,0 +1,221 @@
+"""The tables that hold the state's records, their indexes, and their form in the store."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, Generic, TypeVar
+
+import msgspec
+
+from rce_master.state.records import (
+    Container,
+    ContainerLive,
+    Counter,
+    Endpoint,
+    Link,
+    Live,
+    Presence,
+    Robot,
+    RobotLive,
+    TaskSet,
+    Token,
+    Tombstone,
+    User,
+)
+
+R = TypeVar("R")
+
+Snapshot = Mapping[str, Mapping[str, bytes]]
+"""What the store holds: table name to key to encoded record."""
+
+
+class Table(Generic[R]):
+    """Records by key, with indexes that are always up to date.
+
+    Args:
+        name: Name in the store.
+        persistent: Whether the records go to the store.
+        type_: What records are decoded as.
+        key: Tells a record's key.
+        indexes: By name.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        type_: Any,
+        key: Callable[[R], str],
+        persistent: bool = True,
+        **indexes: Callable[[R], Iterable[str]],
+    ) -> None:
+        self.name = name
+        self.persistent = persistent
+        self.key = key
+        self._decoder = msgspec.json.Decoder(type_)
+        self._rows: dict[str, R] = {}
+        self._indexes = indexes
+        # Inner dicts instead of sets keep the order of arrival, so that everything stays reproducible.
+        self._found: dict[str, dict[str, dict[str, None]]] = {name: {} for name in indexes}
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._rows
+
+    def __iter__(self) -> Iterator[R]:
+        return iter(self._rows.values())
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, key: str) -> R:
+        return self._rows[key]
+
+    def get(self, key: str) -> R | None:
+        """Find a record."""
+        return self._rows.get(key)
+
+    def by(self, index: str, value: str) -> list[R]:
+        """List the records that an index finds for a value, in order of arrival."""
+        return [self._rows[key] for key in self._found[index].get(value, ())]
+
+    def count(self, index: str, value: str) -> int:
+        """Tell how many records an index finds for a value."""
+        return len(self._found[index].get(value, ()))
+
+    def assign(self, key: str, record: R | None) -> None:
+        """Put a record in place of what was there; None removes it."""
+        before = self._rows.pop(key, None) if record is None else self._rows.get(key)
+        for name, of in self._indexes.items():
+            old = () if before is None else of(before)
+            new = () if record is None else of(record)
+            self._reindex(self._found[name], key, list(old), list(new))
+        if record is not None:
+            self._rows[key] = record
+
+    def encode(self, record: R) -> bytes:
+        """Encode a record for the store."""
+        return msgspec.json.encode(record)
+
+    def load(self, rows: Mapping[str, bytes]) -> None:
+        """Fill the table from the store.
+
+        Raises:
+            msgspec.ValidationError: A record cannot be read.
+        """
+        for key, body in rows.items():
+            self.assign(key, self._decoder.decode(body))
+
+    def index_entries(self, index: str) -> dict[str, list[str]]:
+        """Show an index: value to keys."""
+        return {value: list(keys) for value, keys in self._found[index].items()}
+
+    def computed_entries(self, index: str) -> dict[str, list[str]]:
+        """Compute anew what :meth:`index_entries` must hold, up to the order."""
+        entries: dict[str, list[str]] = {}
+        for key, record in self._rows.items():
+            for value in self._indexes[index](record):
+                entries.setdefault(value, []).append(key)
+        return entries
+
+    @property
+    def indexes(self) -> tuple[str, ...]:
+        """Names of the indexes."""
+        return tuple(self._indexes)
+
+    @staticmethod
+    def _reindex(entries: dict[str, dict[str, None]], key: str, before: list[str], after: list[str]) -> None:
+        if before == after:
+            return
+        for value in before:
+            del entries[value][key]
+            if not entries[value]:
+                del entries[value]
+        for value in after:
+            entries.setdefault(value, {})[key] = None
+
+
+class Tables:
+    """All tables.
+
+    - ``endpoints``: robots and containers; both in one table, because a tag is unique among both.
+    - ``links``: one for each pair of endpoints that has a connection.
+    - ``live``: exactly one record for each endpoint.
+    - ``presence``: exactly one record for each task set.
+    - ``tombstones``: only of connected task sets.
+    """
+
+    def __init__(self) -> None:
+        self.users = Table[User]("users", type_=User, key=lambda u: u.name)
+        self.tokens = Table[Token]("tokens", type_=Token, key=lambda t: t.digest, user=lambda t: [t.user])
+        self.endpoints = Table[Endpoint](
+            "endpoints",
+            type_=Robot | Container,
+            key=lambda e: e.id,
+            user=lambda e: [e.user],
+            task_set=lambda e: [e.task_set],
+        )
+        self.links = Table[Link]("links", type_=Link, key=lambda k: k.id, endpoint=lambda k: [k.a, k.b])
+        self.task_sets = Table[TaskSet]("task_sets", type_=TaskSet, key=lambda s: s.process)
+        self.counters = Table[Counter]("counters", type_=Counter, key=lambda c: c.name)
+        self.live = Table[Live]("live", type_=Any, key=lambda o: o.id, persistent=False)
+        self.presence = Table[Presence]("presence", type_=Any, key=lambda p: p.process, persistent=False)
+        self.tombstones = Table[Tombstone](
+            "tombstones", type_=Any, key=lambda t: t.key, persistent=False, process=lambda t: [t.process]
+        )
+
+    @property
+    def all(self) -> tuple[Table[Any], ...]:
+        """Every table."""
+        return (
+            self.users,
+            self.tokens,
+            self.endpoints,
+            self.links,
+            self.task_sets,
+            self.counters,
+            self.live,
+            self.presence,
+            self.tombstones,
+        )
+
+    def robot(self, endpoint: str) -> Robot | None:
+        """Find a robot by its endpoint id."""
+        found = self.endpoints.get(endpoint)
+        return found if isinstance(found, Robot) else None
+
+    def container(self, endpoint: str) -> Container | None:
+        """Find a container by its endpoint id."""
+        found = self.endpoints.get(endpoint)
+        return found if isinstance(found, Container) else None
+
+    def robots(self, user: str | None = None) -> list[Robot]:
+        """List the robots, of one user or of all."""
+        return [e for e in self._of(user) if isinstance(e, Robot)]
+
+    def containers(self, user: str | None = None) -> list[Container]:
+        """List the containers, of one user or of all."""
+        return [e for e in self._of(user) if isinstance(e, Container)]
+
+    def robot_live(self, endpoint: str) -> RobotLive:
+        """Tell what is observed of a robot."""
+        live = self.live[endpoint]
+        assert isinstance(live, RobotLive)
+        return live
+
+    def container_live(self, endpoint: str) -> ContainerLive:
+        """Tell what is observed of a container."""
+        live = self.live[endpoint]
+        assert isinstance(live, ContainerLive)
+        return live
+
+    def is_connected(self, process: str) -> bool:
+        """Tell whether a task set is connected."""
+        presence = self.presence.get(process)
+        return presence is not None and presence.connected
+
+    def link_between(self, one: str, other: str) -> Link | None:
+        """Find the link of two endpoints."""
+        return next((link for link in self.links.by("endpoint", one) if link.peer(one) == other), None)
+
+    def _of(self, user: str | None) -> Iterable[Endpoint]:
+        return self.endpoints if user is None else self.endpoints.by("user", user)

@@ -1,0 +1,185 @@
+"""Task sets: arrival, departure, reports, grace times."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rce.control.messages import Hello, TaskSetKind
+from rce.control.model import EndpointState, EndpointStatus
+from rce_master.exceptions import NotFound
+from rce_master.state import containers, endpoints, robots
+from rce_master.state.lifecycle import ContainerPhase, RobotSession
+from rce_master.state.records import (
+    Container,
+    ContainerLive,
+    Presence,
+    Robot,
+    RobotLive,
+    TaskSet,
+    tombstone_key,
+)
+
+if TYPE_CHECKING:
+    from rce_master.state.changes import Transaction
+    from rce_master.state.commands import (
+        EndpointGone,
+        FaultReported,
+        StatusReported,
+        TaskSetArrived,
+        TaskSetLeft,
+        Tick,
+    )
+
+
+def arrived(tx: Transaction, command: TaskSetArrived) -> None:
+    """Take a task set: adopt what runs there, note what is missing; ``Sync`` says the rest."""
+    hello = command.hello
+    _register(tx, hello)
+    running = {status.id: status for status in hello.endpoints}
+    # Revisions go on above all that was ever applied, even if the store was restored from an old copy.
+    tx.raise_counter("revision", max((s.revision for s in hello.endpoints), default=0))
+    for status in hello.endpoints:
+        _adopt(tx, hello.process, status)
+    for endpoint in tx.tables.endpoints.by("task_set", hello.process):
+        if endpoint.id not in running:
+            _miss(tx, endpoint)
+    for endpoint in tx.tables.endpoints.by("task_set", hello.process):
+        # A task set ignores a spec that is older than what it has.
+        if endpoint.id in running and running[endpoint.id].revision > endpoint.revision:
+            tx.touch(endpoint.id)
+    tx.changes.arrived = hello.process
+    containers.place_waiting(tx)
+
+
+def _register(tx: Transaction, hello: Hello) -> None:
+    before = tx.tables.task_sets.get(hello.process)
+    tx.put(
+        TaskSet(
+            process=hello.process,
+            kind=hello.kind,
+            machine=hello.machine,
+            url=hello.url,
+            address=hello.address,
+        )
+    )
+    tx.put(Presence(process=hello.process, connected=True, since=tx.now))
+    for tombstone in tx.tables.tombstones.by("process", hello.process):
+        tx.delete(tx.tables.tombstones, tombstone.key)
+    if before is not None and before.address != hello.address:
+        for endpoint in tx.tables.endpoints.by("task_set", hello.process):
+            if isinstance(endpoint, Robot):
+                endpoints.touch_dialers(tx, endpoint.id)
+    text = f"on {hello.machine.name}" + (f": {hello.machine.detail}" if hello.machine.detail else "")
+    tx.happen("task_set_connected", hello.process, text, user="")
+
+
+def _adopt(tx: Transaction, process: str, status: EndpointStatus) -> None:
+    endpoint = tx.tables.endpoints.get(status.id)
+    if isinstance(endpoint, Container) and not endpoint.task_set and _may_adopt(tx, process, status):
+        containers.bind(tx, endpoint, process)
+        endpoint = tx.tables.endpoints[status.id]
+    if endpoint is not None and endpoint.task_set == process:
+        _note(tx, endpoint, status)
+
+
+def _may_adopt(tx: Transaction, process: str, status: EndpointStatus) -> bool:
+    is_container_set = tx.tables.task_sets[process].kind is TaskSetKind.CONTAINER
+    return is_container_set and status.state is not EndpointState.STOPPING
+
+
+def _miss(tx: Transaction, endpoint: Container | Robot) -> None:
+    if isinstance(endpoint, Container):
+        containers.missing(tx, endpoint)
+    else:
+        robots.leave(tx, endpoint, "its task set does not have it any more")
+
+
+def left(tx: Transaction, command: TaskSetLeft) -> None:
+    """Note that a task set's channel ended: its robots become absent, its containers go on unseen."""
+    process = command.process
+    if not tx.tables.is_connected(process):
+        return
+    tx.put(Presence(process=process, connected=False, since=tx.now))
+    for tombstone in tx.tables.tombstones.by("process", process):
+        tx.delete(tx.tables.tombstones, tombstone.key)
+    for endpoint in tx.tables.endpoints.by("task_set", process):
+        if isinstance(endpoint, Robot):
+            robots.leave(tx, endpoint, f"its task set {process!r} is away")
+    tx.happen("task_set_left", process, user="")
+    containers.place_waiting(tx)
+
+
+def status_reported(tx: Transaction, command: StatusReported) -> None:
+    """Note what a task set reports of one endpoint; of one that is not placed there it is ignored."""
+    endpoint = tx.tables.endpoints.get(command.status.id)
+    if endpoint is not None and endpoint.task_set == command.process:
+        _note(tx, endpoint, command.status)
+
+
+def _note(tx: Transaction, endpoint: Container | Robot, status: EndpointStatus) -> None:
+    if isinstance(endpoint, Container):
+        containers.reported(tx, endpoint, status)
+    else:
+        robots.reported(tx, endpoint, status)
+
+
+def gone(tx: Transaction, command: EndpointGone) -> None:
+    """Note that an endpoint ended at a task set."""
+    key = tombstone_key(command.process, command.id)
+    if key in tx.tables.tombstones:
+        tx.delete(tx.tables.tombstones, key)
+        if command.id not in tx.tables.endpoints:
+            tx.happen("container_gone", command.id)
+    else:
+        endpoint = tx.tables.endpoints.get(command.id)
+        if isinstance(endpoint, Container) and endpoint.task_set == command.process:
+            containers.ended(tx, endpoint)
+    containers.place_waiting(tx)
+
+
+def fault(tx: Transaction, command: FaultReported) -> None:
+    """Tell the user of an endpoint of a fault."""
+    user = command.id.partition("/")[0]
+    if user not in tx.tables.users:
+        raise NotFound(f"there is no user {user!r}")
+    tx.notify(command.robot or user, command.text)
+    tx.happen("fault", command.id, command.text)
+
+
+def tick(tx: Transaction, _: Tick) -> None:
+    """End grace times that are over, place what waits, tell users who have waited for long."""
+    robots.expire(tx)
+    for presence in list(tx.tables.presence):
+        if not presence.connected:
+            _expire(tx, presence)
+    containers.place_waiting(tx)
+    containers.tell_waiting(tx)
+
+
+def _expire(tx: Transaction, presence: Presence) -> None:
+    task_set = tx.tables.task_sets[presence.process]
+    grace = tx.settings.container_grace if task_set.kind is TaskSetKind.CONTAINER else tx.settings.robot_grace
+    if tx.now - presence.since < grace:
+        return
+    for endpoint in tx.tables.endpoints.by("task_set", presence.process):
+        if isinstance(endpoint, Container):
+            containers.lose(tx, endpoint)
+    if not tx.tables.endpoints.by("task_set", presence.process):
+        tx.delete(tx.tables.task_sets, presence.process)
+        tx.delete(tx.tables.presence, presence.process)
+        tx.happen("task_set_gone", presence.process, f"away for {grace:.0f} s", user="")
+
+
+def restart(tx: Transaction) -> None:
+    """Begin with what the store held: nobody is connected, and every grace time starts now."""
+    for task_set in tx.tables.task_sets:
+        tx.put(Presence(process=task_set.process, connected=False, since=tx.now))
+    for endpoint in tx.tables.endpoints:
+        tx.put(_restarted(tx, endpoint))
+
+
+def _restarted(tx: Transaction, endpoint: Container | Robot) -> ContainerLive | RobotLive:
+    if isinstance(endpoint, Robot):
+        return RobotLive(id=endpoint.id, session=RobotSession.ABSENT, since=tx.now)
+    phase = ContainerPhase.PLACED if endpoint.task_set else ContainerPhase.REQUESTED
+    return ContainerLive(id=endpoint.id, phase=phase, since=tx.now)

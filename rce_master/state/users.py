@@ -1,0 +1,77 @@
+"""Commands on users and tokens."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from msgspec.structs import replace
+
+from rce.protocol.names import is_name
+from rce_master.exceptions import Conflict, Invalid, NotFound
+from rce_master.state import endpoints
+from rce_master.state.records import User, UserRole
+
+if TYPE_CHECKING:
+    from rce_master.state.changes import Transaction
+    from rce_master.state.commands import AddToken, AddUser, RemoveToken, RemoveUser, SetPassword
+
+
+def add_user(tx: Transaction, command: AddUser) -> None:
+    """Make a user."""
+    user = command.user
+    if not is_name(user.name):
+        raise Invalid(f"{user.name!r} is no user name: use letters, digits and '_', a letter first")
+    if user.name in tx.tables.users:
+        raise Conflict(f"there is a user {user.name!r} already")
+    tx.put(user)
+    tx.happen("user_added", user.name, user.role.value, user="")
+
+
+def set_password(tx: Transaction, command: SetPassword) -> None:
+    """Change a password and end the user's tokens."""
+    user = _find(tx, command.name)
+    tx.put(replace(user, password=command.password))
+    _forget_tokens(tx, user.name)
+    tx.happen("user_password_changed", user.name, user=user.name)
+
+
+def remove_user(tx: Transaction, command: RemoveUser) -> None:
+    """Remove a user with all that is theirs."""
+    user = _find(tx, command.name)
+    admins = [u for u in tx.tables.users if u.role is UserRole.ADMIN]
+    if admins == [user]:
+        raise Conflict(f"{user.name!r} is the last administrator; make another one first")
+    for endpoint in tx.tables.endpoints.by("user", user.name):
+        endpoints.remove(tx, endpoint.id, "the user was removed")
+    _forget_tokens(tx, user.name)
+    tx.delete(tx.tables.users, user.name)
+    tx.happen("user_removed", user.name, user="")
+
+
+def add_token(tx: Transaction, command: AddToken) -> None:
+    """Keep a token and forget what expired."""
+    token = command.token
+    _find(tx, token.user)
+    for old in tx.tables.tokens.by("user", token.user):
+        if old.expires <= token.created:
+            tx.delete(tx.tables.tokens, old.digest)
+    tx.put(token)
+
+
+def remove_token(tx: Transaction, command: RemoveToken) -> None:
+    """Forget a token."""
+    if command.digest not in tx.tables.tokens:
+        raise NotFound("there is no such token")
+    tx.delete(tx.tables.tokens, command.digest)
+
+
+def _find(tx: Transaction, name: str) -> User:
+    user = tx.tables.users.get(name)
+    if user is None:
+        raise NotFound(f"there is no user {name!r}")
+    return user
+
+
+def _forget_tokens(tx: Transaction, user: str) -> None:
+    for token in tx.tables.tokens.by("user", user):
+        tx.delete(tx.tables.tokens, token.digest)
