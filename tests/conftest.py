@@ -35,10 +35,19 @@ _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
         lambda: _runs("/usr/bin/python3", "-c", "import rospy"),
         "ROS 1 is not installed (Debian: python3-rospy ros-core)",
     ),
-    "rostopic": (lambda: shutil.which("rostopic") is not None, "rostopic is missing (Debian: python3-rostopic)"),
+    "rostopic": (
+        lambda: shutil.which("rostopic") is not None,
+        "rostopic is missing (Debian: python3-rostopic)",
+    ),
     "chromium": (lambda: chromium_path() is not None, "Chromium is not installed (Debian: chromium)"),
-    "pymunk": (lambda: _runs("python3", "-c", "") and _importable("pymunk"), "the extra 'fleet' is not installed"),
-    "data": (lambda: data_folder() is not None, "the folder of public maps and logs is absent (set RCE_DATA)"),
+    "pymunk": (
+        lambda: _runs("python3", "-c", "") and _importable("pymunk"),
+        "the extra 'fleet' is not installed",
+    ),
+    "data": (
+        lambda: data_folder() is not None,
+        "the folder of public maps and logs is absent (set RCE_DATA)",
+    ),
     "root": (lambda: os.geteuid() == 0, "needs root"),
 }
 
@@ -101,7 +110,9 @@ def _leaks(fds: dict[int, str], children: set[int], threads: set[threading.Threa
     found = [
         f"descriptor {fd} -> {target}"
         for fd, target in _descriptors().items()
-        if fds.get(fd) != target and not target.startswith(("/dev/", "anon_inode:", "/proc/")) and "__pycache__" not in target
+        if fds.get(fd) != target
+        and not target.startswith(("/dev/", "anon_inode:", "/proc/"))
+        and "__pycache__" not in target
     ]
     found += [
         f"process {child.pid} {child.name()}"
@@ -111,7 +122,10 @@ def _leaks(fds: dict[int, str], children: set[int], threads: set[threading.Threa
     found += [
         f"thread {thread.name}"
         for thread in threading.enumerate()
-        if thread not in threads and thread.is_alive() and not thread.daemon and not thread.name.startswith("asyncio_")
+        if thread not in threads
+        and thread.is_alive()
+        and not thread.daemon
+        and not thread.name.startswith("asyncio_")
     ]
     return found
 

@@ -1,7 +1,7 @@
 """Puts the ``rce`` program together from the commands that the packages plug in.
 
 A package adds a command by an entry point of the group ``rce.commands``: the entry point's name is the
-command, its value a function or a :class:`typer.Typer` of subcommands. So ``rce`` imports no package above it.
+command, its value a function or a :class:`typer.Typer` of subcommands. So ``rce`` imports nothing above it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ def _version(asked: bool) -> None:
 
 
 def _root(
-    version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
+    version: bool = typer.Option(
+        False, "--version", callback=_version, is_eager=True, help="Print the version."
+    ),
 ) -> None:
     """RCE, a cloud robotics engine: run it, look into it, drive a fleet on it."""
 

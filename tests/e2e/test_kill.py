@@ -58,7 +58,9 @@ def node_pids(engine: Engine) -> set[int]:
 
 
 def environment_pids(engine: Engine) -> list[psutil.Process]:
-    return [process for process in engine.processes_of("rce_container.environment") if "python" in process.name()]
+    return [
+        process for process in engine.processes_of("rce_container.environment") if "python" in process.name()
+    ]
 
 
 async def test_master_dies_and_comes_back() -> None:
@@ -69,7 +71,10 @@ async def test_master_dies_and_comes_back() -> None:
             await until(lambda: len(running.returned) > 50, what="traffic")
             await engine.master.kill()
             before = running.sent
-            await until(lambda: running.sent > before + 100 and before + 50 in running.returned, what="traffic without a master")
+            await until(
+                lambda: running.sent > before + 100 and before + 50 in running.returned,
+                what="traffic without a master",
+            )
             await engine.master.start()
             await until(engine.accepts_robots, what="the robot process is back")
             before = running.sent
@@ -80,7 +85,11 @@ async def test_master_dies_and_comes_back() -> None:
         assert (False in [state for _, state in client.statuses]) is False
         await client.send("CC", {"containerTag": "second"})
         await until(
-            lambda: [c for c in engine.get("/api/v1/containers")["containers"] if c["tag"] == "second" and c["state"] == "running"],
+            lambda: [
+                c
+                for c in engine.get("/api/v1/containers")["containers"]
+                if c["tag"] == "second" and c["state"] == "running"
+            ],
             what="a container made by the new master",
         )
         async with stranger(engine.url, robot="secondRobot") as other:
@@ -91,7 +100,11 @@ async def test_robot_process_dies_and_its_robots_come_back() -> None:
     async with running_engine(robots=2) as engine:
         async with stranger(engine.url) as client:
             await wire_echo(client)
-            victim = next(r for r, (ws, _) in zip(engine.robots, engine.robot_ports, strict=True) if client.socket.get_extra_info("peername")[1] == ws)
+            victim = next(
+                r
+                for r, (ws, _) in zip(engine.robots, engine.robot_ports, strict=True)
+                if client.socket.get_extra_info("peername")[1] == ws
+            )
             await victim.kill()
         await until(engine.accepts_robots, what="another robot process")
         nodes = node_pids(engine)
@@ -142,7 +155,9 @@ async def test_manager_dies_and_adopts_its_containers(runtime: str) -> None:
             await until(lambda: before + 50 in running.returned, what="traffic without a manager")
             await engine.container.start()
             await until(
-                lambda: [c for c in engine.get("/api/v1/containers")["containers"] if c["state"] == "running"],
+                lambda: [
+                    c for c in engine.get("/api/v1/containers")["containers"] if c["state"] == "running"
+                ],
                 what="the container is adopted",
             )
             before = running.sent

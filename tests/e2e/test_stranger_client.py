@@ -24,7 +24,9 @@ async def test_faults_are_told_and_nothing_else_is_lost() -> None:
     async with running_engine() as engine, stranger(engine.url) as client:
         await client.socket.send_str("no json")
         await client.send("XY", {})
-        await client.send("CN", {"addNodes": [{"containerTag": "nowhere", "nodeTag": "n", "pkg": "Test", "exe": "x"}]})
+        await client.send(
+            "CN", {"addNodes": [{"containerTag": "nowhere", "nodeTag": "n", "pkg": "Test", "exe": "x"}]}
+        )
         await client.wait_error("nowhere")
         await wire_echo(client)
         before = len(client.errors)

@@ -74,11 +74,18 @@ class Program:
         offset = self.log.stat().st_size if self.log.exists() else 0
         with self.log.open("ab") as log:
             self.process = await asyncio.create_subprocess_exec(
-                *self.argv, stdin=asyncio.subprocess.DEVNULL, stdout=log, stderr=log, env=self.env, start_new_session=True
+                *self.argv,
+                stdin=asyncio.subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                env=self.env,
+                start_new_session=True,
             )
 
         def is_ready() -> bool:
-            assert self.running, f"{self.name} ended with {self.process and self.process.returncode}:\n{self.output()}"
+            assert self.running, (
+                f"{self.name} ended with {self.process and self.process.returncode}:\n{self.output()}"
+            )
             with self.log.open("rb") as log:
                 log.seek(offset)
                 return ready.encode() in log.read()
@@ -172,8 +179,10 @@ class Engine:
 
     def get(self, path: str, *, token: str | None = None) -> Any:
         """GET from the master's HTTP server; JSON comes back decoded."""
-        headers = {"Authorization": f"Bearer {self.token() if token is None else token}"} if token != "" else {}
-        with urllib.request.urlopen(  # noqa: S310
+        headers = (
+            {"Authorization": f"Bearer {self.token() if token is None else token}"} if token != "" else {}
+        )
+        with urllib.request.urlopen(
             urllib.request.Request(self.url.rstrip("/") + path, headers=headers), timeout=10
         ) as reply:
             text = reply.read().decode()
@@ -185,7 +194,7 @@ class Engine:
             data=json.dumps({"userID": "testUser", "password": "testUser"}).encode(),
             headers={"Content-Type": "application/json"},
         )
-        with urllib.request.urlopen(request, timeout=10) as reply:  # noqa: S310
+        with urllib.request.urlopen(request, timeout=10) as reply:
             return str(json.loads(reply.read())["token"])
 
     def processes_of(self, needle: str) -> list[psutil.Process]:
@@ -198,7 +207,9 @@ def engine_processes(folder: Path) -> list[psutil.Process]:
     found = []
     for process in psutil.process_iter():
         try:
-            if str(folder) in " ".join(process.cmdline()) or process.environ().get("XDG_RUNTIME_DIR") == str(folder):
+            if str(folder) in " ".join(process.cmdline()) or process.environ().get("XDG_RUNTIME_DIR") == str(
+                folder
+            ):
                 found.append(process)
         except (psutil.NoSuchProcess, psutil.AccessDenied, psutil.ZombieProcess):
             continue

@@ -1,4 +1,4 @@
-"""A client written from ``docs/protocol.md`` alone: no import of the project, another WebSocket library (aiohttp)."""
+"""A client written from ``docs/protocol.md`` alone: imports nothing of the project, uses aiohttp."""
 
 from __future__ import annotations
 
@@ -88,7 +88,9 @@ class Stranger:
     async def wait_status(self, tags: dict[str, bool], *, timeout: float = 20) -> None:
         try:
             async with asyncio.timeout(timeout), self._changed:
-                await self._changed.wait_for(lambda: all(self.status.get(tag) == state for tag, state in tags.items()))
+                await self._changed.wait_for(
+                    lambda: all(self.status.get(tag) == state for tag, state in tags.items())
+                )
         except TimeoutError:
             raise AssertionError(f"wanted {tags}; status {self.status}, errors {self.errors}") from None
 
@@ -139,7 +141,9 @@ async def wire_echo(client: Stranger, *, container: str = "cTag_01", robot: str 
     await client.send(
         "CN",
         {
-            "addNodes": [{"containerTag": container, "nodeTag": "echo", "pkg": "Test", "exe": "stringEcho.py"}],
+            "addNodes": [
+                {"containerTag": container, "nodeTag": "echo", "pkg": "Test", "exe": "stringEcho.py"}
+            ],
             "addInterfaces": [
                 {
                     "endpointTag": {"cTag_01": container, "testRobot": robot}[endpoint],

@@ -1,0 +1,66 @@
+"""Measure the engine: ``python -m benchmarks [--quick] [--only NAME ...]``."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import uvloop
+
+from benchmarks import containers, fanout, rate, roundtrip
+from benchmarks.engine import RunningEngine, engine
+from benchmarks.figures import plot_round_trips, save, show
+
+Rows = list[dict[str, Any]]
+
+
+async def _memory(running: RunningEngine) -> Rows:
+    return await asyncio.to_thread(containers.memory, running)
+
+
+def suites(*, quick: bool) -> dict[str, tuple[str, Callable[[RunningEngine], Awaitable[Rows]]]]:
+    """What can be measured, by name."""
+    sizes = roundtrip.SIZES[::4] if quick else roundtrip.SIZES
+    passes, seconds = (1, 3.0) if quick else (3, 10.0)
+    return {
+        "memory": ("Memory of each task set, idle", _memory),
+        "start": ("Container start", lambda e: containers.start_times(e, count=5 if quick else 20)),
+        "many": ("Many containers", lambda e: containers.many(e, count=10 if quick else 100)),
+        "roundtrip": ("Round trip", lambda e: roundtrip.run(e, passes=passes, sizes=sizes)),
+        "rate": ("Message rate", lambda e: rate.run(e, seconds=seconds)),
+        "fanout": (
+            "Fan-out",
+            lambda e: fanout.run(e, clients=20 if quick else 200, rate=20.0, seconds=seconds),
+        ),
+    }
+
+
+async def measure(names: list[str], *, quick: bool, runtime: str) -> None:
+    """Run the chosen suites on one engine."""
+    results: dict[str, Rows] = {}
+    chosen = suites(quick=quick)
+    async with engine(runtime) as running:
+        for name in names or chosen:
+            title, suite = chosen[name]
+            rows = await suite(running)
+            show(title, rows)
+            results[name] = rows
+            if name == "roundtrip":
+                print("plot:", plot_round_trips(rows))
+    print("results:", save("engine", results))
+
+
+def main() -> None:
+    """Read the command line and measure."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="fewer sizes, clients and seconds")
+    parser.add_argument("--only", nargs="+", choices=suites(quick=True), default=[], metavar="NAME")
+    parser.add_argument("--runtime", default="auto", choices=("auto", "namespace", "process"))
+    options = parser.parse_args()
+    uvloop.run(measure(options.only, quick=options.quick, runtime=options.runtime))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,88 @@
+"""How fast a container is there, and what it and each task set weigh."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from time import perf_counter
+from typing import Any
+
+import psutil
+
+from benchmarks.engine import RunningEngine
+from benchmarks.figures import spread
+from benchmarks.wire import STRING, Robot, robot, serialized_string
+
+
+async def start_times(running: RunningEngine, *, count: int) -> list[dict[str, Any]]:
+    """Create -> first message of its node, sent as soon as the interfaces are active."""
+    times = []
+    async with robot(running.url, "starter") as client:
+        for number in range(count):
+            start = perf_counter()
+            await _create(client, f"start{number}")
+            await client.wait_active(f"request{number}", f"response{number}")
+            await client.send_forwarded(f"request{number}", serialized_string(5))
+            await client.receive_binary()
+            times.append(perf_counter() - start)
+            await client.send("DC", {"containerTag": f"start{number}"})
+    return [{"containers": count, "one after another": "create -> first message", **spread(times)}]
+
+
+async def many(running: RunningEngine, *, count: int) -> list[dict[str, Any]]:
+    """Create many at once, until every one's node has answered; then what they weigh while idle."""
+    async with robot(running.url, "crowd") as client:
+        start = perf_counter()
+        for number in range(count):
+            await _create(client, f"crowd{number}")
+        await client.wait_active(
+            *(f"request{n}" for n in range(count)), *(f"response{n}" for n in range(count)), timeout=300
+        )
+        for number in range(count):
+            await client.send_forwarded(f"request{number}", serialized_string(5))
+        for _ in range(count):
+            await client.receive_binary()
+        elapsed = perf_counter() - start
+        environments = running.named("rce_container.environment")
+        weight = sum(_own_memory(process) for process in environments) / max(1, len(environments)) / 1e6
+        for number in range(count):
+            await client.send("DC", {"containerTag": f"crowd{number}"})
+    return [{"containers": count, "all at once": f"{elapsed:.1f} s", "environment PSS MB": round(weight, 1)}]
+
+
+def memory(running: RunningEngine) -> list[dict[str, Any]]:
+    """Proportional set size of each task set, in MB."""
+    rows = []
+    for needle in ("rce_master", "rce_robot", "rce_container"):
+        for process in running.named(needle):
+            if "environment" not in " ".join(process.cmdline()):
+                rows.append({"process": needle, "PSS MB": round(_own_memory(process) / 1e6, 1)})
+    return rows
+
+
+def _own_memory(process: psutil.Process) -> int:
+    with contextlib.suppress(psutil.Error):
+        return int(process.memory_full_info().pss)
+    return 0
+
+
+async def _create(client: Robot, container: str) -> None:
+    number = container.lstrip("abcdefghijklmnopqrstuvwxyz")
+    interfaces = []
+    for tag, inside, outside, address in (
+        ("request", "Publisher", "Subscriber", "/stringEchoReq"),
+        ("response", "Subscriber", "Publisher", "/stringEchoResp"),
+    ):
+        common = {"interfaceTag": f"{tag}{number}", "className": STRING}
+        interfaces += [
+            {"endpointTag": container, "interfaceType": f"{inside}Interface", "addr": address, **common},
+            {"endpointTag": client.name, "interfaceType": f"{outside}Forwarder", **common},
+        ]
+    node = {"containerTag": container, "nodeTag": "echo", "pkg": "Test", "exe": "stringEcho.py"}
+    await client.send("CC", {"containerTag": container})
+    await client.send("CN", {"addNodes": [node], "addInterfaces": interfaces})
+    tags = [f"{tag}{number}" for tag in ("request", "response")]
+    await client.send(
+        "CX", {"connect": [{"tagA": f"{client.name}/{t}", "tagB": f"{container}/{t}"} for t in tags]}
+    )
+    await asyncio.sleep(0)

@@ -1,0 +1,111 @@
+"""An engine to measure, and a bare echo server to measure beside it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import shutil
+import socket
+import sys
+import tempfile
+from collections.abc import AsyncIterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+from rce.cli.process import Child
+
+BIN = Path(sys.executable).parent
+
+
+@dataclass(frozen=True)
+class RunningEngine:
+    """An engine in processes of its own."""
+
+    url: str
+    folder: Path
+    pid: int
+
+    def processes(self) -> list[psutil.Process]:
+        """Every process of the engine: task sets, environments, nodes."""
+        found = []
+        for process in psutil.process_iter():
+            with contextlib.suppress(psutil.Error):
+                if (
+                    process.environ().get("XDG_RUNTIME_DIR") == str(self.folder)
+                    or str(self.folder) in process.cmdline()
+                ):
+                    found.append(process)
+        return found
+
+    def named(self, needle: str) -> list[psutil.Process]:
+        """Its Python processes whose command line holds ``needle``."""
+        return [p for p in self.processes() if needle in " ".join(p.cmdline()) and "python" in p.name()]
+
+
+def free_ports(count: int) -> list[int]:
+    """TCP ports that nobody uses now."""
+    with contextlib.ExitStack() as stack:
+        sockets = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
+        return [sock.getsockname()[1] for sock in sockets]
+
+
+@contextlib.asynccontextmanager
+async def engine(runtime: str = "auto") -> AsyncIterator[RunningEngine]:
+    """Run ``rce up --dev`` on ports of its own."""
+    folder = Path(tempfile.mkdtemp(prefix="rce-bench-", dir="/tmp"))
+    names = ("--http-port", "--control-port", "--ws-port", "--robot-link-port", "--container-link-port")
+    ports = free_ports(len(names))
+    argv = [str(BIN / "rce"), "up", "--dev", "--state-dir", str(folder / "state"), "--runtime", runtime]
+    for name, port in zip(names, ports, strict=True):
+        argv += [name, str(port)]
+    child = await Child.start("rce up", argv, env={"XDG_RUNTIME_DIR": str(folder)})
+    log: list[str] = []
+    drain: asyncio.Task[None] | None = None
+    try:
+        async for line in child.lines():
+            log.append(line)
+            if line.startswith("RCE ready:"):
+                break
+        else:
+            raise RuntimeError("the engine did not start:\n" + "\n".join(log))
+        drain = asyncio.create_task(_drain(child))
+        yield RunningEngine(f"http://127.0.0.1:{ports[0]}/", folder, child.pid)
+    finally:
+        await child.stop(timeout=60)
+        if drain is not None:
+            await drain
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+async def _drain(child: Child) -> None:
+    async for _ in child.lines():
+        pass
+
+
+BARE_ECHO = """
+import asyncio, sys, uvloop
+from websockets.asyncio.server import serve
+async def echo(ws):
+    async for message in ws:
+        await ws.send(message)
+async def main():
+    async with serve(echo, "127.0.0.1", int(sys.argv[1]), compression=None, max_size=None):
+        print("ready", flush=True)
+        await asyncio.Event().wait()
+uvloop.run(main())
+"""
+
+
+@contextlib.asynccontextmanager
+async def bare_echo() -> AsyncIterator[str]:
+    """Run a bare websockets echo server under uvloop in its own process; yields its URL."""
+    (port,) = free_ports(1)
+    child = await Child.start("bare echo", [sys.executable, "-c", BARE_ECHO, str(port)])
+    try:
+        async for _ in child.lines():
+            break
+        yield f"ws://127.0.0.1:{port}/"
+    finally:
+        await child.stop()

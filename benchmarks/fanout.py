@@ -1,0 +1,65 @@
+"""One publisher, many clients: latency at each and what the robot task set costs."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import struct
+from time import perf_counter, time
+from typing import Any
+
+from benchmarks.engine import RunningEngine
+from benchmarks.figures import spread
+from benchmarks.wire import STRING, Robot, robot
+
+SIZE = 256
+
+
+async def run(running: RunningEngine, *, clients: int, rate: float, seconds: float) -> list[dict[str, Any]]:
+    """A robot publishes at ``rate``; ``clients`` other robots hear it through the engine."""
+    async with contextlib.AsyncExitStack() as stack:
+        source = await stack.enter_async_context(robot(running.url, "source"))
+        listeners = [
+            await stack.enter_async_context(robot(running.url, f"listener{n}")) for n in range(clients)
+        ]
+        await _wire(source, listeners)
+        process = running.named("rce-robot")[0]
+        latencies: list[float] = []
+        tasks = [asyncio.create_task(_listen(listener, latencies)) for listener in listeners]
+        cpu, start, sent = sum(process.cpu_times()[:2]), perf_counter(), 0
+        while (now := perf_counter() - start) < seconds:
+            stamp = struct.pack("<Id", SIZE, time()) + b"x" * (SIZE - 8)
+            await source.send_forwarded("out", stamp)
+            sent += 1
+            await asyncio.sleep(max(0.0, sent / rate - now))
+        await asyncio.sleep(0.5)
+        cpu = sum(process.cpu_times()[:2]) - cpu
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+    row = {"clients": clients, "rate Hz": rate, "sent": sent, "received": len(latencies), **spread(latencies)}
+    return [row | {"rce-robot cpu %": round(100 * cpu / (perf_counter() - start), 1)}]
+
+
+async def _wire(source: Robot, listeners: list[Robot]) -> None:
+    def interface(client: Robot, tag: str, kind: str) -> dict[str, str]:
+        return {"endpointTag": client.name, "interfaceTag": tag, "interfaceType": kind, "className": STRING}
+
+    await source.send(
+        "CN",
+        {
+            "addInterfaces": [
+                interface(source, "out", "SubscriberForwarder"),
+                *(interface(listener, "in", "PublisherForwarder") for listener in listeners),
+            ]
+        },
+    )
+    pairs = [{"tagA": f"{source.name}/out", "tagB": f"{listener.name}/in"} for listener in listeners]
+    await source.send("CX", {"connect": pairs})
+    await asyncio.gather(*(listener.wait_active("in") for listener in listeners))
+
+
+async def _listen(listener: Robot, latencies: list[float]) -> None:
+    while True:
+        frame = await listener.receive_binary()
+        latencies.append(time() - struct.unpack_from("<d", frame, 36)[0])

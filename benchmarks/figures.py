@@ -1,0 +1,81 @@
+"""Figures of a measurement: percentiles, tables, files, plots."""
+
+from __future__ import annotations
+
+import json
+import platform
+import time
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import psutil
+from rich.console import Console
+from rich.table import Table
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def percentile(values: Sequence[float], share: float) -> float:
+    """The value that ``share`` of the sorted values do not exceed (nearest rank)."""
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, int(share * len(ordered)))]
+
+
+def spread(seconds: Sequence[float]) -> dict[str, float]:
+    """Median, 95th and 99th percentile of times, in milliseconds."""
+    return {
+        f"p{round(100 * share)}_ms": round(1e3 * percentile(seconds, share), 4) for share in (0.5, 0.95, 0.99)
+    }
+
+
+def machine() -> dict[str, Any]:
+    """What was measured on."""
+    return {
+        "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "cores": psutil.cpu_count(),
+        "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "rce": version("rce"),
+    }
+
+
+def show(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print rows as a table."""
+    table = Table(title=title, title_justify="left")
+    for name in rows[0]:
+        table.add_column(name, justify="right")
+    for row in rows:
+        table.add_row(*(f"{value:.3f}" if isinstance(value, float) else str(value) for value in row.values()))
+    Console().print(table)
+
+
+def save(name: str, results: Mapping[str, Any]) -> Path:
+    """Write results as JSON."""
+    RESULTS.mkdir(exist_ok=True)
+    path = RESULTS / f"{name}.json"
+    path.write_text(json.dumps({"machine": machine(), **results}, indent=1) + "\n")
+    return path
+
+
+def plot_round_trips(rows: Sequence[Mapping[str, Any]]) -> Path:
+    """Draw median round trip over message size, a line per path."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(8, 5))
+    for path in dict.fromkeys(row["path"] for row in rows):
+        mine = [row for row in rows if row["path"] == path]
+        axes.loglog([row["bytes"] for row in mine], [row["p50_ms"] for row in mine], marker=".", label=path)
+    axes.set(xlabel="message size in bytes", ylabel="median round trip in ms")
+    axes.grid(visible=True, which="both", alpha=0.3)
+    axes.legend()
+    RESULTS.mkdir(exist_ok=True)
+    path = RESULTS / "roundtrip.svg"
+    figure.savefig(path, bbox_inches="tight")
+    plt.close(figure)
+    return path

@@ -1,0 +1,124 @@
+"""A robot for measurements: the client protocol with as little of its own around it as possible."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import json
+import struct
+import urllib.request
+from collections.abc import AsyncIterator
+from typing import Any
+
+from websockets.asyncio.client import ClientConnection, connect
+
+STRING = "std_msgs/String"
+ECHO = "Test/StringEcho"
+_ID = b"0" * 32
+
+
+def serialized_string(size: int) -> bytes:
+    """A serialized std_msgs/String of ``size`` characters."""
+    return struct.pack("<I", size) + b"x" * size
+
+
+class Robot:
+    """One connected robot."""
+
+    def __init__(self, socket: ClientConnection, name: str) -> None:
+        self.socket = socket
+        self.name = name
+        self.status: dict[str, bool] = {}
+
+    async def send(self, kind: str, data: Any) -> None:
+        """Send a message without binary values."""
+        await self.socket.send(json.dumps({"type": kind, "data": data}))
+
+    async def receive_json(self) -> dict[str, Any]:
+        """The data of the next data message; statuses on the way are noted, errors raised."""
+        while True:
+            frame = await self.socket.recv()
+            if isinstance(frame, bytes):
+                continue
+            message = json.loads(frame)
+            if message["type"] == "DM":
+                return dict(message["data"])
+            self._note(message)
+
+    async def receive_binary(self) -> bytes:
+        """The next binary value."""
+        while True:
+            frame = await self.socket.recv()
+            if isinstance(frame, bytes):
+                return frame
+            if not frame.startswith('{"type":"DM"') and not frame.startswith('{"type": "DM"'):
+                self._note(json.loads(frame))
+
+    def _note(self, message: dict[str, Any]) -> None:
+        if message["type"] == "ST":
+            self.status[message["data"]["iTag"]] = message["data"]["status"]
+        elif message["type"] == "ER":
+            raise RuntimeError(message["data"])
+
+    async def wait_active(self, *tags: str, timeout: float = 60) -> None:
+        """Wait until interfaces are active."""
+        async with asyncio.timeout(timeout):
+            while not all(self.status.get(tag) for tag in tags):
+                frame = await self.socket.recv()
+                if isinstance(frame, str):
+                    self._note(json.loads(frame))
+
+    async def send_forwarded(
+        self, tag: str, payload: bytes, *, number: str = "nil", cls: str = STRING
+    ) -> None:
+        """Send a serialized message: its text frame and its binary frame."""
+        data = {"iTag": tag, "type": cls, "msgID": number, "msg*": _ID.decode()}
+        await self.socket.send(json.dumps({"type": "DM", "data": data}))
+        await self.socket.send(_ID + payload)
+
+
+@contextlib.asynccontextmanager
+async def robot(master: str, name: str) -> AsyncIterator[Robot]:
+    """Connect a robot of testUser."""
+    query = "userID=testUser&version=20130902"
+    with await asyncio.to_thread(urllib.request.urlopen, f"{master}?{query}", timeout=10) as reply:
+        url = json.load(reply)["url"]
+    password = hashlib.sha256(b"testUser").hexdigest()
+    target = f"{url}?userID=testUser&robotID={name}&password={password}"
+    async with connect(target, max_size=None, compression=None, ping_interval=None) as socket:
+        yield Robot(socket, name)
+
+
+async def wire_echo(client: Robot, form: str, container: str = "bench") -> None:
+    """Make a container with the echo node, its topics and its service wired to the robot by ``form``."""
+    ends = [
+        ("request", "Publisher", "Subscriber", STRING, "/stringEchoReq"),
+        ("response", "Subscriber", "Publisher", STRING, "/stringEchoResp"),
+        ("service", "ServiceClient", "ServiceProvider", ECHO, "/stringEchoService"),
+    ]
+    interfaces = []
+    for tag, inside, outside, cls, address in ends:
+        interfaces.append(
+            {
+                "endpointTag": container,
+                "interfaceTag": tag,
+                "interfaceType": f"{inside}Interface",
+                "className": cls,
+            }
+            | {"addr": address}
+        )
+        interfaces.append(
+            {
+                "endpointTag": client.name,
+                "interfaceTag": tag,
+                "interfaceType": f"{outside}{form}",
+                "className": cls,
+            }
+        )
+    node = {"containerTag": container, "nodeTag": "echo", "pkg": "Test", "exe": "stringEcho.py"}
+    await client.send("CC", {"containerTag": container})
+    await client.send("CN", {"addNodes": [node], "addInterfaces": interfaces})
+    pairs = [{"tagA": f"{client.name}/{tag}", "tagB": f"{container}/{tag}"} for tag, *_ in ends]
+    await client.send("CX", {"connect": pairs})
+    await client.wait_active(*(tag for tag, *_ in ends))
