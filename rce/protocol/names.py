@@ -101,7 +101,10 @@ _TYPES = {str(t): t for t in (InterfaceType(role, form) for role in Role for for
 
 @dataclass(frozen=True, slots=True, order=True)
 class EndpointId:
-    """A robot or container of a user, written ``user/tag``. Tags are unique among a user's robots and containers."""
+    """A robot or container of a user, written ``user/tag``.
+
+    Tags are unique among a user's robots and containers.
+    """
 
     user: str
     tag: str

@@ -1,0 +1,230 @@
+"""Puts binary frames into the messages that refer to them.
+
+Any value of a JSON object may travel as a binary frame of its own: 32 ASCII hex characters, the *id*,
+followed by the bytes. The object then holds ``"key*": id`` instead of ``"key"``, or ``"key*": [ids]`` for a
+list of binary values. The frames of a message may arrive in any order and mixed with those of others.
+
+Invariants: every id is awaited by at most one message; an unclaimed value is awaited by none;
+``pending_bytes`` is the sum over all incomplete messages (their text and the values they have got) and all
+unclaimed values; both stay within the limits after every call.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from rce.protocol.exceptions import AssemblyError
+from rce.protocol.limits import DEFAULT_LIMITS, Limits
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+ID_LENGTH = 32
+"""Length of the id at the start of a binary frame, in bytes."""
+
+_ID = re.compile(r"[0-9A-Fa-f]{32}")
+_ID_BYTES = re.compile(rb"[0-9A-Fa-f]{32}")
+
+Binary: TypeAlias = bytes | bytearray | memoryview
+
+
+@dataclass(eq=False, slots=True)
+class _Partial:
+    """A message that waits for binary values."""
+
+    value: Any
+    size: int
+    deadline: float
+    places: dict[str, tuple[Any, Any]]
+    """Id to the container and key (or index) where its value belongs."""
+    missing: set[str] = field(default_factory=set)
+
+
+@dataclass(eq=False, slots=True)
+class _Unclaimed:
+    """A binary value that no message has asked for yet."""
+
+    id: str
+    data: memoryview
+    size: int
+    deadline: float
+
+
+class Assembler:
+    """Joins parsed text frames with binary frames. Pure: time comes in as ``now``, in seconds."""
+
+    def __init__(self, limits: Limits = DEFAULT_LIMITS) -> None:
+        self._limits = limits
+        self._entries: dict[int, _Partial | _Unclaimed] = {}  # oldest first
+        self._awaited: dict[str, _Partial] = {}
+        self._unclaimed: dict[str, _Unclaimed] = {}
+        self.pending_bytes = 0
+        """Bytes that are kept for what is not complete."""
+
+    def __len__(self) -> int:
+        """Count the incomplete messages and unclaimed values."""
+        return len(self._entries)
+
+    @property
+    def next_deadline(self) -> float | None:
+        """When :meth:`expire` has something to do next, if ever."""
+        oldest = next(iter(self._entries.values()), None)
+        return None if oldest is None else oldest.deadline
+
+    def add_message(self, value: Any, size: int, now: float) -> tuple[bool, list[str]]:
+        """Take a parsed text frame.
+
+        Args:
+            value: The JSON value; starred keys in it are replaced in place.
+            size: Length of the text, what it counts in memory.
+            now: Seconds on the caller's clock.
+
+        Returns:
+            Whether ``value`` is complete, and a text for everything that had to be dropped.
+
+        Raises:
+            AssemblyError: A reference in it is wrong; the message is refused.
+        """
+        places = self._claim_places(value)
+        found = [self._unclaimed[id_] for id_ in places if id_ in self._unclaimed]
+        for unclaimed in found:
+            self._forget(unclaimed)
+            _put(places[unclaimed.id], unclaimed.data)
+        if len(found) == len(places):
+            return True, []
+        partial = _Partial(
+            value,
+            size + sum(unclaimed.size for unclaimed in found),
+            now + self._limits.expiry,
+            places,
+            set(places).difference(unclaimed.id for unclaimed in found),
+        )
+        self._awaited.update(dict.fromkeys(partial.missing, partial))
+        return False, self._keep(partial)
+
+    def add_binary(self, frame: Binary, now: float) -> tuple[Any, list[str]]:
+        """Take a binary frame.
+
+        Args:
+            frame: The id and the bytes after it; kept, not copied.
+            now: Seconds on the caller's clock.
+
+        Returns:
+            The message that this frame completed (``None`` if it completed none), and a text for everything
+            that had to be dropped.
+
+        Raises:
+            AssemblyError: The frame is wrong, or its id was there already.
+        """
+        if not _ID_BYTES.match(frame):
+            raise AssemblyError(f"a binary frame must start with {ID_LENGTH} hexadecimal characters")
+        id_ = bytes(frame[:ID_LENGTH]).decode("ascii")
+        data = memoryview(frame)[ID_LENGTH:]
+        partial = self._awaited.pop(id_, None)
+        if partial is None:
+            if id_ in self._unclaimed:
+                raise AssemblyError(f"binary value {id_} came twice")
+            unclaimed = _Unclaimed(id_, data, len(frame), now + self._limits.expiry)
+            self._unclaimed[id_] = unclaimed
+            return None, self._keep(unclaimed)
+        _put(partial.places[id_], data)
+        partial.missing.discard(id_)
+        partial.size += len(frame)
+        self.pending_bytes += len(frame)
+        if partial.missing:
+            return None, self._shrink()
+        self._forget(partial)
+        return partial.value, []
+
+    def expire(self, now: float) -> list[str]:
+        """Drop what is older than the limit; return a text for each."""
+        dropped = []
+        while self._entries:
+            oldest = next(iter(self._entries.values()))
+            if oldest.deadline > now:
+                break
+            self._forget(oldest)
+            dropped.append(f"{_describe(oldest)} within {self._limits.expiry:g} s; dropped")
+        return dropped
+
+    def _claim_places(self, value: Any) -> dict[str, tuple[Any, Any]]:
+        """Replace the starred keys by empty places; check everything before anything is changed."""
+        references = list(_references(value))
+        places: dict[str, tuple[Any, Any]] = {}
+        count = 0
+        for holder, key in references:
+            name = key[:-1]
+            if not name or name in holder:
+                raise AssemblyError(
+                    f"{key!r}: there is a value {name!r} already" if name else "'*': the name is missing"
+                )
+            ids = holder[key] if isinstance(holder[key], list) else [holder[key]]
+            count += len(ids)
+            if count > self._limits.max_references:
+                raise AssemblyError(f"more than {self._limits.max_references} binary values in a message")
+            for id_ in ids:
+                if not isinstance(id_, str) or not _ID.fullmatch(id_):
+                    raise AssemblyError(
+                        f"{key!r}: an id must be a string of {ID_LENGTH} hexadecimal characters"
+                    )
+                if id_ in places or id_ in self._awaited:
+                    raise AssemblyError(f"{key!r}: binary value {id_} is referred to twice")
+                places[id_] = (holder, name)
+        for holder, key in references:
+            ids = holder.pop(key)
+            holder[key[:-1]] = ids if isinstance(ids, list) else None
+            if isinstance(ids, list):
+                places.update((id_, (ids, index)) for index, id_ in enumerate(ids))
+        return places
+
+    def _keep(self, entry: _Partial | _Unclaimed) -> list[str]:
+        self._entries[id(entry)] = entry
+        self.pending_bytes += entry.size
+        return self._shrink()
+
+    def _shrink(self) -> list[str]:
+        """Drop the oldest until the rest is within the limits."""
+        dropped = []
+        limits = self._limits
+        while self.pending_bytes > limits.max_pending_bytes or len(self._entries) > limits.max_pending:
+            oldest = next(iter(self._entries.values()))
+            self._forget(oldest)
+            dropped.append(f"{_describe(oldest)} and too much is incomplete; the oldest was dropped")
+        return dropped
+
+    def _forget(self, entry: _Partial | _Unclaimed) -> None:
+        del self._entries[id(entry)]
+        self.pending_bytes -= entry.size
+        if isinstance(entry, _Unclaimed):
+            del self._unclaimed[entry.id]
+        else:
+            for id_ in entry.missing:
+                del self._awaited[id_]
+
+
+def _put(place: tuple[Any, Any], data: memoryview) -> None:
+    holder, key = place
+    holder[key] = data
+
+
+def _references(value: Any) -> Iterator[tuple[dict[str, Any], str]]:
+    """Find all starred keys: pairs of the object that holds one and the key."""
+    stack = [value]
+    while stack:
+        item = stack.pop()
+        if type(item) is dict:
+            for key, inner in item.items():
+                if key.endswith("*"):
+                    yield item, key
+                elif type(inner) is dict or type(inner) is list:
+                    stack.append(inner)
+        elif type(item) is list:
+            stack.extend(inner for inner in item if type(inner) is dict or type(inner) is list)
+
+
+def _describe(entry: _Partial | _Unclaimed) -> str:
+    if isinstance(entry, _Unclaimed):
+        return f"no message asked for binary value {entry.id} ({entry.size - ID_LENGTH} bytes)"
+    return f"{len(entry.missing)} of {len(entry.places)} binary values of a message did not come"

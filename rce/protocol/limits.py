@@ -1,0 +1,31 @@
+"""How much one client may send, and for how long the engine waits for the rest of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+MAX_MESSAGE_ID_LENGTH = 255
+"""Longest ``msgID`` of a data message, in characters."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Limits of one connection."""
+
+    max_text: int = 64 * 2**20
+    """Longest text frame: characters if given as ``str``, else bytes."""
+    max_binary: int = 64 * 2**20
+    """Longest binary frame in bytes, with its id."""
+    max_depth: int = 64
+    """Deepest nesting of objects and lists; the message itself is depth 1."""
+    max_pending_bytes: int = 128 * 2**20
+    """Bytes kept of messages that are not complete."""
+    max_pending: int = 256
+    """How many incomplete messages and unclaimed binary values are kept."""
+    max_references: int = 4096
+    """How many binary values one message may have."""
+    expiry: float = 60.0
+    """Seconds after which what is still incomplete is dropped."""
+
+
+DEFAULT_LIMITS = Limits()

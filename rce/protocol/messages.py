@@ -1,0 +1,246 @@
+"""The messages between a client and its robot endpoint, as types.
+
+Attribute names are snake_case; on the wire they are camelCase (``container_tag`` is ``containerTag``).
+:mod:`rce.protocol.reading` makes them from JSON and checks them, :mod:`rce.protocol.codec` writes them.
+Wire source: ``docs/protocol.md``.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, TypeAlias
+
+from msgspec import Meta, Struct, field
+
+from rce.protocol.limits import MAX_MESSAGE_ID_LENGTH
+from rce.protocol.names import CLASS_PATTERN, MAX_NAME_LENGTH, NAME_PATTERN, Form, Role
+
+ROS_NAME_PATTERN = r"[~/]?[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*"
+"""What a ROS topic, service, parameter or namespace may be called."""
+
+_TYPE_PATTERN = f"({'|'.join(r.value for r in Role)})({'|'.join(f.value for f in Form)})"
+_EXECUTABLE_PATTERN = r"(?!/)(?!(.*/)?\.\.(/|\Z))[^\x00-\x1f\x7f]+"
+
+Name = Annotated[str, Meta(pattern=rf"^{NAME_PATTERN}\Z", max_length=MAX_NAME_LENGTH)]
+"""Names a user, robot, container, node or interface."""
+ClassName = Annotated[str, Meta(pattern=rf"^{CLASS_PATTERN}\Z", max_length=2 * MAX_NAME_LENGTH)]
+"""A message or service class, ``package/Type``."""
+TypeName = Annotated[str, Meta(pattern=rf"^{_TYPE_PATTERN}\Z")]
+"""An interface type such as ``PublisherConverter``."""
+RosName = Annotated[str, Meta(pattern=rf"^{ROS_NAME_PATTERN}\Z", max_length=255)]
+"""A ROS name."""
+OptionalRosName = Annotated[str, Meta(pattern=rf"^({ROS_NAME_PATTERN})?\Z", max_length=255)]
+"""A ROS name or the empty string."""
+OptionalName = Annotated[str, Meta(pattern=rf"^({NAME_PATTERN})?\Z", max_length=MAX_NAME_LENGTH)]
+"""A name or the empty string."""
+OptionalNamespace = Annotated[str, Meta(pattern=rf"^(/|{ROS_NAME_PATTERN}/?)?\Z", max_length=255)]
+"""A ROS namespace or the empty string."""
+Executable = Annotated[str, Meta(pattern=rf"^{_EXECUTABLE_PATTERN}\Z", max_length=255)]
+"""A file below a package's folders; never absolute, never above the package."""
+InterfacePath = Annotated[
+    str, Meta(pattern=rf"^{NAME_PATTERN}/{NAME_PATTERN}\Z", max_length=2 * MAX_NAME_LENGTH)
+]
+"""An interface of an endpoint, ``ENDPOINT/INTERFACE``."""
+MessageId = Annotated[str, Meta(max_length=MAX_MESSAGE_ID_LENGTH)]
+"""Echoed in the answer to a service request."""
+Text = Annotated[str, Meta(max_length=65536, pattern=r"^[^\x00]*\Z")]
+"""Free text without a NUL, which no argument and no file name may hold."""
+Scalar: TypeAlias = bool | int | float | str
+Value: TypeAlias = bool | int | float | str | list[Scalar]
+"""A parameter's value."""
+
+NO_ID = "nil"
+"""The ``msgID`` of a message that expects no answer."""
+UPDATE_TOPIC = "iu"
+"""The ``topic`` of an interface's status."""
+
+HUMAN_PATTERNS: dict[str, str] = {
+    rf"^{NAME_PATTERN}\Z": "must be a name: letters, digits and '_', a letter first",
+    rf"^({NAME_PATTERN})?\Z": "must be a name: letters, digits and '_', a letter first",
+    rf"^{CLASS_PATTERN}\Z": "must be a class of the form package/Type",
+    rf"^{_TYPE_PATTERN}\Z": (
+        f"must be an interface type: one of {', '.join(r.value for r in Role)},"
+        f" followed by one of {', '.join(f.value for f in Form)}"
+    ),
+    rf"^{ROS_NAME_PATTERN}\Z": "must be a ROS name such as /group/topic",
+    rf"^({ROS_NAME_PATTERN})?\Z": "must be a ROS name such as /group/topic",
+    rf"^(/|{ROS_NAME_PATTERN}/?)?\Z": "must be a ROS namespace such as /Robot1",
+    rf"^{_EXECUTABLE_PATTERN}\Z": "must be the name of a file inside the package",
+    rf"^{NAME_PATTERN}/{NAME_PATTERN}\Z": "must have the form ENDPOINT/INTERFACE",
+    r"^[^\x00]*\Z": "must not hold a NUL character",
+}
+"""What to tell a client instead of a regular expression."""
+
+
+class _Part(Struct, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
+    """Base of everything that appears in a message; unknown keys are ignored."""
+
+
+class ContainerData(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
+    """What a container asks for; zero or empty means no wish."""
+
+    group: Text = ""
+    group_ip: Text = ""
+    size: Annotated[int, Meta(ge=0, le=2**31)] = 1
+    cpu: Annotated[float, Meta(ge=0)] = 0.0
+    """Cores."""
+    memory: Annotated[int, Meta(ge=0, lt=2**63)] = 0
+    """Bytes."""
+    bandwidth: Annotated[int, Meta(ge=0, lt=2**63)] = 0
+    """Bytes per second."""
+    special_features: list[Text] | Text = []
+    """Labels that the machine must have; a string is a list of its words."""
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        """The special features as a tuple, whichever way they were written."""
+        given = self.special_features
+        return tuple(given.split()) if isinstance(given, str) else tuple(given)
+
+
+class CreateContainer(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
+    """``CC``: make a container."""
+
+    container_tag: Name
+    container_data: ContainerData = ContainerData()
+
+
+class DestroyContainer(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
+    """``DC``: remove a container and all that is in it."""
+
+    container_tag: Name
+
+
+class AddNode(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
+    """Start a node in a container."""
+
+    container_tag: Name
+    node_tag: Name
+    pkg: Name
+    exe: Executable
+    args: Text = ""
+    name: OptionalName = ""
+    namespace: OptionalNamespace = ""
+
+
+class RemoveNode(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
+    """Stop a node."""
+
+    container_tag: Name
+    node_tag: Name
+
+
+class AddInterface(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
+    """Make an interface of a container or a robot."""
+
+    endpoint_tag: Name
+    interface_tag: Name
+    interface_type: TypeName
+    class_name: ClassName
+    addr: OptionalRosName = ""
+    """ROS name of the topic or service; container ends need it."""
+
+
+class RemoveInterface(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
+    """Remove an interface and its connections."""
+
+    endpoint_tag: Name
+    interface_tag: Name
+
+
+class SetParam(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
+    """Set a parameter of a container."""
+
+    container_tag: Name
+    name: RosName
+    value: Value
+
+
+class DeleteParam(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
+    """Delete a parameter of a container."""
+
+    container_tag: Name
+    name: RosName
+
+
+class Connection(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
+    """Two interfaces that are (to be) joined."""
+
+    tag_a: InterfacePath
+    tag_b: InterfacePath
+
+
+class ConfigureComponents(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
+    """``CN``: add and remove nodes, interfaces and parameters. Removals are meant to be done first."""
+
+    add_nodes: tuple[AddNode, ...] = ()
+    remove_nodes: tuple[RemoveNode, ...] = ()
+    add_interfaces: tuple[AddInterface, ...] = ()
+    remove_interfaces: tuple[RemoveInterface, ...] = ()
+    set_param: tuple[SetParam, ...] = ()
+    delete_param: tuple[DeleteParam, ...] = ()
+    faults: tuple[str, ...] = ()
+    """One text for each item that was refused in reading; not on the wire."""
+
+
+class ConfigureConnections(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
+    """``CX``: join and part interfaces."""
+
+    connect: tuple[Connection, ...] = ()
+    disconnect: tuple[Connection, ...] = ()
+    faults: tuple[str, ...] = ()
+    """One text for each item that was refused in reading; not on the wire."""
+
+
+class DataMessage(Struct, frozen=True, omit_defaults=False):
+    """``DM``: a message on a topic, a service request or its answer, at one interface."""
+
+    i_tag: Name = field(name="iTag")
+    type: ClassName
+    msg: Any
+    """A JSON object, or bytes where the message travels serialized."""
+    msg_id: MessageId = field(name="msgID", default=NO_ID)
+
+
+class InterfaceStatus(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
+    """``ST``: an interface became usable (``True``) or unusable."""
+
+    i_tag: Name
+    status: bool
+    topic: str = field(default_factory=lambda: UPDATE_TOPIC)
+
+
+class ErrorReport(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
+    """``ER``: something that the client asked for failed."""
+
+    text: str
+
+
+Request: TypeAlias = CreateContainer | DestroyContainer | ConfigureComponents | ConfigureConnections
+"""What a client may ask of the master."""
+ClientMessage: TypeAlias = Request | DataMessage | InterfaceStatus | ErrorReport
+"""Any message of the protocol."""
+
+REQUEST_TYPES: dict[str, type[Request]] = {
+    "CC": CreateContainer,
+    "DC": DestroyContainer,
+    "CN": ConfigureComponents,
+    "CX": ConfigureConnections,
+}
+TYPES: dict[str, type[ClientMessage]] = {
+    **REQUEST_TYPES,
+    "DM": DataMessage,
+    "ST": InterfaceStatus,
+    "ER": ErrorReport,
+}
+"""The value of ``type`` to the class of the message."""
+UPWARD = frozenset(("CC", "DC", "CN", "CX", "DM"))
+"""Types that a client sends."""
+DOWNWARD = frozenset(("DM", "ST", "ER"))
+"""Types that the engine sends."""
+
+_TAGS = {cls: tag for tag, cls in TYPES.items()}
+
+
+def type_of(message: ClientMessage) -> str:
+    """Return the value of ``type`` for a message, such as ``CN``."""
+    return _TAGS[type(message)]
