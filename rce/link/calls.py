@@ -1,0 +1,155 @@
+"""Service calls: who waits for an answer, and who works on one."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from typing import TYPE_CHECKING
+
+from rce.link.exceptions import NotConnected, Overloaded
+from rce.link.frames import MAX_ID
+from rce.link.tasks import TaskScope
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from rce.link.channel import Channel
+    from rce.link.interface import Buffer
+    from rce.link.settings import LinkLimits
+
+log = logging.getLogger(__name__)
+
+
+class PendingCalls:
+    """Calls of one channel that have no answer yet, by id."""
+
+    def __init__(self, max_calls: int) -> None:
+        self._max_calls = max_calls
+        self._last = 0
+        self._answers: dict[int, asyncio.Future[bytes]] = {}
+
+    def __len__(self) -> int:
+        return len(self._answers)
+
+    def add(self) -> tuple[int, asyncio.Future[bytes]]:
+        """Begin a call.
+
+        Returns:
+            Its id and its answer.
+
+        Raises:
+            Overloaded: Too many calls have no answer.
+        """
+        if len(self._answers) >= self._max_calls:
+            raise Overloaded(f"{len(self._answers)} calls have no answer yet")
+        self._last = self._last % MAX_ID + 1
+        while self._last in self._answers:
+            self._last = self._last % MAX_ID + 1
+        answer = asyncio.get_running_loop().create_future()
+        self._answers[self._last] = answer
+        return self._last, answer
+
+    def drop(self, call_id: int) -> bool:
+        """Forget a call; false if it was answered."""
+        return self._answers.pop(call_id, None) is not None
+
+    def answer(self, call_id: int, payload: bytes) -> None:
+        """Hand an answer to who waits for it, if somebody still does."""
+        answer = self._answers.pop(call_id, None)
+        if answer is not None and not answer.done():
+            answer.set_result(payload)
+
+    def fail(self, call_id: int, error: Exception) -> None:
+        """Hand an error to who waits for the answer, if somebody still does."""
+        answer = self._answers.pop(call_id, None)
+        if answer is not None and not answer.done():
+            answer.set_exception(error)
+
+    def fail_all(self, make_error: Callable[[], Exception]) -> None:
+        """Hand an error to everybody who waits."""
+        for call_id in list(self._answers):
+            self.fail(call_id, make_error())
+
+
+class CallServer:
+    """Answers the requests that peers send to one interface.
+
+    At most :attr:`LinkLimits.serving` requests are served at a time; :attr:`LinkLimits.waiting` more wait in order, and what
+    comes then is answered with a fault at once.
+    """
+
+    def __init__(self, serve: Callable[[bytes], Awaitable[Buffer]], limits: LinkLimits, name: str) -> None:
+        self._serve = serve
+        self._limits = limits
+        self._name = name
+        self._scope = TaskScope()
+        self._serving: dict[tuple[Channel, int], asyncio.Task[None]] = {}
+        self._waiting: deque[tuple[Channel, int, bytes]] = deque()
+        self._closed = False
+
+    def accept(self, channel: Channel, call_id: int, payload: bytes) -> None:
+        """Serve a request, now or when its turn comes.
+
+        Raises:
+            NotConnected: The interface is closed.
+            Overloaded: Too many requests wait.
+        """
+        if self._closed:
+            raise NotConnected
+        if len(self._scope) < self._limits.serving:
+            self._begin(channel, call_id, payload)
+        elif len(self._waiting) < self._limits.waiting:
+            self._waiting.append((channel, call_id, payload))
+        else:
+            raise Overloaded(f"{len(self._waiting)} requests wait to be served")
+
+    def has(self, channel: Channel, call_id: int) -> bool:
+        """Tell whether a request is being served or waits."""
+        return (channel, call_id) in self._serving or any(
+            waiting[:2] == (channel, call_id) for waiting in self._waiting
+        )
+
+    def cancel(self, channel: Channel, call_id: int | None = None) -> None:
+        """Stop working on a request, or on all requests of a channel; they get no answer."""
+        self._waiting = deque(
+            request
+            for request in self._waiting
+            if not (request[0] is channel and call_id in (None, request[1]))
+        )
+        for key in [key for key in self._serving if key[0] is channel and call_id in (None, key[1])]:
+            self._serving.pop(key).cancel()
+
+    async def close(self) -> None:
+        """Stop working and wait until that has happened."""
+        self._closed = True
+        self._waiting.clear()
+        self._serving.clear()
+        await self._scope.close()
+
+    def _begin(self, channel: Channel, call_id: int, payload: bytes) -> None:
+        task = self._scope.spawn(self._run(channel, call_id, payload), f"{self._name} request {call_id}")
+        self._serving[channel, call_id] = task
+        task.add_done_callback(self._next)
+
+    async def _run(self, channel: Channel, call_id: int, payload: bytes) -> None:
+        try:
+            answer = await self._serve(payload)
+        except Exception as error:
+            log.debug("%s: request failed", self._name, exc_info=True)
+            if self._finish(channel, call_id):
+                channel.fault(call_id, error)
+        else:
+            if self._finish(channel, call_id):
+                channel.reply(call_id, answer)
+
+    def _finish(self, channel: Channel, call_id: int) -> bool:
+        """Take note that a request was served; false if nobody waits for its answer any more."""
+        if self._serving.get((channel, call_id)) is not asyncio.current_task():
+            return False
+        del self._serving[channel, call_id]
+        return True
+
+    def _next(self, _ended: asyncio.Task[None]) -> None:
+        while self._waiting and len(self._scope) < self._limits.serving and not self._closed:
+            self._begin(*self._waiting.popleft())

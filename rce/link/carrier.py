@@ -1,0 +1,166 @@
+"""What carries the frames of a link: a socket, or a pair of objects in one process."""
+
+from __future__ import annotations
+
+import asyncio
+from abc import ABC, abstractmethod
+from collections import deque
+from typing import TYPE_CHECKING, Protocol
+
+from rce.link.exceptions import LinkLost, ProtocolError
+
+if TYPE_CHECKING:
+    from rce.link.frames import Frame
+    from rce.link.queues import OutgoingQueue
+
+
+class CarrierHandler(Protocol):
+    """Who takes what a carrier brings."""
+
+    def frame_received(self, frame: Frame) -> None:
+        """Take a frame of the peer.
+
+        Raises:
+            ProtocolError: The peer must not send this; the carrier ends.
+        """
+        ...
+
+    def carrier_lost(self, carrier: Carrier, reason: Exception) -> None:
+        """Notice that the carrier ended. Called once, and nothing comes after it."""
+        ...
+
+
+class Carrier(ABC):
+    """A live connection between the two ends of a link."""
+
+    @property
+    @abstractmethod
+    def kind(self) -> str:
+        """``unix``, ``tcp`` or ``local``."""
+
+    @abstractmethod
+    def start(self, handler: CarrierHandler) -> None:
+        """Begin to hand frames over. Nothing is handed over before, and nothing is lost."""
+
+    @abstractmethod
+    def control(self, frame: Frame) -> None:
+        """Send a small frame of the link itself, before all messages that wait. Ignored when the carrier ended."""
+
+    @abstractmethod
+    def send(self, queue: OutgoingQueue, frame: Frame) -> None:
+        """Send a message of a channel, after those that wait in the channel's queue. Ignored when the carrier ended.
+
+        Raises:
+            Overloaded: The queue is full and its policy is to refuse.
+        """
+
+    @abstractmethod
+    def withdraw(self, queue: OutgoingQueue, call_id: int) -> bool:
+        """Take a call back that has not begun to be sent; false if it is on its way."""
+
+    @abstractmethod
+    def clear(self, queue: OutgoingQueue) -> None:
+        """Throw away what waits on a channel."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """End the carrier, without :meth:`CarrierHandler.carrier_lost` at this end."""
+
+    @abstractmethod
+    async def wait_closed(self) -> None:
+        """Wait until the carrier has ended and holds nothing any more."""
+
+
+class LocalCarrier(Carrier):
+    """One half of a link between two endpoints of one process.
+
+    Payloads are handed over as they are. Delivery is a later step of the event loop, so that interfaces which answer at
+    once cannot recurse, and takes what lay there when it began, so that two of them cannot hold the loop.
+    """
+
+    kind = "local"
+
+    def __init__(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._peer: LocalCarrier | None = None
+        self._handler: CarrierHandler | None = None
+        self._inbox: deque[Frame] = deque()
+        self._delivery: asyncio.Handle | None = None
+        self._closed = self._loop.create_future()
+
+    @classmethod
+    def pair(cls) -> tuple[LocalCarrier, LocalCarrier]:
+        """Make both halves."""
+        one, other = cls(), cls()
+        one._peer, other._peer = other, one
+        return one, other
+
+    def start(self, handler: CarrierHandler) -> None:
+        """Begin to hand frames over."""
+        self._handler = handler
+        self._schedule()
+
+    def control(self, frame: Frame) -> None:
+        """Send a frame."""
+        if self._peer is not None:
+            self._peer._take(frame)  # noqa: SLF001 - two halves of one thing
+
+    def send(self, queue: OutgoingQueue, frame: Frame) -> None:
+        """Send a message; nothing ever waits here."""
+        queue.counters.count_out(len(frame.payload))
+        if type(frame.payload) is not bytes:
+            frame = frame._replace(payload=bytes(frame.payload))
+        self.control(frame)
+
+    def withdraw(self, queue: OutgoingQueue, call_id: int) -> bool:  # noqa: ARG002 - nothing waits here
+        """Return false: the call is on its way."""
+        return False
+
+    def clear(self, queue: OutgoingQueue) -> None:
+        """Do nothing: nothing waits here."""
+
+    def close(self) -> None:
+        """End both halves; the peer's handler learns it in a later step of the event loop."""
+        peer = self._end()
+        if peer is not None:
+            self._loop.call_soon(peer._lose)  # noqa: SLF001 - two halves of one thing
+
+    async def wait_closed(self) -> None:
+        """Wait until this half has ended."""
+        await asyncio.shield(self._closed)
+
+    def _end(self) -> LocalCarrier | None:
+        peer, self._peer = self._peer, None
+        self._inbox.clear()
+        if self._delivery is not None:
+            self._delivery.cancel()
+        if not self._closed.done():
+            self._closed.set_result(None)
+        return peer
+
+    def _lose(self) -> None:
+        if self._end() is not None and self._handler is not None:
+            self._handler.carrier_lost(self, LinkLost("the peer ended the link"))
+
+    def _take(self, frame: Frame) -> None:
+        if not self._closed.done():
+            self._inbox.append(frame)
+            self._schedule()
+
+    def _schedule(self) -> None:
+        if self._delivery is None and self._inbox and self._handler is not None:
+            self._delivery = self._loop.call_soon(self._deliver)
+
+    def _deliver(self) -> None:
+        self._delivery = None
+        assert self._handler is not None
+        for _ in range(len(self._inbox)):
+            if not self._inbox:
+                return
+            try:
+                self._handler.frame_received(self._inbox.popleft())
+            except ProtocolError as error:
+                self.close()
+                self._handler.carrier_lost(self, error)
+                return
+        self._schedule()

@@ -1,0 +1,209 @@
+"""One end of a connection: an interface's channel on a link."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING
+
+from rce.link.calls import PendingCalls
+from rce.link.exceptions import (
+    CallTimeout,
+    MessageTooLarge,
+    NotConnected,
+    Overloaded,
+    PeerFault,
+    PeerLost,
+    ProtocolError,
+)
+from rce.link.frames import Flag, Frame, FrameType
+from rce.link.queues import OutgoingQueue, OverflowPolicy
+
+if TYPE_CHECKING:
+    from rce.control.model import ConnectionSpec
+    from rce.link.interface import Buffer
+    from rce.link.link import Link
+    from rce.link.slot import InterfaceSlot
+
+log = logging.getLogger(__name__)
+
+_MAX_FAULT = 4096
+"""Longest fault text that is sent, in bytes."""
+
+
+class Channel:
+    """An interface's end of a connection.
+
+    It is *established* while both ends are open: this one since its interface has started, the peer's since its OPEN came
+    on the link's present carrier.
+
+    Attributes:
+        spec: The connection.
+        slot: The interface's place.
+        established: Whether messages can be sent.
+    """
+
+    def __init__(self, spec: ConnectionSpec, slot: InterfaceSlot, link: Link) -> None:
+        self.spec = spec
+        self.slot = slot
+        self.established = False
+        self.link = link
+        self._limits = link.limits
+        self._calls = PendingCalls(link.limits.max_calls)
+        self._queue = self._new_queue()
+
+    @property
+    def number(self) -> int:
+        """The channel's number on its link."""
+        return self.spec.id
+
+    # The life of the channel
+
+    def open(self) -> None:
+        """Tell the peer that this end is ready, if it is."""
+        if self.slot.started and self.link.carrier is not None:
+            self.link.carrier.control(Frame(FrameType.OPEN, self.number))
+            if self.number in self.link.peer_open:
+                self._set_established(True)
+
+    def peer_opened(self) -> None:
+        """Take note that the peer's end is ready."""
+        if self.slot.started:
+            self._set_established(True)
+
+    def peer_closed(self) -> None:
+        """Take note that the peer's end is gone; it may come again."""
+        self._set_established(False)
+
+    def close(self) -> None:
+        """Tell the peer that this end is gone."""
+        if self.slot.started and self.link.carrier is not None:
+            self.link.carrier.control(Frame(FrameType.CLOSE, self.number))
+        self._set_established(False)
+
+    def _set_established(self, established: bool) -> None:
+        if established == self.established:
+            return
+        self.established = established
+        if not established:
+            if self.link.carrier is not None:
+                self.link.carrier.clear(self._queue)
+            self._queue.clear()
+            self._queue = self._new_queue()
+            self._calls.fail_all(lambda: PeerLost("the connection was lost"))
+        self.slot.channel_changed(self)
+
+    def _new_queue(self) -> OutgoingQueue:
+        limits = self._limits
+        service = self.slot.role.is_service
+        return OutgoingQueue(
+            self.number,
+            self.slot.counters,
+            OverflowPolicy.REFUSE if service else OverflowPolicy.DROP_OLDEST,
+            max_messages=limits.max_calls if service else limits.queue_messages,
+            max_bytes=max(limits.queue_bytes, limits.max_message) if service else limits.queue_bytes,
+        )
+
+    # Sending
+
+    def send(self, payload: bytes | memoryview, *, latched: bool) -> None:
+        """Send a message of a topic; the caller has looked at its size."""
+        carrier = self.link.carrier
+        if self.established and carrier is not None:
+            flags = Flag.LATCHED if latched else 0
+            carrier.send(self._queue, Frame(FrameType.DATA, self.number, 0, flags, payload))
+
+    async def call(self, payload: bytes | memoryview, deadline: float) -> bytes:
+        """Send a request and wait ``deadline`` seconds for its answer. Raises as :meth:`Port.call`."""
+        carrier = self.link.carrier
+        if not self.established or carrier is None:
+            raise NotConnected
+        call_id, answer = self._calls.add()
+        queue = self._queue
+        try:
+            carrier.send(queue, Frame(FrameType.CALL, self.number, call_id, 0, payload))
+        except Overloaded:
+            self._calls.drop(call_id)
+            raise
+        try:
+            async with asyncio.timeout(deadline):
+                return await answer
+        except TimeoutError as error:
+            raise CallTimeout(f"no answer in {deadline:g} s") from error
+        finally:
+            if self._calls.drop(call_id) and not carrier.withdraw(queue, call_id):
+                carrier.control(Frame(FrameType.CANCEL, self.number, call_id))
+
+    def reply(self, call_id: int, answer: Buffer) -> None:
+        """Send the answer to a request."""
+        carrier = self.link.carrier
+        if not self.established or carrier is None:
+            return
+        try:
+            payload = as_payload(answer, self._limits.max_message)
+            carrier.send(self._queue, Frame(FrameType.REPLY, self.number, call_id, 0, payload))
+        except (TypeError, MessageTooLarge, Overloaded) as error:
+            self.fault(call_id, error)
+
+    def fault(self, call_id: int, error: Exception) -> None:
+        """Answer a request with what went wrong."""
+        carrier = self.link.carrier
+        if carrier is not None:
+            text = (str(error) or type(error).__name__).encode(errors="replace")[:_MAX_FAULT]
+            flags = Flag.OVERLOADED if isinstance(error, Overloaded) else 0
+            carrier.control(Frame(FrameType.FAULT, self.number, call_id, flags, text))
+
+    # Receiving
+
+    def frame_received(self, frame: Frame) -> None:
+        """Take a message of the peer.
+
+        Raises:
+            ProtocolError: The peer must not send this.
+        """
+        if not self.established:
+            return  # it was sent before the peer heard that this end closed
+        payload = bytes(frame.payload)
+        match frame.type:
+            case FrameType.DATA:
+                self.slot.receive(payload, latched=bool(frame.flags & Flag.LATCHED))
+            case FrameType.CALL:
+                self._request_received(frame.id, payload)
+            case FrameType.REPLY:
+                self.slot.counters.count_in(len(payload))
+                self._calls.answer(frame.id, payload)
+            case FrameType.FAULT:
+                text = payload.decode(errors="replace")
+                overloaded = frame.flags & Flag.OVERLOADED
+                self._calls.fail(frame.id, Overloaded(text) if overloaded else PeerFault(text))
+            case FrameType.CANCEL:
+                if self.slot.server is not None:
+                    self.slot.server.cancel(self, frame.id)
+            case _:
+                raise ProtocolError(f"{frame.type.name} on a channel")
+
+    def _request_received(self, call_id: int, payload: bytes) -> None:
+        server = self.slot.server
+        if server is None:
+            self.fault(call_id, TypeError(f"{self.spec.interface} serves no requests"))
+            return
+        if server.has(self, call_id):
+            raise ProtocolError(f"request {call_id} came twice")
+        self.slot.counters.count_in(len(payload))
+        try:
+            server.accept(self, call_id, payload)
+        except (Overloaded, NotConnected) as error:
+            self.fault(call_id, error)
+
+
+def as_payload(buffer: Buffer, limit: int) -> bytes | memoryview:
+    """Return a payload as the frames need it: its length in bytes, and small enough.
+
+    Raises:
+        MessageTooLarge: It is larger than ``limit`` bytes.
+        TypeError: It is no buffer.
+    """
+    payload = buffer if isinstance(buffer, bytes) else memoryview(buffer).cast("B")
+    if len(payload) > limit:
+        raise MessageTooLarge(len(payload), limit)
+    return payload

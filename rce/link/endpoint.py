@@ -1,0 +1,249 @@
+"""A robot or a container: makes what its spec says, and keeps it so."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING
+
+from rce.link.channel import Channel
+from rce.link.dialer import keep_dialed
+from rce.link.link import Link
+from rce.link.slot import InterfaceSlot
+from rce.link.tasks import TaskScope
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+
+    from rce.control.model import ConnectionSpec, EndpointSpec, InterfaceSpec, InterfaceUsage, LinkSpec
+    from rce.link.carrier import Carrier
+    from rce.link.hub import LinkHub
+    from rce.link.interface import InterfaceFactory
+    from rce.protocol.names import EndpointId
+
+log = logging.getLogger(__name__)
+
+
+class Endpoint:
+    """Interfaces, links and connections of one endpoint, as the newest applied spec says.
+
+    Args:
+        id: The endpoint.
+        factory: Makes its interfaces.
+        hub: Reaches its peers.
+        on_change: Called when :attr:`interfaces` or :attr:`connections` changed; once for changes that come together.
+        on_fault: Called with a text for the user when an interface cannot do its work.
+    """
+
+    def __init__(
+        self,
+        id: EndpointId,  # noqa: A002 - what it is
+        factory: InterfaceFactory,
+        hub: LinkHub,
+        *,
+        on_change: Callable[[], None],
+        on_fault: Callable[[str], None],
+    ) -> None:
+        self.id = id
+        self._factory = factory
+        self._hub = hub
+        self._on_change = on_change
+        self._on_fault = on_fault
+        self._slots: dict[str, InterfaceSlot] = {}
+        self._links: dict[str, Link] = {}
+        self._channels: dict[int, Channel] = {}
+        self._refused: set[InterfaceSpec | ConnectionSpec] = set()
+        self._starts: dict[InterfaceSlot, asyncio.Task[None]] = {}
+        self._dials: dict[Link, asyncio.Task[None]] = {}
+        self._tasks = TaskScope()
+        self._lock = asyncio.Lock()
+        self._notice: asyncio.Handle | None = None
+        self._closed = False
+
+    @property
+    def interfaces(self) -> Mapping[str, bool]:
+        """Interface tag to whether the interface has an established connection."""
+        return {tag: slot.active for tag, slot in self._slots.items()}
+
+    @property
+    def connections(self) -> tuple[int, ...]:
+        """Ids of the established connections, in order."""
+        return tuple(sorted(number for number, channel in self._channels.items() if channel.established))
+
+    def usage(self) -> dict[str, InterfaceUsage]:
+        """Return the counters of every interface by tag, since it was made."""
+        return {tag: slot.counters.usage() for tag, slot in self._slots.items()}
+
+    async def apply(self, spec: EndpointSpec) -> None:
+        """Make up the difference between ``spec`` and what is there.
+
+        What is equal in both is not touched. Returns when what is no longer desired is gone, and what is new has begun to
+        be made: interfaces start and links are dialed in the background. An interface that cannot be made or started is
+        reported to ``on_fault`` and does not hinder the others; it is not tried again before its spec changes.
+
+        Raises:
+            RuntimeError: The endpoint is closed.
+        """
+        async with self._lock:
+            if self._closed:
+                raise RuntimeError(f"endpoint {self.id} is closed")
+            await self._remove(spec)
+            self._add(spec)
+
+    async def close(self) -> None:
+        """End everything; returns when nothing is left."""
+        async with self._lock:
+            self._closed = True
+            self._drop_channels(list(self._channels.values()))
+            carriers = self._drop_links(list(self._links.values()))
+            await self._close_slots(list(self._slots.values()))
+            await self._tasks.close()
+            for carrier in carriers:
+                await carrier.wait_closed()
+            if self._notice is not None:
+                self._notice.cancel()
+
+    # Taking away
+
+    async def _remove(self, spec: EndpointSpec) -> None:
+        interfaces = {interface.tag: interface for interface in spec.interfaces}
+        links = {link.id: link for link in spec.links}
+        connections = {connection.id: connection for connection in spec.connections}
+        self._refused &= {*spec.interfaces, *spec.connections}
+        slots = [slot for tag, slot in self._slots.items() if interfaces.get(tag) != slot.spec]
+        gone = [
+            link for link_id, link in self._links.items() if not _is_same_link(link.spec, links.get(link_id))
+        ]
+        self._drop_channels(
+            channel
+            for channel in list(self._channels.values())
+            if connections.get(channel.number) != channel.spec
+            or channel.slot in slots
+            or channel.link in gone
+        )
+        self._drop_links(gone)
+        await self._close_slots(slots)
+
+    def _drop_channels(self, channels: Iterable[Channel]) -> None:
+        for channel in list(channels):
+            channel.link.remove(channel)
+            channel.slot.remove(channel)
+            del self._channels[channel.number]
+
+    def _drop_links(self, links: list[Link]) -> list[Carrier]:
+        """Forget links; return the carriers that are still closing."""
+        for link in links:
+            self._hub.unregister(link)
+            self._stop_dialing(link)
+            del self._links[link.spec.id]
+        return [carrier for link in links if (carrier := link.detach()) is not None]
+
+    async def _close_slots(self, slots: list[InterfaceSlot]) -> None:
+        """Close interfaces, all at the same time."""
+        for slot in slots:
+            del self._slots[slot.spec.tag]
+        if slots:
+            self._changed()
+            async with asyncio.TaskGroup() as group:
+                for slot in slots:
+                    group.create_task(self._close_slot(slot))
+
+    async def _close_slot(self, slot: InterfaceSlot) -> None:
+        start = self._starts.pop(slot, None)
+        if start is not None:
+            start.cancel()
+            await asyncio.wait([start])
+        try:
+            async with asyncio.timeout(self._hub.timeouts.close):
+                await slot.close()
+        except Exception as error:
+            log.debug("endpoint %s: interface %s did not close well", self.id, slot.spec.tag, exc_info=True)
+            slot.fail(error)
+
+    # Adding
+
+    def _add(self, spec: EndpointSpec) -> None:
+        for link in spec.links:
+            self._put_link(link)
+        for interface in spec.interfaces:
+            if interface.tag not in self._slots and interface not in self._refused:
+                self._add_slot(interface)
+        for connection in spec.connections:
+            if connection.id not in self._channels and connection not in self._refused:
+                self._add_channel(connection)
+
+    def _put_link(self, spec: LinkSpec) -> None:
+        link = self._links.get(spec.id)
+        if link is None:
+            link = self._links[spec.id] = Link(spec, self._hub.limits)
+            if spec.dial:
+                self._dial(link)
+            else:
+                self._hub.register(link)
+        elif link.spec != spec:
+            moved = spec.dial and link.spec.address != spec.address
+            link.spec = spec
+            if moved and (link.carrier is None or link.carrier.kind != "local"):
+                self._stop_dialing(link)
+                link.detach()
+                self._dial(link)
+
+    def _dial(self, link: Link) -> None:
+        task = self._tasks.spawn(keep_dialed(link, self._hub), f"{self.id} dials {link.spec.peer}")
+        self._dials[link] = task
+
+    def _stop_dialing(self, link: Link) -> None:
+        task = self._dials.pop(link, None)
+        if task is not None:
+            task.cancel()
+
+    def _add_slot(self, spec: InterfaceSpec) -> None:
+        try:
+            slot = InterfaceSlot(
+                spec,
+                limits=self._hub.limits,
+                timeouts=self._hub.timeouts,
+                on_change=self._changed,
+                on_fault=self._on_fault,
+            )
+            slot.make(self._factory)
+        except Exception as error:
+            log.debug("endpoint %s: interface %s cannot be made", self.id, spec.tag, exc_info=True)
+            self._refuse(spec, f"interface {spec.tag}: {error}")
+            return
+        self._slots[spec.tag] = slot
+        self._starts[slot] = self._tasks.spawn(self._start(slot), f"{self.id} starts {spec.tag}")
+        self._changed()
+
+    async def _start(self, slot: InterfaceSlot) -> None:
+        await slot.start()
+        self._starts.pop(slot, None)
+
+    def _add_channel(self, spec: ConnectionSpec) -> None:
+        slot = self._slots.get(spec.interface)
+        link = self._links.get(spec.link)
+        if slot is None or link is None:
+            missing = f"interface {spec.interface}" if slot is None else f"link {spec.link}"
+            self._refuse(spec, f"connection {spec.id}: there is no {missing}")
+            return
+        channel = self._channels[spec.id] = Channel(spec, slot, link)
+        slot.add(channel)
+        link.add(channel)
+
+    def _refuse(self, spec: InterfaceSpec | ConnectionSpec, text: str) -> None:
+        self._refused.add(spec)
+        self._on_fault(text)
+
+    def _changed(self) -> None:
+        """Call ``on_change`` soon, once for all that changes until then."""
+        if self._notice is None and not self._closed:
+            self._notice = asyncio.get_running_loop().call_soon(self._tell)
+
+    def _tell(self) -> None:
+        self._notice = None
+        self._on_change()
+
+
+def _is_same_link(old: LinkSpec, new: LinkSpec | None) -> bool:
+    """Whether a link can go on under a new spec: another address or token does not end it."""
+    return new is not None and (old.peer, old.dial) == (new.peer, new.dial)

@@ -1,0 +1,91 @@
+"""What may go wrong on links.
+
+::
+
+    LinkError
+    +-- ProtocolError        the peer broke the rules of the frames; the connection is dropped
+    +-- LinkRefused          the accepting end turned the dialing end away
+    +-- LinkLost             the connection of a link ended
+    +-- InterfaceError       an interface cannot be made or started as its spec says
+    +-- CallError            a service call got no answer
+        +-- NotConnected     there is no peer to ask
+        +-- PeerFault        the peer answered with a fault
+        +-- PeerLost         the peer went away before it answered
+        +-- CallTimeout      no answer in time
+        +-- Overloaded       too many calls wait already, here or at the peer
+        +-- MessageTooLarge  the message is larger than a link carries
+"""
+
+from __future__ import annotations
+
+
+class LinkError(Exception):
+    """Base of all that this package raises."""
+
+
+class ProtocolError(LinkError):
+    """The peer broke the rules of the frames."""
+
+
+class LinkRefused(LinkError):
+    """The accepting end turned the dialing end away; the text is its reason."""
+
+
+class LinkLost(LinkError):
+    """The connection of a link ended."""
+
+
+class InterfaceError(LinkError):
+    """An interface cannot be made or started as its spec says; the text is for the user."""
+
+
+class CallError(LinkError):
+    """A service call got no answer."""
+
+
+class NotConnected(CallError):
+    """There is no peer to ask."""
+
+    def __str__(self) -> str:
+        return super().__str__() or "not connected"
+
+
+class PeerFault(CallError):
+    """The peer answered with a fault.
+
+    Attributes:
+        text: What the peer said.
+    """
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self.text = text
+
+
+class PeerLost(CallError):
+    """The peer went away before it answered."""
+
+
+class CallTimeout(CallError):
+    """No answer came in time."""
+
+
+class Overloaded(CallError):
+    """Too many calls wait already, here or at the peer."""
+
+
+class MessageTooLarge(CallError):
+    """The message is larger than a link carries.
+
+    Attributes:
+        size: Of the message, in bytes.
+        limit: What the link carries, in bytes.
+    """
+
+    def __init__(self, size: int, limit: int) -> None:
+        super().__init__(size, limit)
+        self.size = size
+        self.limit = limit
+
+    def __str__(self) -> str:
+        return f"message of {self.size} bytes is larger than the limit of {self.limit} bytes"

@@ -1,0 +1,329 @@
+"""The frames of a link: a fixed header and an untouched payload (sans-I/O).
+
+Every frame starts with 24 bytes in network order::
+
+    offset  size  field
+         0     1  type     FrameType
+         1     1  flags    Flag
+         2     2  zero
+         4     4  id       of a service call; 0 elsewhere
+         8     8  channel  0 for frames of the link itself
+        16     4  length   bytes of payload in this frame
+        20     4  total    bytes of payload in the whole message
+
+A message with ``total`` above ``length`` goes on in FRAGMENT frames of the same channel. A channel has at most one
+unfinished message at a time; frames of other channels, and frames that carry a whole message, may come in between.
+ABORT says that the rest of the channel's unfinished message will not come.
+
+Since the first frame tells the total, the reader allocates the message once and has the socket read straight
+into it.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from enum import IntEnum, IntFlag
+from typing import TYPE_CHECKING, NamedTuple
+
+import msgspec
+
+from rce.link.exceptions import ProtocolError
+from rce.link.settings import KIB
+
+if TYPE_CHECKING:
+    from rce.link.settings import LinkLimits
+
+VERSION = 1
+HEADER = struct.Struct("!BBHIQII")
+HEADER_SIZE = HEADER.size
+FRAGMENT_SIZE = 128 * KIB
+"""Most bytes of payload that a sender puts in one frame: 1 ms at 1 Gbit/s, the longest an urgent frame waits for it."""
+HANDSHAKE_SIZE = 4 * KIB
+"""Most bytes of payload before the peer has shown who it is."""
+MAX_CHANNEL = 2**64 - 1
+MAX_ID = 2**32 - 1
+
+_SCRATCH_SIZE = 64 * KIB
+_DIRECT_SIZE = 16 * KIB
+"""Payloads from here on are read straight into their message."""
+
+
+class FrameType(IntEnum):
+    """What a frame is for."""
+
+    HELLO = 1
+    """Dialing end's first frame: who it is."""
+    WELCOME = 2
+    """Accepting end's answer; the link is up."""
+    REFUSE = 3
+    """Accepting end's answer: a text why not; it hangs up."""
+    PING = 4
+    PONG = 5
+    OPEN = 8
+    """The sender's interface is ready on this channel."""
+    CLOSE = 9
+    """It is no more."""
+    DATA = 16
+    """A message of a topic."""
+    CALL = 17
+    """A request; the answer has the same id."""
+    REPLY = 18
+    FAULT = 19
+    """A text in place of a REPLY."""
+    CANCEL = 20
+    """The caller no longer waits for the answer to the CALL with this id."""
+    FRAGMENT = 24
+    ABORT = 25
+
+
+class Flag(IntFlag):
+    """More about a frame."""
+
+    NONE = 0
+    LATCHED = 1
+    """DATA: the topic's last message, kept for those who come late."""
+    OVERLOADED = 2
+    """FAULT: the peer has too many requests already."""
+
+
+class Frame(NamedTuple):
+    """A whole message, or a frame without payload."""
+
+    type: FrameType
+    channel: int = 0
+    id: int = 0
+    flags: int = 0
+    payload: bytes | memoryview = b""
+
+
+class Hello(msgspec.Struct, frozen=True, kw_only=True):
+    """Payload of HELLO."""
+
+    version: int
+    link: str
+    token: str
+
+
+_hello_decoder = msgspec.json.Decoder(Hello)
+_TYPES = {int(t): t for t in FrameType}
+_CARRIERS = frozenset({FrameType.DATA, FrameType.CALL, FrameType.REPLY})
+
+
+def pack_header(frame: Frame, length: int, total: int) -> bytes:
+    """Write the header of a frame that carries the first ``length`` of ``total`` bytes of a message."""
+    return HEADER.pack(frame.type, frame.flags, 0, frame.id, frame.channel, length, total)
+
+
+def pack_fragment(channel: int, length: int, total: int) -> bytes:
+    """Write the header of a frame that carries the next ``length`` bytes of the channel's message."""
+    return HEADER.pack(FrameType.FRAGMENT, 0, 0, 0, channel, length, total)
+
+
+def encode(frame: Frame) -> bytes:
+    """Write a frame with its whole payload."""
+    size = len(frame.payload)
+    return pack_header(frame, size, size) + frame.payload
+
+
+def encode_hello(link: str, token: str) -> bytes:
+    """Write the first frame of a link's dialing end."""
+    return encode(
+        Frame(FrameType.HELLO, payload=msgspec.json.encode(Hello(version=VERSION, link=link, token=token)))
+    )
+
+
+def parse_hello(frame: Frame) -> Hello:
+    """Read the first frame of a link's dialing end.
+
+    Raises:
+        ProtocolError: It is no HELLO, or one of a version that is not spoken here.
+    """
+    if frame.type is not FrameType.HELLO:
+        raise ProtocolError(f"first frame is {frame.type.name}, not HELLO")
+    try:
+        hello = _hello_decoder.decode(frame.payload)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise ProtocolError(f"bad HELLO: {error}") from error
+    if hello.version != VERSION:
+        raise ProtocolError(f"link version {hello.version} is not spoken here, {VERSION} is")
+    return hello
+
+
+class _Message:
+    """A message that is being received.
+
+    ``BytesIO`` is used because it is the one place of the standard library where bytes can be filled in place and
+    then taken as ``bytes`` without copying them.
+    """
+
+    __slots__ = ("_buffer", "filled", "first", "total", "view")
+
+    def __init__(self, first: Frame, total: int) -> None:
+        self.first = first
+        self.total = total
+        self.filled = 0
+        self._buffer = io.BytesIO()
+        self._buffer.seek(total - 1)
+        self._buffer.write(b"\0")
+        self.view = self._buffer.getbuffer()
+
+    def write(self, data: memoryview) -> None:
+        end = self.filled + len(data)
+        self.view[self.filled : end] = data
+        self.filled = end
+
+    def finish(self) -> Frame:
+        self.view.release()
+        return self.first._replace(payload=self._buffer.getvalue())
+
+
+class FrameReader:
+    """Turns bytes into frames: fill :meth:`get_buffer`, then tell :meth:`advance` how much was filled.
+
+    Attributes:
+        max_message: Largest message that is accepted, in bytes.
+    """
+
+    def __init__(self, limits: LinkLimits, *, max_message: int | None = None) -> None:
+        self.max_message = limits.max_message if max_message is None else max_message
+        self._max_unfinished_bytes = limits.unfinished_bytes
+        self._unfinished_bytes = 0
+        self._scratch = memoryview(bytearray(_SCRATCH_SIZE))
+        self._start = 0
+        self._end = 0
+        self._unfinished: dict[int, _Message] = {}
+        self._current: _Message | None = None
+        """The message whose payload is read straight into it."""
+        self._missing = 0
+        """Payload bytes of the current frame that have not come yet."""
+
+    def get_buffer(self) -> memoryview:
+        """Return where the next bytes go; never empty."""
+        message = self._current
+        # The last byte of a frame goes through the scratch: as long as whoever fills a buffer holds on to it, which
+        # event loops do until `advance` returns, the message could not be taken without a copy.
+        if message is not None and self._missing > 1:
+            return message.view[message.filled : message.filled + self._missing - 1]
+        return self._scratch[self._end :]
+
+    def advance(self, count: int) -> list[Frame]:
+        """Take ``count`` bytes that were written to the buffer.
+
+        Returns:
+            The messages that these bytes completed, in order.
+
+        Raises:
+            ProtocolError: The bytes are no frames. The reader cannot be used any more.
+        """
+        if self._current is not None and self._missing > 1:
+            self._current.filled += count
+            self._missing -= count
+            return []
+        self._end += count
+        return self._parse()
+
+    @property
+    def missing(self) -> int:
+        """Bytes that are needed at least to go on: of a header, or of the frame whose header is known."""
+        if self._current is not None:
+            return self._missing
+        known = self._end - self._start
+        if known < HEADER_SIZE:
+            return HEADER_SIZE - known
+        length: int = HEADER.unpack_from(self._scratch, self._start)[5]
+        return HEADER_SIZE + length - known
+
+    def feed(self, data: bytes | memoryview) -> list[Frame]:
+        """Take bytes that lie elsewhere. As :meth:`advance`."""
+        frames: list[Frame] = []
+        rest = memoryview(data)
+        while rest:
+            buffer = self.get_buffer()
+            count = min(len(buffer), len(rest))
+            buffer[:count] = rest[:count]
+            buffer.release()
+            frames += self.advance(count)
+            rest = rest[count:]
+        return frames
+
+    def _parse(self) -> list[Frame]:
+        frames: list[Frame] = []
+        while self._start < self._end:
+            if self._current is not None:
+                self._continue_payload(frames)
+            elif self._end - self._start < HEADER_SIZE or not self._parse_frame(frames):
+                break
+        self._compact()
+        return frames
+
+    def _continue_payload(self, frames: list[Frame]) -> None:
+        message = self._current
+        assert message is not None
+        count = min(self._missing, self._end - self._start)
+        message.write(self._scratch[self._start : self._start + count])
+        self._start += count
+        self._missing -= count
+        if self._missing == 0:
+            self._current = None
+            if message.filled == message.total:
+                if self._unfinished.get(message.first.channel) is message:
+                    del self._unfinished[message.first.channel]
+                    self._unfinished_bytes -= message.total
+                frames.append(message.finish())
+
+    def _parse_frame(self, frames: list[Frame]) -> bool:
+        """Parse the frame at the start of the scratch; false if more of it must come first."""
+        number, flags, zero, call_id, channel, length, total = HEADER.unpack_from(self._scratch, self._start)
+        frame_type = _TYPES.get(number)
+        if frame_type is None or zero:
+            raise ProtocolError("these bytes are no frame")
+        if length > total or total > self.max_message:
+            raise ProtocolError(f"message of {total} bytes (limit {self.max_message}), {length} in one frame")
+        body = self._start + HEADER_SIZE
+        if length == total and length < _DIRECT_SIZE and frame_type is not FrameType.FRAGMENT:
+            if self._end - body < length:
+                return False
+            self._start = body + length
+            frame = Frame(frame_type, channel, call_id, flags, bytes(self._scratch[body : self._start]))
+            if frame_type is not FrameType.ABORT:
+                frames.append(frame)
+            else:
+                self._abort(channel)
+            return True
+        self._start = body
+        self._begin_payload(Frame(frame_type, channel, call_id, flags), length, total)
+        return True
+
+    def _begin_payload(self, first: Frame, length: int, total: int) -> None:
+        if length == 0:
+            raise ProtocolError("empty part of a message")
+        message = self._unfinished.get(first.channel)
+        if first.type is FrameType.FRAGMENT:
+            if message is None or message.total != total or message.filled + length > total:
+                raise ProtocolError("fragment of an unknown message")
+        elif first.type not in _CARRIERS:
+            raise ProtocolError(f"{first.type.name} of {total} bytes")
+        elif length < total:
+            if message is not None or self._unfinished_bytes + total > self._max_unfinished_bytes:
+                raise ProtocolError("too many unfinished messages")
+            message = self._unfinished[first.channel] = _Message(first, total)
+            self._unfinished_bytes += total
+        else:
+            message = _Message(first, total)
+        self._current = message
+        self._missing = length
+
+    def _abort(self, channel: int) -> None:
+        message = self._unfinished.pop(channel, None)
+        if message is None:
+            raise ProtocolError("ABORT without an unfinished message")
+        self._unfinished_bytes -= message.total
+
+    def _compact(self) -> None:
+        if self._start == self._end:
+            self._start = self._end = 0
+        elif self._start + HEADER_SIZE + _DIRECT_SIZE > _SCRATCH_SIZE:
+            rest = bytes(self._scratch[self._start : self._end])
+            self._scratch[: len(rest)] = rest
+            self._start, self._end = 0, len(rest)

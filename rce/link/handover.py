@@ -1,0 +1,280 @@
+"""Hand accepted TCP connections over to the process whose endpoint they are for.
+
+One process of a machine accepts links for all its containers. It reads the HELLO of each connection, which names the
+link, and passes the socket with those bytes to the container's process, over a unix socket with ``SCM_RIGHTS``. From then
+on data goes straight to that process::
+
+    peer --TCP--> Doorman --(socket, HELLO)--> HandoverSender ==unix==> HandoverReceiver --> LinkHub.adopt
+
+The unix socket must keep message boundaries (``SOCK_SEQPACKET`` or ``SOCK_DGRAM``).
+"""
+
+from __future__ import annotations
+
+import array
+import asyncio
+import contextlib
+import logging
+import os
+import socket
+from typing import TYPE_CHECKING
+
+from rce.link.exceptions import LinkError, LinkLost, LinkRefused, ProtocolError
+from rce.link.frames import HANDSHAKE_SIZE, HEADER_SIZE, Frame, FrameReader, FrameType, encode, parse_hello
+from rce.link.settings import LinkLimits, LinkTimeouts
+from rce.link.tasks import TaskScope
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterable
+
+log = logging.getLogger(__name__)
+
+_MAX_GREETINGS = 1024
+"""Accepted connections that have not been handed over yet."""
+_BUSY_PAUSE = 0.1
+"""Seconds to wait before accepting again after the system refused, for want of file descriptors for example."""
+_FD = array.array("i")
+
+
+class HandoverSender:
+    """Passes connections to one process.
+
+    Args:
+        sock: Connected to a :class:`HandoverReceiver`; belongs to the sender from now on.
+    """
+
+    def __init__(self, sock: socket.socket) -> None:
+        sock.setblocking(False)
+        self._sock = sock
+        self._turn = asyncio.Lock()
+
+    async def send(self, connection: socket.socket, received: bytes) -> None:
+        """Pass a connection and what was read from it; the caller closes its own copy afterwards.
+
+        Raises:
+            OSError: The process is gone.
+        """
+        rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", [connection.fileno()]))]
+        async with self._turn:
+            while True:
+                try:
+                    self._sock.sendmsg([received], rights)
+                except BlockingIOError:
+                    await self._writable()
+                else:
+                    return
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._sock.close()
+
+    async def _writable(self) -> None:
+        loop = asyncio.get_running_loop()
+        ready = loop.create_future()
+        loop.add_writer(self._sock, lambda: ready.done() or ready.set_result(None))
+        try:
+            await ready
+        finally:
+            loop.remove_writer(self._sock)
+
+
+class HandoverReceiver:
+    """Takes connections from a :class:`HandoverSender`.
+
+    Args:
+        sock: Connected to the sender; belongs to the receiver from now on.
+        adopt: What to do with a connection, as :meth:`rce.link.hub.LinkHub.adopt`.
+        on_end: Called when the sender is gone.
+    """
+
+    def __init__(
+        self,
+        sock: socket.socket,
+        adopt: Callable[[socket.socket, bytes], Awaitable[None]],
+        *,
+        on_end: Callable[[], None] | None = None,
+    ) -> None:
+        sock.setblocking(False)
+        self._sock = sock
+        self._adopt = adopt
+        self._on_end = on_end
+        self._scope = TaskScope()
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(sock, self._read)
+        self._open = True
+
+    async def close(self) -> None:
+        """Stop taking connections."""
+        self._stop()
+        await self._scope.close()
+
+    def _stop(self) -> None:
+        if self._open:
+            self._open = False
+            self._loop.remove_reader(self._sock)
+            self._sock.close()
+
+    def _read(self) -> None:
+        """Take all that has come."""
+        while self._open:
+            try:
+                received, descriptors = _receive(self._sock)
+            except BlockingIOError:
+                return
+            except OSError as error:
+                log.debug("handover ended: %s", error)
+                received, descriptors = b"", []
+            if not received:
+                self._stop()
+                if self._on_end is not None:
+                    self._on_end()
+            for descriptor in descriptors:
+                self._scope.spawn(self._take(descriptor, received), "handed-over connection")
+
+    async def _take(self, descriptor: int, received: bytes) -> None:
+        try:
+            await self._adopt(socket.socket(fileno=descriptor), received)
+        except OSError as error:
+            log.info("a handed-over connection is of no use: %s", error)
+
+
+def _receive(sock: socket.socket) -> tuple[bytes, list[int]]:
+    """Read a message and the descriptors that came with it."""
+    size = HEADER_SIZE + HANDSHAKE_SIZE
+    received, ancillary, _, _ = sock.recvmsg(
+        size, socket.CMSG_SPACE(_FD.itemsize), getattr(socket, "MSG_CMSG_CLOEXEC", 0)
+    )
+    descriptors = array.array("i")
+    for level, kind, data in ancillary:
+        if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
+            descriptors.frombytes(data[: len(data) - len(data) % _FD.itemsize])
+    for descriptor in descriptors:
+        os.set_inheritable(descriptor, False)
+    return received, list(descriptors)
+
+
+class Doorman:
+    """Accepts TCP links for the endpoints of other processes and hands each to the right one."""
+
+    def __init__(self, timeouts: LinkTimeouts | None = None, limits: LinkLimits | None = None) -> None:
+        self._timeouts = timeouts or LinkTimeouts()
+        self._limits = limits or LinkLimits()
+        self._routes: dict[str, HandoverSender] = {}
+        self._assigned = asyncio.Condition()
+        self._sockets: list[socket.socket] = []
+        self._scope = TaskScope()
+
+    async def listen(self, host: str, port: int) -> int:
+        """Accept links.
+
+        Args:
+            host: Address to bind.
+            port: Zero takes a free one.
+
+        Returns:
+            The port taken.
+        """
+        sock = socket.create_server((host, port), backlog=512)
+        sock.setblocking(False)
+        self._sockets.append(sock)
+        self._scope.spawn(self._accept(sock), f"doorman on port {port}")
+        taken: int = sock.getsockname()[1]
+        return taken
+
+    async def assign(self, sender: HandoverSender, links: Iterable[str]) -> None:
+        """Send the links with these ids, and no others, to ``sender`` from now on."""
+        self._forget(sender)
+        async with self._assigned:
+            self._routes.update(dict.fromkeys(links, sender))
+            self._assigned.notify_all()
+
+    def forget(self, sender: HandoverSender) -> None:
+        """Send no more links to ``sender``."""
+        self._forget(sender)
+
+    async def close(self) -> None:
+        """Stop accepting; connections that were not handed over are closed."""
+        await self._scope.close()
+        for sock in self._sockets:
+            sock.close()
+        self._sockets.clear()
+
+    def _forget(self, sender: HandoverSender) -> None:
+        for link in [link for link, target in self._routes.items() if target is sender]:
+            del self._routes[link]
+
+    async def _accept(self, sock: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                connection, _ = await loop.sock_accept(sock)
+            except OSError as error:
+                log.warning("cannot accept a link: %s", error)
+                await asyncio.sleep(_BUSY_PAUSE)
+                continue
+            if len(self._scope) > _MAX_GREETINGS:
+                connection.close()
+                continue
+            self._scope.spawn(self._pass_on(connection), "link to hand over")
+
+    async def _pass_on(self, connection: socket.socket) -> None:
+        with connection:
+            try:
+                async with asyncio.timeout(self._timeouts.handshake):
+                    received = await read_hello(connection, self._limits)
+                    sender = await self._find(received.link)
+                    await sender.send(connection, received.data)
+            except LinkRefused as error:
+                log.warning("link refused: %s", error)
+                with contextlib.suppress(OSError):
+                    connection.send(encode(Frame(FrameType.REFUSE, payload=b"unknown link or wrong token")))
+            except (LinkError, OSError) as error:
+                log.info("a link was not handed over: %s", str(error) or type(error).__name__)
+
+    async def _find(self, link: str) -> HandoverSender:
+        """Return who takes a link; the news of it may still be on its way."""
+        try:
+            async with asyncio.timeout(self._timeouts.unknown_link), self._assigned:
+                await self._assigned.wait_for(lambda: link in self._routes)
+                return self._routes[link]
+        except TimeoutError as error:
+            raise LinkRefused(f"unknown link {link!r}") from error
+
+
+class ReceivedHello:
+    """The first frame of a connection.
+
+    Attributes:
+        link: Id of the link that the peer asks for.
+        data: All that was read.
+    """
+
+    def __init__(self, link: str, data: bytes) -> None:
+        self.link = link
+        self.data = data
+
+
+async def read_hello(connection: socket.socket, limits: LinkLimits) -> ReceivedHello:
+    """Read the first frame of a connection and not a byte more.
+
+    Raises:
+        ProtocolError: It is no HELLO.
+        LinkLost: The connection ended.
+        OSError: The connection failed.
+    """
+    loop = asyncio.get_running_loop()
+    connection.setblocking(False)
+    reader = FrameReader(limits, max_message=HANDSHAKE_SIZE)
+    data = bytearray()
+    missing = HEADER_SIZE
+    while True:
+        part = await loop.sock_recv(connection, missing)
+        if not part:
+            raise LinkLost("the peer hung up")
+        data += part
+        frames = reader.feed(part)
+        if frames:
+            return ReceivedHello(parse_hello(frames[0]).link, bytes(data))
+        missing = reader.missing
+        if len(data) + missing > HEADER_SIZE + HANDSHAKE_SIZE:
+            raise ProtocolError("HELLO is too long")

@@ -1,0 +1,298 @@
+"""One process's place in the web of links: it listens, dials, and joins endpoints of the same process."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import hmac
+import logging
+import socket
+import stat
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rce.link.carrier import Carrier, LocalCarrier
+from rce.link.exceptions import LinkError, LinkLost, LinkRefused, ProtocolError
+from rce.link.frames import Frame, FrameType, encode, encode_hello, parse_hello
+from rce.link.settings import LinkLimits, LinkTimeouts
+from rce.link.socket_carrier import SocketCarrier
+from rce.link.tasks import TaskScope
+
+if TYPE_CHECKING:
+    from rce.control.model import LinkAddress, LinkSpec
+    from rce.link.frames import Hello
+    from rce.link.link import Link
+
+log = logging.getLogger(__name__)
+
+_MAX_GREETINGS = 1024
+"""Accepted connections that have not shown yet who they are."""
+
+
+class LinkHub:
+    """Listens for links, dials them, and joins endpoints of the same process without a socket.
+
+    Attributes:
+        machine: Name of the machine; a peer whose address has the same name is reached by its unix socket.
+        timeouts: Of all links.
+        limits: Of all links; both ends of a link need the same.
+    """
+
+    def __init__(
+        self, machine: str, timeouts: LinkTimeouts | None = None, limits: LinkLimits | None = None
+    ) -> None:
+        self.machine = machine
+        self.timeouts = timeouts or LinkTimeouts()
+        self.limits = limits or LinkLimits()
+        self._accepting: dict[str, Link] = {}
+        self._waiters: dict[str, set[asyncio.Future[None]]] = {}
+        self._carriers: set[SocketCarrier] = set()
+        self._greetings = TaskScope()
+        self._servers: list[asyncio.Server] = []
+        self._unix_sockets: dict[Path, int] = {}
+        self._closed = False
+
+    @property
+    def loop(self) -> asyncio.AbstractEventLoop:
+        """The running event loop."""
+        return asyncio.get_running_loop()
+
+    # Listening
+
+    async def listen_unix(self, path: Path) -> None:
+        """Accept links on a unix socket that only this user may use. It is removed by :meth:`close`.
+
+        A socket file that a dead process left behind is replaced.
+
+        Raises:
+            OSError: The path is too long (107 bytes at most), is no socket, or another process listens there.
+        """
+        _remove_stale_socket(path)
+        sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            sock.setblocking(False)
+            sock.bind(str(path))
+            path.chmod(stat.S_IRUSR | stat.S_IWUSR)
+            server = await self.loop.create_unix_server(self._accept, sock=sock, backlog=512)
+        except BaseException:
+            sock.close()
+            raise
+        self._servers.append(server)
+        self._unix_sockets[path] = path.stat().st_ino
+
+    async def listen_tcp(self, host: str, port: int) -> int:
+        """Accept links on TCP.
+
+        Args:
+            host: Address to bind; empty is every address.
+            port: Zero takes a free one.
+
+        Returns:
+            The port taken.
+        """
+        server = await self.loop.create_server(
+            self._accept, host or None, port, backlog=512, reuse_address=True
+        )
+        self._servers.append(server)
+        taken: int = server.sockets[0].getsockname()[1]
+        return taken
+
+    async def adopt(self, sock: socket.socket, received: bytes) -> None:
+        """Take over a connection that another process accepted, with what it has read from it.
+
+        The socket belongs to the hub from now on, also if this raises.
+
+        Raises:
+            OSError: The socket cannot be used.
+        """
+        try:
+            sock.setblocking(False)
+            await self.loop.connect_accepted_socket(lambda: self._accept(received), sock)
+        except BaseException:
+            sock.close()
+            raise
+
+    async def close(self) -> None:
+        """Stop listening and end every link. No socket and no socket file is left."""
+        self._closed = True
+        for server in self._servers:
+            server.close()
+        for path, inode in self._unix_sockets.items():
+            with contextlib.suppress(FileNotFoundError):
+                if path.stat().st_ino == inode:
+                    path.unlink()
+        await self._greetings.close()
+        for carrier in list(self._carriers):
+            carrier.abort(LinkLost("the hub is closed"))
+        for carrier in list(self._carriers):
+            await carrier.wait_closed()
+        for server in self._servers:
+            await server.wait_closed()
+        self._servers.clear()
+        self._unix_sockets.clear()
+
+    # Endpoints of this process
+
+    def register(self, link: Link) -> None:
+        """Let a link be found by its id: its peer dials."""
+        self._accepting[link.spec.id] = link
+        for waiter in self._waiters.get(link.spec.id, ()):
+            if not waiter.done():
+                waiter.set_result(None)
+
+    def unregister(self, link: Link) -> None:
+        """Take :meth:`register` back."""
+        if self._accepting.get(link.spec.id) is link:
+            del self._accepting[link.spec.id]
+
+    async def wait_registered(self, link_id: str, timeout: float | None) -> None:
+        """Wait until the accepting end of a link is registered anew, at most ``timeout`` seconds; none is for ever."""
+        waiter = self.loop.create_future()
+        self._waiters.setdefault(link_id, set()).add(waiter)
+        try:
+            await asyncio.wait([waiter], timeout=timeout)
+        finally:
+            waiters = self._waiters[link_id]
+            waiters.discard(waiter)
+            if not waiters:
+                del self._waiters[link_id]
+
+    # Dialing
+
+    def can_reach(self, spec: LinkSpec) -> bool:
+        """Tell whether :meth:`connect` has anywhere to go; else only a registration can help."""
+        if spec.id in self._accepting:
+            return True
+        address = spec.address
+        if self._is_near(address):
+            return Path(address.unix) not in self._unix_sockets
+        return bool(address.port)
+
+    async def connect(self, spec: LinkSpec) -> Carrier:
+        """Reach the accepting end of a link: in this process, by its unix socket, or by TCP.
+
+        Raises:
+            OSError: It cannot be reached, or not in time.
+            LinkError: It does not want the link, or does not speak as it should.
+        """
+        local = self._accepting.get(spec.id)
+        if local is not None:
+            _check_token(local, spec.token)
+            ours, theirs = LocalCarrier.pair()
+            local.attach(theirs)
+            return ours
+        address = spec.address
+        if self._is_near(address):
+            try:
+                return await self._dial_unix(spec)
+            except OSError as error:
+                if not address.port:
+                    raise
+                log.debug("link %s: %s does not answer (%s), trying TCP", spec.id, address.unix, error)
+        return await self._dial_tcp(spec)
+
+    def _is_near(self, address: LinkAddress) -> bool:
+        return bool(address.unix) and address.machine == self.machine
+
+    async def _dial_unix(self, spec: LinkSpec) -> Carrier:
+        async with asyncio.timeout(self.timeouts.connect):
+            _, carrier = await self.loop.create_unix_connection(self._new_carrier, spec.address.unix)
+        return await self._introduce(carrier, spec)
+
+    async def _dial_tcp(self, spec: LinkSpec) -> Carrier:
+        address = spec.address
+        async with asyncio.timeout(self.timeouts.connect):
+            _, carrier = await self.loop.create_connection(self._new_carrier, address.host, address.port)
+        return await self._introduce(carrier, spec)
+
+    async def _introduce(self, carrier: SocketCarrier, spec: LinkSpec) -> Carrier:
+        """Shake hands as the dialing end."""
+        try:
+            carrier.greet(encode_hello(spec.id, spec.token))
+            async with asyncio.timeout(self.timeouts.handshake):
+                answer = await carrier.handshake_frame()
+            if answer.type is FrameType.REFUSE:
+                raise LinkRefused(bytes(answer.payload).decode(errors="replace"))
+            if answer.type is not FrameType.WELCOME:
+                raise ProtocolError(f"HELLO was answered by {answer.type.name}")
+        except BaseException as error:
+            carrier.abort(LinkLost(f"no handshake: {error}"))
+            raise
+        return carrier
+
+    # Accepting
+
+    def _new_carrier(self, received: bytes = b"") -> SocketCarrier:
+        carrier = SocketCarrier(
+            self.limits, self.timeouts, received=received, on_closed=self._carriers.discard
+        )
+        self._carriers.add(carrier)
+        return carrier
+
+    def _accept(self, received: bytes = b"") -> SocketCarrier:
+        carrier = self._new_carrier(received)
+        if self._closed or len(self._greetings) >= _MAX_GREETINGS:
+            carrier.abort(LinkLost("too many connections come at once"))
+        else:
+            self._greetings.spawn(self._greet(carrier), "link greeting")
+        return carrier
+
+    async def _greet(self, carrier: SocketCarrier) -> None:
+        """Shake hands as the accepting end."""
+        try:
+            async with asyncio.timeout(self.timeouts.handshake):
+                hello = parse_hello(await carrier.handshake_frame())
+                link = await self._find(hello)
+        except LinkRefused as error:
+            log.warning("link refused: %s", error)
+            carrier.greet(encode(Frame(FrameType.REFUSE, payload=b"unknown link or wrong token")))
+            carrier.close()
+        except (LinkError, TimeoutError) as error:
+            log.info("no handshake: %s", str(error) or "it took too long")
+            carrier.abort(LinkLost("no handshake"))
+        except BaseException:
+            carrier.abort(LinkLost("the hub is closed"))
+            raise
+        else:
+            carrier.greet(encode(Frame(FrameType.WELCOME)))
+            link.attach(carrier)
+
+    async def _find(self, hello: Hello) -> Link:
+        """Return the link that a peer asks for; its spec may still be on its way."""
+        if hello.link not in self._accepting:
+            await self.wait_registered(hello.link, self.timeouts.unknown_link)
+        link = self._accepting.get(hello.link)
+        if link is None:
+            raise LinkRefused(f"unknown link {hello.link!r}")
+        _check_token(link, hello.token)
+        return link
+
+
+def _check_token(link: Link, token: str) -> None:
+    if not hmac.compare_digest(link.spec.token.encode(), token.encode()):
+        raise LinkRefused(f"wrong token for link {link.spec.id!r}")
+
+
+def _remove_stale_socket(path: Path) -> None:
+    """Remove the socket file of a process that is gone.
+
+    Raises:
+        OSError: The path is no socket, or somebody listens there.
+    """
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        return
+    if not stat.S_ISSOCK(mode):
+        raise FileExistsError(errno.EEXIST, "exists and is no socket", str(path))
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(str(path))
+        except ConnectionRefusedError:
+            path.unlink()
+            return
+        except BlockingIOError:
+            pass
+    raise OSError(errno.EADDRINUSE, "another process listens here", str(path))

@@ -1,0 +1,95 @@
+"""What ends a connection: interfaces, and the ports they send through."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Protocol, TypeAlias
+
+if TYPE_CHECKING:
+    from rce.control.model import InterfaceSpec
+
+Buffer: TypeAlias = bytes | bytearray | memoryview
+"""A payload to send. It is not copied where that can be avoided: do not change it afterwards."""
+
+
+class Port(Protocol):
+    """What an interface may do with its peers."""
+
+    @property
+    def spec(self) -> InterfaceSpec:
+        """What the interface was made for."""
+        ...
+
+    def send(self, payload: Buffer, *, latched: bool = False) -> None:
+        """Send a message to every peer. For subscriber interfaces.
+
+        Never blocks and never fails: where a peer's queue is full its oldest messages are dropped and counted. The
+        newest latched message is kept and sent to each peer that comes later.
+
+        Raises:
+            TypeError: The interface is not a subscriber.
+        """
+        ...
+
+    async def call(self, payload: Buffer, *, timeout: float | None = None) -> bytes:
+        """Ask the peer and wait for its answer. For service provider interfaces.
+
+        When the waiting task is cancelled, or time is up, the peer's work on the request is cancelled too.
+
+        Args:
+            payload: The request.
+            timeout: In seconds; none is :attr:`~rce.link.settings.LinkTimeouts.call`.
+
+        Raises:
+            TypeError: The interface is not a service provider.
+            NotConnected: There is no peer.
+            PeerFault: The peer answered with a fault.
+            PeerLost: The connection ended before the answer came.
+            CallTimeout: No answer in time.
+            Overloaded: Too many calls wait, here or at the peer.
+            MessageTooLarge: The request is larger than a link carries.
+        """
+        ...
+
+
+class Interface(ABC):
+    """An end of connections: a ROS topic or service, a converter, a forwarder.
+
+    :meth:`close` is called once for every interface that was made, also if :meth:`start` failed or was cancelled.
+    No other method is called after it.
+    """
+
+    def __init__(self, port: Port) -> None:
+        self.port = port
+
+    @abstractmethod
+    async def start(self) -> None:
+        """Make the interface usable; its connections open when this returns. May be cancelled.
+
+        Raises:
+            InterfaceError: It cannot be made usable; the text is for the user. Its connections stay closed.
+        """
+
+    @abstractmethod
+    async def close(self) -> None:
+        """Give up all that the interface holds."""
+
+    def receive(self, payload: bytes, *, latched: bool) -> None:
+        """Take a peer's message. For publisher interfaces; must not block."""
+        raise NotImplementedError(f"{type(self).__name__} takes no messages")
+
+    async def serve(self, payload: bytes) -> Buffer:
+        """Answer a peer's request. For service client interfaces; cancelled when the peer does not wait any more.
+
+        Raises:
+            Exception: Anything; its text is what the peer gets.
+        """
+        raise NotImplementedError(f"{type(self).__name__} serves no requests")
+
+    def on_active(self, active: bool) -> None:
+        """Notice that the first connection was established or the last one lost. Must not block."""
+
+
+InterfaceFactory: TypeAlias = Callable[[Port], Interface]
+"""Makes the interface for a port's spec; may raise :class:`~rce.link.exceptions.InterfaceError`."""

@@ -1,0 +1,96 @@
+"""One endpoint's end of a link: its channels, over whatever carries them at present."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+from rce.link.exceptions import ProtocolError
+from rce.link.frames import FrameType
+
+if TYPE_CHECKING:
+    from rce.control.model import LinkSpec
+    from rce.link.carrier import Carrier
+    from rce.link.channel import Channel
+    from rce.link.frames import Frame
+    from rce.link.settings import LinkLimits
+
+log = logging.getLogger(__name__)
+
+
+class Link:
+    """An endpoint's end of the link to a peer. It outlives its carriers.
+
+    Attributes:
+        spec: What the master desires.
+        limits: Of everything on this link.
+        carrier: What carries the frames at present.
+        peer_open: Channels that the peer opened on this carrier; also those that this end knows nothing of yet.
+    """
+
+    def __init__(self, spec: LinkSpec, limits: LinkLimits) -> None:
+        self.spec = spec
+        self.limits = limits
+        self.carrier: Carrier | None = None
+        self.peer_open: set[int] = set()
+        self._channels: dict[int, Channel] = {}
+
+    def add(self, channel: Channel) -> None:
+        """Add a channel and open it if its interface has started."""
+        self._channels[channel.number] = channel
+        channel.open()
+
+    def remove(self, channel: Channel) -> None:
+        """Close and forget a channel."""
+        channel.close()
+        del self._channels[channel.number]
+
+    def attach(self, carrier: Carrier) -> None:
+        """Go on over a new carrier; a former one is closed, as its peer has given it up."""
+        self.detach()
+        log.debug("link %s to %s is up (%s)", self.spec.id, self.spec.peer, carrier.kind)
+        self.carrier = carrier
+        for channel in list(self._channels.values()):
+            channel.open()
+        carrier.start(self)
+
+    def detach(self) -> Carrier | None:
+        """Close the carrier, if there is one, and return it; all channels are closed at once."""
+        carrier = self.carrier
+        if carrier is not None:
+            carrier.close()
+            self._lose()
+        return carrier
+
+    def frame_received(self, frame: Frame) -> None:
+        """Take a frame of the peer.
+
+        Raises:
+            ProtocolError: The peer must not send this.
+        """
+        number = frame.channel
+        channel = self._channels.get(number)
+        if frame.type is FrameType.OPEN:
+            if len(self.peer_open) >= self.limits.max_channels:
+                raise ProtocolError("too many open channels")
+            self.peer_open.add(number)
+            if channel is not None:
+                channel.peer_opened()
+        elif frame.type is FrameType.CLOSE:
+            self.peer_open.discard(number)
+            if channel is not None:
+                channel.peer_closed()
+        elif channel is not None:
+            channel.frame_received(frame)
+
+    def carrier_lost(self, carrier: Carrier, reason: Exception) -> None:
+        """Close all channels."""
+        if carrier is self.carrier:
+            log.debug("link %s to %s is down: %s", self.spec.id, self.spec.peer, reason)
+            self._lose()
+
+    def _lose(self) -> None:
+        self.carrier = None
+        self.peer_open.clear()
+        for channel in list(self._channels.values()):
+            channel.peer_closed()

@@ -1,0 +1,56 @@
+"""Times and limits of links, as frozen values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+KIB = 1024
+MIB = 1024 * KIB
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkTimeouts:
+    """How long links wait for what. All in seconds."""
+
+    connect: float = 5.0
+    """To reach a peer's socket."""
+    handshake: float = 10.0
+    """From an accepted connection to its HELLO, and from HELLO to the answer; more than ``unknown_link``."""
+    unknown_link: float = 5.0
+    """An accepted link that no endpoint knows yet: its spec may be on its way."""
+    redial_first: float = 0.02
+    """First pause before dialing again; it doubles every time."""
+    redial_last: float = 1.0
+    """Longest pause before dialing again."""
+    heartbeat: float = 2.0
+    """A TCP link that was silent for so long is asked whether it lives."""
+    silence: float = 8.0
+    """A TCP link that was silent for so long is dead."""
+    flush: float = 1.0
+    """A closing connection may send for so long what waits in its socket's buffer."""
+    call: float = 30.0
+    """A service call that names no timeout."""
+    close: float = 10.0
+    """An interface may take so long to close."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkLimits:
+    """How much links hold. Sizes in bytes."""
+
+    max_message: int = 64 * MIB
+    """A larger message is not sent, and ends the link if a peer sends it."""
+    unfinished_bytes: int = 256 * MIB
+    """Messages that are partly sent on one link, together; a sender begins no other before, a receiver accepts no more."""
+    max_channels: int = 4096
+    """Channels that a peer may have open on one link."""
+    queue_messages: int = 64
+    """Messages of one topic connection that wait to be sent."""
+    queue_bytes: int = 32 * MIB
+    """Bytes of one topic connection that wait to be sent; a single larger message may still wait alone."""
+    max_calls: int = 1024
+    """Calls of one service connection without an answer; also how many requests or answers wait to be sent."""
+    serving: int = 64
+    """Requests that one interface serves at the same time."""
+    waiting: int = 1024
+    """Requests that wait until one interface can serve them."""

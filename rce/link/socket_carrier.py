@@ -1,0 +1,310 @@
+"""Carries frames over a unix or TCP socket: a thin shell around :mod:`frames` and :mod:`lanes`."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+from typing import TYPE_CHECKING, TypeVar, cast
+
+from rce.link.carrier import Carrier, CarrierHandler
+from rce.link.exceptions import LinkLost, ProtocolError
+from rce.link.frames import FRAGMENT_SIZE, HANDSHAKE_SIZE, Frame, FrameReader, FrameType, encode
+from rce.link.lanes import Lanes, frame_chunk
+from rce.link.settings import KIB, MIB
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rce.link.lanes import Chunk
+    from rce.link.queues import OutgoingQueue
+    from rce.link.settings import LinkLimits, LinkTimeouts
+
+T = TypeVar("T")
+log = logging.getLogger(__name__)
+
+_HIGH_WATER = 64 * KIB
+_LOW_WATER = 16 * KIB
+"""With so little in the transport's buffer, urgent frames wait for a fragment or two there and not for a message."""
+_NOT_SENT = 128 * KIB
+"""What the kernel may hold unsent of a TCP link, for the same reason."""
+_TURN = 1 * MIB
+"""Bytes after which a link that could go on writing lets the event loop do something else."""
+
+
+class SocketCarrier(asyncio.BufferedProtocol, Carrier):
+    """A link's connection over a socket, from its first byte on.
+
+    Until :meth:`start` only small frames are accepted, and kept; :meth:`handshake_frame` returns the first of them.
+    """
+
+    def __init__(
+        self,
+        limits: LinkLimits,
+        timeouts: LinkTimeouts,
+        *,
+        received: bytes = b"",
+        on_closed: Callable[[SocketCarrier], None] = lambda _: None,
+    ) -> None:
+        self._limits = limits
+        self._timeouts = timeouts
+        self._received = received
+        self._on_closed = on_closed
+        self._loop = asyncio.get_running_loop()
+        self._reader = FrameReader(limits, max_message=HANDSHAKE_SIZE)
+        self._lanes = Lanes(limits)
+        self._transport: asyncio.Transport | None = None
+        self._kind = ""
+        self._writable = False
+        self._handler: CarrierHandler | None = None
+        self._early: list[Frame] = []
+        self._first: asyncio.Future[None] = self._loop.create_future()
+        self._closed: asyncio.Future[None] = self._loop.create_future()
+        self._ending = False
+        self._reason: Exception | None = None
+        self._heard = 0.0
+        self._beat = 0.0
+        self._timer: asyncio.TimerHandle | None = None
+        self._turn: asyncio.Handle | None = None
+
+    # The handshake
+
+    async def handshake_frame(self) -> Frame:
+        """Wait for the peer's first frame.
+
+        Raises:
+            ProtocolError: The peer sent something else than frames.
+            LinkLost: The connection ended first.
+        """
+        await asyncio.shield(self._first)
+        if not self._early:
+            raise self._reason or LinkLost("the connection ended before the handshake")
+        return self._early.pop(0)
+
+    def greet(self, frame: bytes) -> None:
+        """Send an encoded frame of the handshake."""
+        if self._transport is not None and not self._ending:
+            self._transport.write(frame)
+
+    # Carrier
+
+    @property
+    def kind(self) -> str:
+        """``unix`` or ``tcp``."""
+        return self._kind
+
+    def start(self, handler: CarrierHandler) -> None:
+        """Begin to hand frames over; the handshake is done."""
+        self._handler = handler
+        self._reader.max_message = self._limits.max_message
+        if self._kind == "tcp":
+            self._heartbeat()
+        early, self._early = self._early, []
+        if self._ending:
+            reason = self._reason or LinkLost("the connection ended")
+            self._loop.call_soon(handler.carrier_lost, self, reason)
+        else:
+            self._dispatch(early)
+
+    def control(self, frame: Frame) -> None:
+        """Send a small frame of the link itself."""
+        if self._ending or self._transport is None:
+            return
+        if self._writable and not self._lanes:
+            self._transport.write(encode(frame))
+            return
+        try:
+            self._lanes.add_control(frame)
+        except ProtocolError as error:
+            self.abort(error)
+        else:
+            self._go_on()
+
+    def send(self, queue: OutgoingQueue, frame: Frame) -> None:
+        """Send a message: at once where nothing waits, else in its lane."""
+        transport = self._transport
+        if self._ending or transport is None:
+            return
+        size = len(frame.payload)
+        if self._writable and size <= FRAGMENT_SIZE and not self._lanes:
+            queue.counters.count_out(size)
+            for buffer in frame_chunk(frame):
+                transport.write(buffer)
+            return
+        self._lanes.add(queue, frame)
+        self._go_on()
+
+    def withdraw(self, queue: OutgoingQueue, call_id: int) -> bool:
+        """Take a call back that has not begun to be sent."""
+        return self._lanes.withdraw(queue, call_id)
+
+    def clear(self, queue: OutgoingQueue) -> None:
+        """Throw away what waits on a channel."""
+        self._lanes.clear(queue)
+        self._go_on()
+
+    def close(self) -> None:
+        """Hang up after what lies in the socket's buffer was sent, or after the flush time."""
+        self._handler = None
+        self._end(LinkLost("closed"), flush=True)
+
+    def abort(self, reason: Exception) -> None:
+        """End at once; whoever handles the frames is told the reason."""
+        if isinstance(reason, ProtocolError):
+            log.warning("link dropped: %s", reason)
+        self._end(reason, flush=False)
+
+    async def wait_closed(self) -> None:
+        """Wait until the socket is closed."""
+        await asyncio.shield(self._closed)
+
+    # asyncio.BufferedProtocol
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Take the socket."""
+        self._transport = cast("asyncio.Transport", transport)
+        if self._ending:
+            self._transport.abort()
+            return
+        self._transport.set_write_buffer_limits(high=_HIGH_WATER, low=_LOW_WATER)
+        sock = transport.get_extra_info("socket")
+        self._kind = "unix" if sock.family == socket.AF_UNIX else "tcp"
+        if self._kind == "tcp":
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if hasattr(socket, "TCP_NOTSENT_LOWAT"):
+                sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _NOT_SENT)
+        self._writable = True
+        received, self._received = self._received, b""
+        if received:
+            self._take(self._reader.feed, received)
+
+    def get_buffer(self, sizehint: int) -> memoryview:  # noqa: ARG002 - the reader knows better
+        """Return where the socket's next bytes go."""
+        return self._reader.get_buffer()
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """Take bytes of the socket."""
+        self._take(self._reader.advance, nbytes)
+
+    def pause_writing(self) -> None:
+        """Stop handing bytes to the transport."""
+        self._writable = False
+
+    def resume_writing(self) -> None:
+        """Go on handing bytes to the transport."""
+        self._writable = True
+        self._go_on()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Give everything up."""
+        self._end(exc or LinkLost("the peer hung up"), flush=False)
+        if self._timer is not None:
+            self._timer.cancel()
+        self._transport = None
+        self._finish()
+
+    # Inside
+
+    def _take(self, read: Callable[[T], list[Frame]], argument: T) -> None:
+        self._heard = self._loop.time()
+        try:
+            frames = read(argument)
+        except ProtocolError as error:
+            self.abort(error)
+            return
+        if frames:
+            self._dispatch(frames)
+
+    def _dispatch(self, frames: list[Frame]) -> None:
+        for frame in frames:
+            if self._ending:
+                return
+            if self._handler is None:
+                self._keep(frame)
+            elif frame.type is FrameType.PING:
+                self.control(Frame(FrameType.PONG))
+            elif frame.type is not FrameType.PONG:
+                try:
+                    self._handler.frame_received(frame)
+                except ProtocolError as error:
+                    self.abort(error)
+
+    def _keep(self, frame: Frame) -> None:
+        if len(self._early) > self._limits.max_channels:
+            self.abort(ProtocolError("too many frames before the handshake is done"))
+            return
+        self._early.append(frame)
+        if not self._first.done():
+            self._first.set_result(None)
+
+    def _go_on(self) -> None:
+        if self._writable and self._turn is None:
+            self._pump()
+
+    def _pump(self) -> None:
+        """Hand frames to the transport until its buffer is full enough."""
+        self._turn = None
+        assert self._transport is not None
+        budget = _TURN
+        while self._writable and not self._ending:
+            chunk = self._lanes.next()
+            if chunk is None:
+                return
+            budget -= self._write(chunk)
+            if budget <= 0:
+                self._turn = self._loop.call_soon(self._pump)
+                return
+
+    def _write(self, chunk: Chunk) -> int:
+        assert self._transport is not None
+        size = 0
+        for buffer in chunk:
+            size += len(buffer)
+            self._transport.write(buffer)
+        return size
+
+    def _heartbeat(self) -> None:
+        """Ask a silent peer whether it lives; give a peer up that was silent for too long."""
+        now = self._loop.time()
+        if now - self._beat > 2 * self._timeouts.heartbeat:
+            self._heard = now  # the first beat, or this process stood still: that is not the peer's silence
+        self._beat = now
+        silent = now - self._heard
+        if silent >= self._timeouts.silence:
+            self.abort(LinkLost(f"the peer was silent for {silent:.1f} s"))
+            return
+        if silent >= self._timeouts.heartbeat / 2:
+            self.control(Frame(FrameType.PING))
+        self._timer = self._loop.call_later(self._timeouts.heartbeat, self._heartbeat)
+
+    def _end(self, reason: Exception, *, flush: bool) -> None:
+        """Stop using the socket; the first reason counts."""
+        if not self._ending:
+            self._ending = True
+            self._writable = False
+            self._reason = reason
+            if self._turn is not None:
+                self._turn.cancel()
+            if self._timer is not None:
+                self._timer.cancel()
+            if not self._first.done():
+                self._first.set_result(None)
+            if self._transport is not None:
+                self._hang_up(flush)
+            else:
+                self._finish()
+            if self._handler is not None:
+                self._loop.call_soon(self._handler.carrier_lost, self, reason)
+
+    def _finish(self) -> None:
+        if not self._closed.done():
+            self._closed.set_result(None)
+            self._on_closed(self)
+
+    def _hang_up(self, flush: bool) -> None:
+        assert self._transport is not None
+        if flush:
+            self._transport.close()
+            self._timer = self._loop.call_later(self._timeouts.flush, self._transport.abort)
+        else:
+            self._transport.abort()
