@@ -1,9 +1,12 @@
 """ROS 1 message and service types: definitions, checksums, serialization.
 
->>> from rce.ros.types import TypeRegistry
->>> string = TypeRegistry().message("std_msgs/String")
->>> string.serialize(string.new(data="hello"))
-b'\\x05\\x00\\x00\\x00hello'
+::
+
+    types = TypeRegistry(PackageIndex(["/opt/robots"]))
+    string = types.message("std_msgs/String")
+    data = string.serialize(string.new(data="hello"))
+    assert string.deserialize(data).data == "hello"
+    echo = types.service("Test/StringEcho")  # echo.request, echo.response, echo.md5sum
 """
 
 from rce.ros.types.exceptions import BadDefinition, SerializationError, TypesError, UnknownType

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from rce.ros.types.exceptions import BadDefinition
 from rce.ros.types.values import BUILTINS, NUMBERS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
 
 SEPARATOR = "=" * 80
 """Line between the parts of a full definition text."""
@@ -107,7 +109,9 @@ def parse_service(name: str, text: str, source: str = "") -> tuple[Definition, D
         else:
             parts[-1].append(line)
     if len(parts) != 2:  # noqa: PLR2004
-        raise BadDefinition(source or name, 0, f"a service has one '---' line, this text has {len(parts) - 1}")
+        raise BadDefinition(
+            source or name, 0, f"a service has one '---' line, this text has {len(parts) - 1}"
+        )
     request, response = ("".join(part) for part in parts)
     return (
         parse_message(f"{name}Request", request, source or name),
@@ -126,7 +130,9 @@ def split_full_text(name: str, text: str) -> Iterator[tuple[str, str]]:
     for part in rest:
         head, _, body = part.partition("\n")
         if not head.startswith(PART_HEADER):
-            raise BadDefinition(name, 0, f"a part of the definition begins with {head[:80]!r}, not with 'MSG: '")
+            raise BadDefinition(
+                name, 0, f"a part of the definition begins with {head[:80]!r}, not with 'MSG: '"
+            )
         yield head.removeprefix(PART_HEADER).strip(), body.removesuffix("\n")
 
 

@@ -57,8 +57,8 @@ class SerializationError(TypesError, ValueError):
 
     Attributes:
         type_name: The type of the whole message.
-        field: Path of the faulty field, such as ``header.seq`` or ``poses[2].position.x``; empty for the whole.
-        reason: What is wrong with it.
+        field: Path of the faulty field, such as ``header.seq`` or ``poses[2].position.x``; empty for the
+        whole. reason: What is wrong with it.
     """
 
     def __init__(self, type_name: str, field: str, reason: str) -> None:

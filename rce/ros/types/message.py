@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import keyword
 from array import array
 from collections.abc import Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Union
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from rce.ros.types.definition import PART_HEADER, SEPARATOR, checksum_text, md5
 from rce.ros.types.exceptions import UnknownType
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
     from rce.ros.types.definition import Constant, Definition, RawField
 
-Buffer = Union[bytes, bytearray, memoryview]
+Buffer = bytes | bytearray | memoryview
 """What a serialized message is read from."""
 
 
@@ -25,7 +26,7 @@ class Field(NamedTuple):
 
     name: str
     type: str
-    """A built-in type (``uint8``, ``string``, ``time`` ...) or the name of a message type; without brackets."""
+    """A built-in type (``uint8``, ``string``, ``time`` ...) or a message type; without brackets."""
     is_array: bool
     length: int | None
     """Number of elements of a fixed array; None for a variable array or no array."""
@@ -54,13 +55,14 @@ class Message:
     def __eq__(self, other: object) -> bool:
         if other.__class__ is not self.__class__:
             return NotImplemented
-        slots = self.__class__.__slots__
+        slots: tuple[str, ...] = self.__class__.__slots__
         return all(getattr(self, slot) == getattr(other, slot) for slot in slots)
 
     __hash__ = None  # type: ignore[assignment]  # messages can be changed
 
     def __repr__(self) -> str:
-        values = ", ".join(f"{slot}={getattr(self, slot)!r}" for slot in self.__class__.__slots__)
+        slots: tuple[str, ...] = self.__class__.__slots__
+        values = ", ".join(f"{slot}={getattr(self, slot)!r}" for slot in slots)
         return f"{self._type.name}({values})"
 
     if TYPE_CHECKING:
@@ -94,10 +96,9 @@ class MessageType:
 
     @cached_property
     def definition(self) -> str:
-        """The full text: the own text, then one part per type that is used, as ROS's ``gendeps --cat`` gives it."""
+        """The full text: the own text and a part per type that is used, as ROS's ``gendeps --cat`` has it."""
         parts = [self.own_text + "\n"]
-        for needed in self.dependencies:
-            parts.append(f"{SEPARATOR}\n{PART_HEADER}{needed.name}\n{needed.own_text}\n")
+        parts += (f"{SEPARATOR}\n{PART_HEADER}{kind.name}\n{kind.own_text}\n" for kind in self.dependencies)
         return "".join(parts).removesuffix("\n")
 
     @cached_property
@@ -120,8 +121,8 @@ class MessageType:
     def cls(self) -> type[Message]:
         """The class that holds messages of this type.
 
-        Its constructor takes the fields by position or by name; a field that is left out has its default: zero,
-        empty, or a message of defaults. A field whose name is a Python keyword gets a ``_`` at its end.
+        Its constructor takes the fields by position or by name; a field that is left out has its default:
+        zero, empty, or a message of defaults. A field whose name is a Python keyword gets a ``_`` at its end.
         """
         from rce.ros.types.objects import make_class
 
@@ -180,6 +181,11 @@ class ServiceType:
 
     def __repr__(self) -> str:
         return f"<ServiceType {self.name} {self.md5sum}>"
+
+
+def attribute(name: str) -> str:
+    """Return the attribute that holds a field: its name, with a ``_`` at the end of a Python keyword."""
+    return f"{name}_" if keyword.iskeyword(name) else name
 
 
 def default_value(field: Field) -> Any:

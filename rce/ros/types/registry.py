@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from functools import cache
-from importlib.resources import files
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rce.ros.types.definition import SEPARATOR, Definition, parse_message, parse_service, split_full_text
@@ -23,8 +23,8 @@ _PART = re.compile(r"(MSG|SRV): (\S+)\n")
 class TypeRegistry:
     """Finds types by name and makes each once.
 
-    A definition is looked for in the packages first (``PKG/msg/Type.msg``, ``PKG/srv/Type.srv``), then among the
-    built-in ones of the common ROS packages, then among those learned with :meth:`from_definition`.
+    A definition is looked for in the packages first (``PKG/msg/Type.msg``, ``PKG/srv/Type.srv``), then among
+    the built-in ones of the common ROS packages, then among those learned with :meth:`from_definition`.
 
     Args:
         packages: Where to look for packages; None for the built-in definitions only.
@@ -118,7 +118,8 @@ class TypeRegistry:
                 hint = f"there is no file {file}"
         text = builtin_definitions().get((kind, name))
         if text is None:
-            raise UnknownType(name, f"{hint}, and it is not among the built-in {'messages' if kind == 'msg' else 'services'}")
+            builtin = "messages" if kind == "msg" else "services"
+            raise UnknownType(name, f"{hint}, and it is not among the built-in {builtin}")
         return text, name
 
 
@@ -136,7 +137,8 @@ class _Builder:
             return found
         definition = self._definition(name)
         if name in self._open:
-            raise BadDefinition(definition.source, 0, f"the type holds itself: {' > '.join([*self._open, name])}")
+            chain = " > ".join([*self._open, name])
+            raise BadDefinition(definition.source, 0, f"the type holds itself: {chain}")
         self._open.append(name)
         try:
             kind = self._done[name] = MessageType(definition, self.build)
@@ -155,7 +157,7 @@ def _read(data: bytes, source: str) -> str:
 @cache
 def builtin_definitions() -> dict[tuple[str, str], str]:
     """Return the definitions that ship with the package: ``("msg" | "srv", name) -> text``."""
-    text = files("rce.ros.types").joinpath("definitions.txt").read_text("utf-8")
+    text = Path(__file__).with_name("definitions.txt").read_text("utf-8")
     found = {}
     for part in text.split(SEPARATOR + "\n")[1:]:
         match = _PART.match(part)

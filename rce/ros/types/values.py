@@ -2,7 +2,8 @@
 
 A field's value in a message object is: ``bool``, ``int``, ``float`` or ``str``; :class:`Time` or
 :class:`Duration`; another message object. An array of numbers is an :class:`array.array` (compact, typed,
-``numpy.asarray`` takes it without copying), ``uint8[]`` and ``char[]`` are ``bytes``, any other array is a list.
+``numpy.asarray`` takes it without copying), ``uint8[]`` and ``char[]`` are ``bytes``, any other array is a
+list.
 """
 
 from __future__ import annotations
@@ -33,7 +34,11 @@ class Number(NamedTuple):
 
 def _integer(code: str, size: int, *, signed: bool) -> Number:
     bits = 8 * size
-    return Number(code, size, -(1 << bits - 1), (1 << bits - 1) - 1) if signed else Number(code, size, 0, (1 << bits) - 1)
+    return (
+        Number(code, size, -(1 << bits - 1), (1 << bits - 1) - 1)
+        if signed
+        else Number(code, size, 0, (1 << bits) - 1)
+    )
 
 
 NUMBERS = {

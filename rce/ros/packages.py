@@ -1,0 +1,258 @@
+"""Packages: folders that hold nodes and message definitions.
+
+A package is a folder with a ``package.yaml`` (ours) or a ``package.xml`` (ROS's), or one that holds ``msg``
+or ``srv`` folders only, as distributions install them. Its executables are files in the folder itself or in
+``nodes``, ``scripts``, ``bin`` or ``lib`` below it; those of a package that is installed as
+``PREFIX/share/PKG`` are also in ``PREFIX/lib/PKG``. An installed Python distribution adds nodes by entry
+points of the group ``rce.nodes``, named ``PKG:EXE``.
+
+``package.yaml`` holds::
+
+    name: Test                  # optional: the folder's name
+    description: What it is for
+    python: engine              # .py files run with the engine's Python; system: as their first line says
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+ENTRY_POINTS = "rce.nodes"
+"""Entry point group by which Python distributions add nodes."""
+
+PATH_VARIABLES = ("RCE_PACKAGE_PATH", "ROS_PACKAGE_PATH")
+"""Environment variables that hold package paths, the more important first."""
+
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
+_FOLDERS = ("", "nodes", "scripts", "bin", "lib")
+_PYTHONS = ("engine", "system")
+
+
+class PackageError(Exception):
+    """Base of what can go wrong with packages."""
+
+
+class PackageNotFound(PackageError, LookupError):  # noqa: N818
+    """There is no package of a name on the path."""
+
+
+class ExecutableNotFound(PackageError, LookupError):  # noqa: N818
+    """A package has no such executable, or it may not be executed."""
+
+
+class BadPackage(PackageError, ValueError):  # noqa: N818
+    """A package's manifest cannot be read."""
+
+
+class Package(NamedTuple):
+    """A package that was found."""
+
+    name: str
+    path: Path
+    description: str = ""
+    python: str = "system"
+    """``engine``: .py files run with the engine's Python; ``system``: as their first line says."""
+    scripts: tuple[tuple[str, str], ...] = ()
+    """Executables that are Python functions: name and ``module:function``."""
+
+    def executable(self, exe: str) -> list[str]:
+        """Return what to execute to start a node: the first words of its command line.
+
+        Args:
+            exe: Name of the file, with or without the folder below the package.
+
+        Raises:
+            ExecutableNotFound: There is no such file, it may not be executed, or the name leads out of the
+            package.
+        """
+        for name, target in self.scripts:
+            if name == exe:
+                return [sys.executable, "-c", _call_of(target)]
+        if not exe or exe.startswith("/") or "\0" in exe or ".." in PurePosixPath(exe).parts:
+            raise ExecutableNotFound(f"{exe!r} is not a file inside package {self.name}")
+        candidates = [folder / exe for folder in self._folders()]
+        for file in candidates:
+            if file.is_file():
+                return self._command(file)
+        where = ", ".join(str(folder) for folder in self._folders() if folder.is_dir())
+        raise ExecutableNotFound(
+            f"package {self.name} has no executable {exe!r} (looked in {where or self.path})"
+        )
+
+    def _folders(self) -> Iterator[Path]:
+        for folder in _FOLDERS:
+            yield self.path / folder
+        if self.path.parent.name == "share":
+            yield self.path.parent.parent / "lib" / self.name
+
+    def _command(self, file: Path) -> list[str]:
+        if self.python == "engine" and file.suffix == ".py":
+            return [sys.executable, str(file)]
+        if not os.access(file, os.X_OK):
+            raise ExecutableNotFound(f"{file} may not be executed (chmod +x makes it so)")
+        return [str(file)]
+
+
+class PackageIndex:
+    """Finds packages by name. Nothing is remembered: a package that is added later is found.
+
+    Args:
+        path: Folders that hold package folders, or are packages themselves; the first hit counts.
+    """
+
+    def __init__(self, path: Iterable[Path | str]) -> None:
+        self.path = tuple(Path(folder) for folder in path)
+
+    @classmethod
+    def from_environ(cls, environ: Mapping[str, str] = os.environ) -> PackageIndex:
+        """Make an index of the paths in ``RCE_PACKAGE_PATH`` and ``ROS_PACKAGE_PATH``."""
+        texts = (environ.get(variable, "") for variable in PATH_VARIABLES)
+        return cls(folder for text in texts for folder in text.split(os.pathsep) if folder)
+
+    def __repr__(self) -> str:
+        return f"<PackageIndex {self.describe_path()}>"
+
+    def find(self, name: str) -> Package:
+        """Return the package of a name.
+
+        Raises:
+            PackageNotFound: There is none on the path, and no distribution adds nodes under its name.
+            BadPackage: Its manifest cannot be read.
+        """
+        folder = self.locate(name)
+        if folder is not None:
+            return _read_package(folder, name)._replace(scripts=_scripts(name))
+        scripts = _scripts(name)
+        if scripts:
+            return Package(name, _folder_of(scripts[0][1]), python="engine", scripts=scripts)
+        raise PackageNotFound(f"no package {name!r} on the package path ({self.describe_path()})")
+
+    def locate(self, name: str) -> Path | None:
+        """Return the folder of a package, None if there is none on the path."""
+        if _NAME.fullmatch(name) is None:
+            return None
+        for root in self.path:
+            found = _child(root, name) or _itself(root, name) or _renamed(root, name)
+            if found is not None:
+                return found
+        return None
+
+    def describe_path(self) -> str:
+        """Return the path as text for errors."""
+        return os.pathsep.join(map(str, self.path)) or "empty"
+
+
+def _child(root: Path, name: str) -> Path | None:
+    folder = root / name
+    if _is_package(folder):
+        return folder if _manifest(folder) is None or _declared_name(folder) in ("", name) else None
+    if root.name == "share":
+        programs = root.parent / "lib" / name
+        if programs.is_dir():
+            return folder if folder.is_dir() else programs
+    return None
+
+
+def _itself(root: Path, name: str) -> Path | None:
+    if _manifest(root) is None:
+        return None
+    return root if (_declared_name(root) or root.resolve().name) == name else None
+
+
+def _renamed(root: Path, name: str) -> Path | None:
+    """Find a package whose manifest gives it another name than its folder has."""
+    try:
+        folders = sorted(entry for entry in root.iterdir() if _manifest(entry) is not None)
+    except OSError:
+        return None
+    return next((folder for folder in folders if _declared_name(folder) == name), None)
+
+
+def _is_package(folder: Path) -> bool:
+    return _manifest(folder) is not None or (folder / "msg").is_dir() or (folder / "srv").is_dir()
+
+
+def _manifest(folder: Path) -> Path | None:
+    for name in ("package.yaml", "package.xml"):
+        file = folder / name
+        if file.is_file():
+            return file
+    return None
+
+
+def _declared_name(folder: Path) -> str:
+    """Return the name in a manifest; empty if it gives none or cannot be read."""
+    try:
+        return _read_package(folder, "").name
+    except BadPackage:
+        return ""
+
+
+def _read_package(folder: Path, name: str) -> Package:
+    manifest = _manifest(folder)
+    if manifest is None:
+        return Package(name, folder)
+    if manifest.suffix == ".xml":
+        return _read_xml(manifest, name)
+    return _read_yaml(manifest, name)
+
+
+def _read_yaml(manifest: Path, name: str) -> Package:
+    import yaml
+
+    try:
+        data = yaml.safe_load(manifest.read_bytes()) or {}
+    except (OSError, yaml.YAMLError) as error:
+        raise BadPackage(f"{manifest}: {error}") from error
+    if not isinstance(data, dict):
+        raise BadPackage(f"{manifest}: must hold 'key: value' lines")
+    python = data.get("python", "engine")
+    if python not in _PYTHONS:
+        raise BadPackage(f"{manifest}: python is {python!r}, must be one of {', '.join(_PYTHONS)}")
+    declared = data.get("name", name)
+    if declared != "" and (not isinstance(declared, str) or _NAME.fullmatch(declared) is None):
+        raise BadPackage(f"{manifest}: {declared!r} is not a package name")
+    return Package(declared, manifest.parent, str(data.get("description", "")), python)
+
+
+def _read_xml(manifest: Path, name: str) -> Package:
+    from xml.etree import ElementTree as ET
+
+    try:
+        root = ET.fromstring(manifest.read_bytes())  # noqa: S314  # a file of the machine's owner
+    except (OSError, ET.ParseError) as error:
+        raise BadPackage(f"{manifest}: {error}") from error
+    declared = (root.findtext("name") or name).strip()
+    return Package(declared, manifest.parent, " ".join((root.findtext("description") or "").split()))
+
+
+def _scripts(package: str) -> tuple[tuple[str, str], ...]:
+    from importlib.metadata import entry_points
+
+    points = ((*point.name.partition(":"), point.value) for point in entry_points(group=ENTRY_POINTS))
+    return tuple((exe, target) for owner, _, exe, target in points if owner == package)
+
+
+def _call_of(target: str) -> str:
+    module, _, function = target.partition(":")
+    return f"import importlib, sys; sys.exit(importlib.import_module({module!r}).{function or 'main'}())"
+
+
+def _folder_of(target: str) -> Path:
+    from importlib.util import find_spec
+
+    module = target.partition(":")[0]
+    try:
+        spec = find_spec(module)
+    except ImportError as error:
+        raise BadPackage(f"entry point {target}: {error}") from error
+    if spec is None or spec.origin is None:
+        raise BadPackage(f"entry point {target}: there is no module {module}")
+    return Path(spec.origin).parent

@@ -1,0 +1,133 @@
+"""Generates functions that read messages from their bytes on the wire."""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, Any, Protocol
+
+from rce.ros.types.codegen import Code
+from rce.ros.types.message import element_min_size
+from rce.ros.types.values import NUMBERS, STAMPS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from rce.ros.types.message import Buffer, Field, MessageType
+
+    Reader = Callable[[Buffer, int], tuple[Any, int]]
+    """Reads a value at a position and returns it with the position after it."""
+
+MAX_EMPTY_ELEMENTS = 1 << 16
+"""Longest array of messages without content: its length is not bounded by the size of the buffer."""
+
+
+class ReadDialect(Protocol):
+    """How values that were read become Python values; every method returns an expression."""
+
+    def number(self, code: Code, field: Field, value: str) -> str:
+        """Make the value of a number that :mod:`struct` gave."""
+
+    def stamp(self, code: Code, field: Field, secs: str, nsecs: str) -> str:
+        """Make the value of a time or duration."""
+
+    def octets(self, code: Code, chunk: str) -> str:
+        """Make the value of ``uint8[]`` or ``char[]``; ``chunk`` is a slice of the buffer."""
+
+    def numbers(self, code: Code, field: Field, chunk: str) -> str:
+        """Make the value of an array of numbers; ``chunk`` is a slice of the buffer."""
+
+    def message(self, code: Code, kind: MessageType, values: Sequence[str]) -> str:
+        """Make a message of the expressions of its fields."""
+
+
+class ReaderBuilder:
+    """Generates the reader of one message type."""
+
+    def __init__(self, dialect: ReadDialect, reader_of: Callable[[MessageType], Reader]) -> None:
+        self._dialect = dialect
+        self._reader_of = reader_of
+        self._code = Code()
+        self._pending: list[tuple[str, str]] = []
+
+    def build(self, kind: MessageType) -> Reader:
+        """Return the reader of ``kind``."""
+        value = self._message(kind)
+        self._flush()
+        self._code.line(f"return {value}, p")
+        reader: Reader = self._code.compile("read(b, p)", f"reader of {kind.name}")
+        return reader
+
+    def _message(self, kind: MessageType) -> str:
+        return self._dialect.message(self._code, kind, [self._field(field) for field in kind.fields])
+
+    def _field(self, field: Field) -> str:
+        if field.is_array:
+            return self._array(field)
+        if field.message is not None:
+            return self._message(field.message)
+        if field.type == "string":
+            return self._string()
+        if field.type in STAMPS:
+            secs, nsecs = (self._take(code) for code in STAMPS[field.type])
+            return self._dialect.stamp(self._code, field, secs, nsecs)
+        return self._dialect.number(self._code, field, self._take(NUMBERS[field.type].code))
+
+    def _array(self, field: Field) -> str:
+        code = self._code
+        count = str(field.length) if field.length is not None else self._take("I")
+        self._flush()
+        value = code.variable()
+        if field.message is not None:
+            self._messages(field, field.message, count, value)
+        elif field.type == "string":
+            code.line(f"{value} = []")
+            code.line(f"for _ in range({count}):")
+            code.line(f"    n, = {code.bind(struct.Struct('<I').unpack_from)}(b, p)")
+            code.line("    e = p + 4 + n")
+            code.line(f"    {value}.append(str(b[p + 4:e], 'utf-8'))")
+            code.line("    p = e")
+        else:
+            code.line(f"e = p + {count} * {element_min_size(field)}")
+            code.line(f"{value} = {self._chunk(field)}")
+            code.line("p = e")
+        return value
+
+    def _chunk(self, field: Field) -> str:
+        if field.is_bytes:
+            return self._dialect.octets(self._code, "b[p:e]")
+        if field.type in STAMPS:
+            unpack = self._code.bind(struct.Struct("<" + "".join(STAMPS[field.type])).iter_unpack)
+            return f"[{self._dialect.stamp(self._code, field, 's', 'n')} for s, n in {unpack}(b[p:e])]"
+        return self._dialect.numbers(self._code, field, "b[p:e]")
+
+    def _messages(self, field: Field, kind: MessageType, count: str, value: str) -> None:
+        code = self._code
+        if kind.min_size == 0 and field.length is None:
+            code.line(f"if {count} > {MAX_EMPTY_ELEMENTS}: raise Refused")
+        code.line(f"{value} = []")
+        code.line(f"for _ in range({count}):")
+        code.line(f"    x, p = {code.bind(self._reader_of(kind))}(b, p)")
+        code.line(f"    {value}.append(x)")
+
+    def _string(self) -> str:
+        size = self._take("I")
+        self._flush()
+        value = self._code.variable()
+        self._code.line(f"e = p + {size}")
+        self._code.line(f"{value} = str(b[p:e], 'utf-8')")
+        self._code.line("p = e")
+        return value
+
+    def _take(self, format_code: str) -> str:
+        variable = self._code.variable()
+        self._pending.append((format_code, variable))
+        return variable
+
+    def _flush(self) -> None:
+        if not self._pending:
+            return
+        layout = struct.Struct("<" + "".join(code for code, _ in self._pending))
+        targets = ", ".join(variable for _, variable in self._pending)
+        self._code.line(f"{targets}, = {self._code.bind(layout.unpack_from)}(b, p)")
+        self._code.line(f"p += {layout.size}")
+        self._pending.clear()
