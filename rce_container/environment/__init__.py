@@ -1,0 +1,1 @@
+"""What runs inside a container: its ROS core, its nodes, parameters and interfaces. Imports little, to start fast."""

@@ -1,0 +1,179 @@
+"""Lines of text with file descriptors over a unix stream socket: the transport of the control messages."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import socket
+from collections import deque
+from collections.abc import Callable
+
+from rce_container.environment.exceptions import ChannelError
+
+MAX_LINE = 16 << 20
+"""Bytes; a container's whole specification is one line."""
+MAX_UNSENT = 64 << 20
+"""Bytes that may wait for a peer that does not read."""
+_CHUNK = 1 << 16
+_MAX_FDS = 16
+_CLOEXEC = getattr(socket, "MSG_CMSG_CLOEXEC", 0)
+
+
+class Channel:
+    """One end of a connected unix stream socket. A descriptor arrives no later than the line it was sent with.
+
+    One task receives; anybody sends. The channel owns the socket and the descriptors that nobody took.
+    """
+
+    def __init__(self, sock: socket.socket) -> None:
+        sock.setblocking(False)  # noqa: FBT003
+        self._sock = sock
+        self._loop = asyncio.get_running_loop()
+        self._received = bytearray()
+        self._scanned = 0
+        self._fds: deque[int] = deque()
+        self._unsent: deque[tuple[memoryview, int | None]] = deque()
+        self._unsent_bytes = 0
+        self._closed = False
+        self._waiting: asyncio.Future[None] | None = None
+
+    async def receive(self) -> bytes | None:
+        """Wait for the next line; None when the connection has ended.
+
+        Raises:
+            ChannelError: The line is longer than :data:`MAX_LINE`.
+        """
+        while True:
+            end = self._received.find(b"\n", self._scanned)
+            if end >= 0:
+                line = bytes(self._received[:end])
+                del self._received[: end + 1]
+                self._scanned = 0
+                return line
+            self._scanned = len(self._received)
+            if self._scanned > MAX_LINE:
+                raise ChannelError(f"a line of more than {MAX_LINE} bytes")
+            if not await self._fill():
+                return None
+
+    def take_fd(self) -> int:
+        """Take the oldest descriptor that came in; it is the caller's now.
+
+        Raises:
+            ChannelError: None came.
+        """
+        if not self._fds:
+            raise ChannelError("the message should have come with a file descriptor")
+        return self._fds.popleft()
+
+    def send(self, line: bytes, fd: int | None = None) -> None:
+        """Send a line, and a duplicate of ``fd`` with it. Never blocks; does nothing once the channel is closed.
+
+        A peer that leaves more than :data:`MAX_UNSENT` bytes unread is given up: the channel closes.
+        """
+        if self._closed:
+            return
+        idle = not self._unsent
+        self._unsent.append((memoryview(line + b"\n"), None if fd is None else os.dup(fd)))
+        self._unsent_bytes += len(line) + 1
+        if self._unsent_bytes > MAX_UNSENT:
+            self.close()
+        elif idle:
+            self._flush()
+            if self._unsent:
+                self._loop.add_writer(self._sock, self._flush)
+
+    def close(self) -> None:
+        """Close the connection and all descriptors that were not taken or not sent."""
+        if self._closed:
+            return
+        self._closed = True
+        self._loop.remove_reader(self._sock)
+        self._loop.remove_writer(self._sock)
+        self._sock.close()
+        for fd in [*self._fds, *(fd for _, fd in self._unsent if fd is not None)]:
+            os.close(fd)
+        self._fds.clear()
+        self._unsent.clear()
+        if self._waiting is not None and not self._waiting.done():
+            self._waiting.set_result(None)
+
+    def _flush(self) -> None:
+        while self._unsent and not self._closed:
+            data, fd = self._unsent[0]
+            try:
+                sent = self._sock.send(data) if fd is None else socket.send_fds(self._sock, [data], [fd])
+            except (BlockingIOError, InterruptedError):
+                return
+            except OSError:
+                self.close()
+                return
+            if fd is not None:
+                os.close(fd)
+            self._unsent_bytes -= sent
+            if sent == len(data):
+                self._unsent.popleft()
+            else:
+                self._unsent[0] = (data[sent:], None)
+        if not self._closed:
+            self._loop.remove_writer(self._sock)
+
+    async def _fill(self) -> bool:
+        while not self._closed:
+            try:
+                data, fds, _, _ = socket.recv_fds(self._sock, _CHUNK, _MAX_FDS, _CLOEXEC)
+            except (BlockingIOError, InterruptedError):
+                await self._readable()
+                continue
+            except OSError:
+                return False
+            self._fds.extend(fds)
+            self._received += data
+            return bool(data)
+        return False
+
+    async def _readable(self) -> None:
+        waiting = self._waiting = self._loop.create_future()
+        self._loop.add_reader(self._sock, _wake, waiting)
+        try:
+            await waiting
+        finally:
+            self._waiting = None
+            if not self._closed:
+                self._loop.remove_reader(self._sock)
+
+
+def _wake(waiting: asyncio.Future[None]) -> None:
+    if not waiting.done():
+        waiting.set_result(None)
+
+
+async def accept(listener: socket.socket, take: Callable[[socket.socket], None]) -> None:
+    """Give every connection that comes in on a listening socket to ``take``, until cancelled."""
+    loop = asyncio.get_running_loop()
+    listener.setblocking(False)  # noqa: FBT003
+    while True:
+        sock, _ = await loop.sock_accept(listener)
+        try:
+            take(sock)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                sock.close()
+            raise
+
+
+async def connect(path: str) -> Channel:
+    """Connect to a unix socket.
+
+    Raises:
+        OSError: Nobody listens there.
+    """
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        sock.setblocking(False)  # noqa: FBT003
+        await asyncio.get_running_loop().sock_connect(sock, path)
+    except BaseException:
+        sock.close()
+        raise
+    return Channel(sock)

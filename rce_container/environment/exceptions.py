@@ -1,0 +1,25 @@
+"""What goes wrong inside a container.
+
+EnvironmentFault         told to the user as it is; the rest of the container goes on
+├── NodeError            a node cannot be started
+└── ParameterError       a parameter cannot be set
+ChannelError             the other end of the control socket breaks the protocol, or does not read
+"""
+
+from __future__ import annotations
+
+
+class EnvironmentFault(Exception):  # noqa: N818 - a fault of what the user asked for, not of the program
+    """Something the user asked for cannot be done; the text says what to do."""
+
+
+class NodeError(EnvironmentFault):
+    """A node cannot be started."""
+
+
+class ParameterError(EnvironmentFault):
+    """A parameter cannot be set."""
+
+
+class ChannelError(Exception):
+    """The other end of a control socket breaks the protocol, or does not read."""

@@ -1,0 +1,116 @@
+"""The messages between the manager and an environment (JSON lines on the control socket, tagged by ``t``).
+
+Both are of one release and run on one machine. A manager may die and another one come: the newest connection is
+the one that counts, and the first thing an environment says on it is a :class:`Report`.
+"""
+
+from __future__ import annotations
+
+from typing import Union
+
+import msgspec
+from msgspec import Struct
+
+from rce.control.model import EndpointSpec, EndpointStatus, InterfaceUsage, LinkAddress
+
+
+class Boot(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What an environment is told when it is started, as JSON in its first argument. Holds no secret."""
+
+    id: str
+    """Endpoint id, ``user/tag``."""
+    mark: str
+    """Names this life of the container; see :data:`rce_container.environment.proc.MARK`."""
+    machine: str
+    """See :class:`rce.control.model.LinkAddress`."""
+    control_fd: int
+    """A listening unix socket; managers connect to it."""
+    link_fd: int
+    """A listening unix socket; peers' links come in on it."""
+    home: str
+    logs: str
+    ros_port: int
+    """Port of the container's ROS core on 127.0.0.1; 0 takes a free one."""
+    isolated: bool
+    """Whether the environment is process 1 of its own pid namespace."""
+    packages: tuple[str, ...] = ()
+    grace: float = 30.0
+    """Seconds without a manager after which the environment ends itself."""
+    interrupt_timeout: float = 15.0
+    """Seconds that a node has to end after SIGINT, before it gets SIGTERM."""
+    terminate_timeout: float = 2.0
+    """Seconds that a node has to end after SIGTERM, before it gets SIGKILL."""
+
+
+class _Message(Struct, frozen=True, kw_only=True, omit_defaults=True, tag_field="t"):
+    """Base of all messages."""
+
+
+# Manager to environment
+
+
+class Apply(_Message):
+    """The container is desired like this."""
+
+    spec: EndpointSpec
+
+
+class Adopt(_Message):
+    """A link's socket that the manager accepted for this container. Comes with the descriptor."""
+
+    received: bytes
+    """What was read from it already."""
+
+
+class Dialed(_Message):
+    """Answer to :class:`Dial`. Comes with the descriptor, unless there is an error."""
+
+    request: int
+    error: str = ""
+
+
+class Poll(_Message):
+    """Asks for :class:`Counters`."""
+
+
+class Stop(_Message):
+    """Stop all nodes and end."""
+
+
+# Environment to manager
+
+
+class Report(_Message):
+    """All there is; sent on connection and whenever something in it changed."""
+
+    status: EndpointStatus
+    """Without incarnation and address, which the manager knows; pids as the environment sees them."""
+
+
+class Fault(_Message):
+    """Something failed that the user must know of."""
+
+    text: str
+
+
+class Counters(_Message):
+    """Answer to :class:`Poll`."""
+
+    interfaces: dict[str, InterfaceUsage] = {}
+
+
+class Dial(_Message):
+    """Asks for a connection to a peer, which the environment cannot reach by itself. Answered by :class:`Dialed`."""
+
+    request: int
+    address: LinkAddress
+
+
+ToEnvironment = Union[Apply, Adopt, Dialed, Poll, Stop]
+ToManager = Union[Report, Fault, Counters, Dial]
+
+encode = msgspec.json.Encoder().encode
+"""Write a message as JSON; holds no newline."""
+decode_to_environment = msgspec.json.Decoder(ToEnvironment).decode
+decode_to_manager = msgspec.json.Decoder(ToManager).decode
+decode_boot = msgspec.json.Decoder(Boot).decode

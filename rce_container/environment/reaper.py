@@ -1,0 +1,87 @@
+"""Starting processes and waiting for them, adopted orphans included."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+from collections.abc import Mapping, Sequence
+from typing import Self
+
+
+class Child:
+    """A process that was started here, in a session of its own."""
+
+    def __init__(self, process: subprocess.Popen[bytes], ended: asyncio.Future[int]) -> None:
+        self._process = process
+        self.ended = ended
+        """Its exit code; negative for a signal."""
+
+    @property
+    def pid(self) -> int:
+        """The process id, which is also its group's and its session's."""
+        return self._process.pid
+
+    def signal_group(self, number: signal.Signals) -> None:
+        """Send a signal to all processes of its group."""
+        try:
+            os.killpg(self.pid, number)
+        except (ProcessLookupError, PermissionError):
+            return
+
+    def finish(self, code: int) -> None:
+        """Note the exit code that the reaper read."""
+        self._process.returncode = code
+        if not self.ended.done():
+            self.ended.set_result(code)
+
+
+class Reaper:
+    """Waits for every child of this process, so that orphans which the kernel hands to it leave no zombie.
+
+    Use as a context manager in the main thread, one per process, and start processes by :meth:`spawn` only: it
+    collects exit codes that nobody else will see then.
+    """
+
+    def __init__(self) -> None:
+        self._children: dict[int, Child] = {}
+
+    def __enter__(self) -> Self:
+        asyncio.get_running_loop().add_signal_handler(signal.SIGCHLD, self._reap)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        asyncio.get_running_loop().remove_signal_handler(signal.SIGCHLD)
+        self._reap()
+
+    def spawn(self, argv: Sequence[str], *, env: Mapping[str, str], cwd: str, output: int) -> Child:
+        """Start a process in a new session, with standard output and error to ``output``.
+
+        Raises:
+            OSError: It cannot be started.
+        """
+        process = subprocess.Popen(  # noqa: S603 - what a user's package offers is what runs here
+            argv,
+            env=env,
+            cwd=cwd,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=output,
+            start_new_session=True,
+        )
+        child = Child(process, asyncio.get_running_loop().create_future())
+        self._children[child.pid] = child
+        return child
+
+    def _reap(self) -> None:
+        while True:
+            try:
+                pid, status = os.waitpid(-1, os.WNOHANG)
+            except ChildProcessError:
+                return
+            if not pid:
+                return
+            child = self._children.pop(pid, None)
+            if child is not None:
+                child.finish(os.waitstatus_to_exitcode(status))

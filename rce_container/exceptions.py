@@ -1,0 +1,33 @@
+"""What goes wrong in the Container Task Set.
+
+ContainerError
+├── RuntimeUnavailableError   no runtime of that name works on this machine
+├── StartError                a container could not be started
+└── StateError                the state directory cannot be used
+"""
+
+from __future__ import annotations
+
+
+class ContainerError(Exception):
+    """Base of all errors of this package."""
+
+
+class RuntimeUnavailableError(ContainerError):
+    """The chosen runtime does not work on this machine."""
+
+    def __init__(self, runtime: str, reason: str) -> None:
+        super().__init__(runtime, reason)
+        self.runtime = runtime
+        self.reason = reason
+
+    def __str__(self) -> str:
+        return f"the runtime {self.runtime!r} does not work here: {self.reason}"
+
+
+class StartError(ContainerError):
+    """A container could not be started; the text says what to do."""
+
+
+class StateError(ContainerError):
+    """The state directory cannot be used; the text says why."""

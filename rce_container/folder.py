@@ -1,0 +1,202 @@
+"""Where a container task set keeps what it needs on disk.
+
+``STATE/name`` and one folder per life of a container, ``STATE/containers/MARK`` (record, logs, private home), are
+in the state directory; the container's sockets are in a short path, ``RUN/MARK``. Everything belongs to one task
+set at a time: the state directory is locked while it runs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import re
+import secrets
+import shutil
+import socket
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Self
+
+import msgspec
+from msgspec import Struct
+
+from rce_container.exceptions import StateError
+
+_MARK = re.compile(r"[0-9a-f]{12}")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,127}")
+_MAX_SOCKET_PATH = 107
+
+
+class Record(Struct, frozen=True, kw_only=True):
+    """What a manager must know of a container that an earlier manager started."""
+
+    id: str
+    mark: str
+    runtime: str
+    pid: int
+    """The outermost process of the container."""
+    start: int
+    """Its start time, so that a reused pid is told apart."""
+
+
+class ContainerFolder:
+    """The paths of one life of one container."""
+
+    def __init__(self, root: Path, run: Path, mark: str) -> None:
+        self.mark = mark
+        self.path = root / mark
+        self.run = run / mark
+        self.home = self.path / "home"
+        self.logs = self.path / "logs"
+        self.etc = self.path / "etc"
+        self.control_socket = self.run / "control.sock"
+        self.link_socket = self.run / "link.sock"
+
+    def make(self) -> None:
+        """Make the folders, for the owner only.
+
+        Raises:
+            StateError: They cannot be made.
+        """
+        try:
+            for path in (self.path, self.run, self.home, self.logs, self.etc):
+                path.mkdir(mode=0o700, parents=True)
+        except OSError as error:
+            raise StateError(f"cannot make {error.filename}: {error.strerror}") from error
+
+    def listen(self, path: Path) -> socket.socket:
+        """Bind a listening unix socket.
+
+        Raises:
+            StateError: It cannot be bound.
+        """
+        sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            sock.bind(str(path))
+            sock.listen(128)
+        except OSError as error:
+            sock.close()
+            raise StateError(f"cannot listen on {path}: {error}") from error
+        return sock
+
+    def write_record(self, record: Record) -> None:
+        """Note who the container is, atomically.
+
+        Raises:
+            StateError: It cannot be written.
+        """
+        temporary = self.path / "record.new"
+        try:
+            temporary.write_bytes(msgspec.json.encode(record))
+            temporary.replace(self.path / "record.json")
+        except OSError as error:
+            raise StateError(f"cannot write {error.filename}: {error.strerror}") from error
+
+    def read_record(self) -> Record | None:
+        """The record; None if it was never written whole."""
+        try:
+            return msgspec.json.decode((self.path / "record.json").read_bytes(), type=Record)
+        except (OSError, msgspec.DecodeError):
+            return None
+
+    def remove(self) -> None:
+        """Remove everything, also what a node made unreadable. Blocks; may be repeated."""
+        for path in (self.run, self.path):
+            shutil.rmtree(path, onerror=_make_writable_and_retry)
+
+
+def _make_writable_and_retry(function: object, path: str, _: object) -> None:
+    with contextlib.suppress(OSError):
+        for broken in (os.path.dirname(path), path):
+            if not stat.S_ISLNK(os.lstat(broken).st_mode):
+                os.chmod(broken, 0o700)
+        shutil.rmtree(path) if os.path.isdir(path) and not os.path.islink(path) else os.unlink(path)
+
+
+class StateFolder:
+    """The state directory of a container task set. A context manager: locked while it is open.
+
+    Args:
+        state: Path of the state directory.
+        run: A short path for sockets; one folder per state directory is made in it.
+    """
+
+    def __init__(self, state: Path, run: Path) -> None:
+        self._state = state.absolute()
+        self._containers = self._state / "containers"
+        self._run_base = run
+        self._run = run
+        self._lock = -1
+
+    def __enter__(self) -> Self:
+        try:
+            self._containers.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self._lock = os.open(self._state / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            self.__exit__()
+            raise StateError(
+                f"another rce-container uses {self._state}; give this one its own --state-dir"
+            ) from error
+        except OSError as error:
+            self.__exit__()
+            raise StateError(f"cannot use the state directory {self._state}: {error}") from error
+        self._run = self._run_base / f"c-{self._word('run', secrets.token_hex(4))}"
+        self._run.mkdir(mode=0o700, parents=True, exist_ok=True)
+        longest = len(os.fsencode(self._run / ("0" * 12) / "control.sock"))
+        if longest > _MAX_SOCKET_PATH:
+            raise StateError(
+                f"the path {self._run} is too long for sockets; set XDG_RUNTIME_DIR to a shorter one"
+            )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(OSError):
+            self._run.rmdir()
+        if self._lock >= 0:
+            os.close(self._lock)
+            self._lock = -1
+
+    def name(self, wish: str) -> str:
+        """The task set's name: ``wish``, or the one it had before, or a new one. It is kept.
+
+        Raises:
+            StateError: ``wish`` cannot be a name.
+        """
+        if wish:
+            if not _NAME.fullmatch(wish):
+                raise StateError(f"{wish!r} cannot name a task set: use letters, digits, '_', '-' and '.'")
+            (self._state / "name").write_text(wish)
+        return self._word("name", f"container-{secrets.token_hex(4)}")
+
+    def create(self) -> ContainerFolder:
+        """Make the folder of a new life of a container.
+
+        Raises:
+            StateError: It cannot be made.
+        """
+        folder = self.open(secrets.token_hex(6))
+        folder.make()
+        return folder
+
+    def open(self, mark: str) -> ContainerFolder:
+        """The folder of one life of a container, whether it is there or not."""
+        return ContainerFolder(self._containers, self._run, mark)
+
+    def existing(self) -> Iterator[ContainerFolder]:
+        """All folders that are there, in no order."""
+        marks = {path.name for parent in (self._containers, self._run) for path in parent.iterdir()}
+        return (self.open(mark) for mark in sorted(marks) if _MARK.fullmatch(mark))
+
+    def _word(self, file: str, default: str) -> str:
+        path = self._state / file
+        try:
+            word = path.read_text().strip()
+        except OSError:
+            word = ""
+        if not _NAME.fullmatch(word):
+            word = default
+            path.write_text(word)
+        return word

@@ -1,0 +1,1 @@
+"""How a container's processes are made: with namespaces, or without any isolation."""
