@@ -14,7 +14,7 @@ from pathlib import Path
 
 import psutil
 
-from rce.cli.process import Child
+from rce.supervision.process import Child
 
 BIN = Path(sys.executable).parent
 

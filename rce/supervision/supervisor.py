@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from rce.cli.process import Child, relay
+from rce.supervision.process import Child, relay
 
 RESTART_DELAY_S = 0.2
 RESTART_DELAY_MAX_S = 5.0

@@ -1,0 +1,1 @@
+"""Child programs: started, watched, restarted, ended, whatever happens to the program that watches them."""
