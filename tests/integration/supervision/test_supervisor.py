@@ -1,0 +1,97 @@
+"""Programs are started in order, restarted when they die, and end whole."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+
+from rce.supervision.process import Child
+from rce.supervision.supervisor import Program, StartError, Supervisor
+
+READY = "import time; print('x ready: now', flush=True); time.sleep(1000)"
+
+
+def python(name: str, code: str) -> Program:
+    return Program(name, [sys.executable, "-c", code])
+
+
+async def run_until(supervisor: Supervisor, done: asyncio.Event) -> None:
+    ready = asyncio.Event()
+    task = asyncio.create_task(supervisor.run(ready.set))
+    await ready.wait()
+    await done.wait()
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_restarts_a_program_that_died() -> None:
+    lines: list[str] = []
+    restarted = asyncio.Event()
+    starts = 0
+
+    def show(line: str) -> None:
+        nonlocal starts
+        lines.append(line)
+        if line.startswith("[a] pid"):
+            starts += 1
+            if starts == 1:
+                os.kill(int(line.split()[2]), signal.SIGKILL)
+            else:
+                restarted.set()
+
+    code = "import os,time; print('a ready: yes', flush=True); print('pid', os.getpid(), flush=True); time.sleep(1000)"
+    async with asyncio.timeout(20):
+        await run_until(Supervisor([python("a", code)], show), restarted)
+    assert any("ended with exit code -9" in line for line in lines)
+
+
+async def test_a_program_that_never_gets_ready_fails_the_start() -> None:
+    supervisor = Supervisor([python("good", READY), python("bad", "raise SystemExit(3)")], print)
+    with pytest.raises(ExceptionGroup) as caught:
+        await supervisor.run(lambda: pytest.fail("it is not ready"))
+    assert caught.group_contains(StartError, match="bad ended with exit code 3")
+
+
+async def test_stop_kills_what_ignores_sigterm() -> None:
+    code = "import signal,time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready: x', flush=True); time.sleep(1000)"
+    child = await Child.start("stubborn", [sys.executable, "-c", code])
+    assert [line async for line in _first(child)] == ["ready: x"]
+    await child.stop(timeout=0.2)
+    assert child.returncode == -signal.SIGKILL
+    assert [line async for line in child.lines()] == []
+
+
+async def _first(child: Child):  # type: ignore[no-untyped-def]
+    async for line in child.lines():
+        yield line
+        return
+
+
+async def test_children_end_with_a_supervisor_that_is_killed(tmp_path: Path) -> None:
+    pid_file = tmp_path / "pid"
+    code = f"""
+import asyncio, sys
+from rce.supervision.process import Child
+async def main():
+    child = await Child.start("c", [sys.executable, "-c", "import time; time.sleep(1000)"])
+    open({str(pid_file)!r}, "w").write(str(child.pid))
+    print("ready: x", flush=True)
+    await asyncio.sleep(1000)
+asyncio.run(main())
+"""
+    supervisor = await Child.start("supervisor", [sys.executable, "-c", code])
+    async for _ in supervisor.lines():
+        break
+    child = psutil.Process(int(pid_file.read_text()))
+    os.kill(supervisor.pid, signal.SIGKILL)
+    await supervisor.wait()
+    async with asyncio.timeout(10):
+        while child.is_running() and child.status() != psutil.STATUS_ZOMBIE:
+            await asyncio.sleep(0.02)
+    await supervisor.stop()
