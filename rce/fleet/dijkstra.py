@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import heapq
 from math import inf
-
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rce.fleet.grid import GridMap
     from collections.abc import Sequence
+
+    from rce.fleet.grid import GridMap
 
 
 def distances(grid: GridMap, goal: int, weights: Sequence[float] | None = None) -> list[float]:

@@ -13,14 +13,15 @@ from collections import deque
 from dataclasses import dataclass, field
 from math import inf
 from random import Random
+from typing import TYPE_CHECKING
 
 from rce.fleet.dijkstra import distances
 from rce.fleet.pibt import Configuration, ConfigurationGenerator
-from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rce.fleet.grid import GridMap
     from collections.abc import Sequence
+
+    from rce.fleet.grid import GridMap
 
 DEFAULT_EFFORT = 40_000
 """How many single-robot moves are tried before the search gives up."""

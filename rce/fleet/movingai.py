@@ -7,10 +7,10 @@ right and y downwards, which is column and row of :class:`~rce.fleet.grid.GridMa
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from rce.fleet.exceptions import MapError
 from rce.fleet.grid import GridMap
-from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pathlib import Path

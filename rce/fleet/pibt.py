@@ -11,8 +11,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from random import Random
     from collections.abc import Mapping, Sequence
+    from random import Random
 
 Configuration = tuple[int, ...]
 """The cell of every robot."""

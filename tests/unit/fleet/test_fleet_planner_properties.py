@@ -1,0 +1,63 @@
+"""The promises of the fleet planner, under random delays, losses and speeds."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rce.fleet.coordination.events import CellBlocked
+from rce.fleet.coordination.planner import FleetPlanner
+from rce.fleet.grid import GridMap
+from rce.fleet.movingai import read_map, read_scenario
+
+DATA = Path(os.environ.get("RCE_DATA", "../shared/data")) / "maps"
+
+
+def connected_map(rng: Random, boxes: int) -> GridMap:
+    while True:
+        grid = GridMap().with_blocked(rng.sample(range(64), boxes))
+        if grid.connected():
+            return grid
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**32), count=st.integers(1, 8))
+def test_every_robot_arrives_within_its_own_cells(make_fleet: Any, seed: int, count: int) -> None:
+    rng = Random(seed)
+    grid = connected_map(rng, 3)
+    hidden = grid.blocked and rng.choice(sorted(grid.blocked))
+    known = grid.with_blocked(grid.blocked - {hidden})
+    starts, goals = rng.sample(grid.free, count), rng.sample(grid.free, count)
+    fleet = make_fleet(FleetPlanner(known), starts, seed, loss=rng.choice((0.0, 0.2)))
+    fleet.hidden = {hidden}
+    fleet.send(goals)
+    for _ in range(rng.randrange(60)):
+        fleet.step()
+    ahead = [cell for robot in fleet.planner.snapshot().robots for cell in robot.plan[1:]]
+    candidates = [
+        cell for cell in ahead if cell not in goals and grid.with_blocked(grid.blocked | {cell}).connected()
+    ]
+    if candidates:
+        assert fleet.ask(CellBlocked(rng.choice(candidates))).ok
+    fleet.run(fleet.all_arrived)
+    assert {robot.id: robot.cell for robot in fleet.planner.snapshot().robots} == {
+        f"Robot{number}": goal for number, goal in enumerate(goals, start=1)
+    }
+
+
+@pytest.mark.parametrize("count", [4, 20])
+def test_robots_drive_on_a_benchmark_map(make_fleet: Any, count: int) -> None:
+    path = DATA / "random-32-32-20.map"
+    if not path.exists():
+        pytest.skip(f"{path} is not there (set RCE_DATA)")
+    grid = read_map(path)
+    rows = read_scenario(DATA / "random-32-32-20-random-1.scen", grid, limit=count)
+    fleet = make_fleet(FleetPlanner(grid), [row.start for row in rows], seed=count)
+    fleet.send([row.goal for row in rows])
+    fleet.run(fleet.all_arrived)
