@@ -7,14 +7,13 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rce.ros.packages import PackageIndex
 from rce.ros.types.definition import SEPARATOR, Definition, parse_message, parse_service, split_full_text
 from rce.ros.types.exceptions import BadDefinition, UnknownType
 from rce.ros.types.message import MessageType, ServiceType
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-    from rce.ros.packages import PackageIndex
 
 _NAME = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/([A-Za-z][A-Za-z0-9_]*)")
 _PART = re.compile(r"(MSG|SRV): (\S+)\n")
@@ -27,11 +26,12 @@ class TypeRegistry:
     the built-in ones of the common ROS packages, then among those learned with :meth:`from_definition`.
 
     Args:
-        packages: Where to look for packages; None for the built-in definitions only.
+        packages: Where to look for packages; None: on the paths that the environment names
+            (:meth:`~rce.ros.packages.PackageIndex.from_environ`).
     """
 
     def __init__(self, packages: PackageIndex | None = None) -> None:
-        self._packages = packages
+        self._packages = packages if packages is not None else PackageIndex.from_environ()
         self._messages: dict[str, MessageType] = {}
         self._services: dict[str, ServiceType] = {}
         self._learned: dict[str, MessageType] = {}
@@ -106,16 +106,14 @@ class TypeRegistry:
         if match is None:
             raise UnknownType(name, "a type is named package/Type")
         package, type_name = match.groups()
-        hint = "no package path is set"
-        if self._packages is not None:
-            folder = self._packages.locate(package)
-            if folder is None:
-                hint = f"no package {package} on the package path ({self._packages.describe_path()})"
-            else:
-                file = folder / kind / f"{type_name}.{kind}"
-                if file.is_file():
-                    return _read(file.read_bytes(), str(file)), str(file)
-                hint = f"there is no file {file}"
+        folder = self._packages.locate(package)
+        if folder is None:
+            hint = f"no package {package} on the package path ({self._packages.describe_path()})"
+        else:
+            file = folder / kind / f"{type_name}.{kind}"
+            if file.is_file():
+                return _read(file.read_bytes(), str(file)), str(file)
+            hint = f"there is no file {file}"
         text = builtin_definitions().get((kind, name))
         if text is None:
             builtin = "messages" if kind == "msg" else "services"
