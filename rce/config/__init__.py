@@ -1,0 +1,1 @@
+"""What users write: client config files, engine settings, the shared secret; and where shipped files are."""

@@ -1,0 +1,55 @@
+"""Where the engine keeps its state and its sockets."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import platformdirs
+
+from rce.config.exceptions import RunDirError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+def default_state_dir() -> Path:
+    """Return where state is kept if nothing else was said, such as ``~/.local/state/rce``. Makes nothing."""
+    return platformdirs.user_state_path("rce")
+
+
+def run_dir(environ: Mapping[str, str] | None = None) -> Path:
+    """Return this user's folder for sockets, ``$XDG_RUNTIME_DIR/rce`` or ``/tmp/rce-UID``; made if need be.
+
+    It is short, because the path of a unix socket may have at most 107 bytes, and only its owner may enter.
+
+    Raises:
+        RunDirError: It cannot be made, is no folder, or belongs to somebody else.
+    """
+    environ = os.environ if environ is None else environ
+    runtime = environ.get("XDG_RUNTIME_DIR", "")
+    if runtime and Path(runtime).is_dir():
+        return private_folder(Path(runtime) / "rce")
+    return private_folder(Path(f"/tmp/rce-{os.getuid()}"))  # noqa: S108 - private_folder checks whose it is
+
+
+def private_folder(path: Path) -> Path:
+    """Make a folder that only its owner may enter, or check that the one which is there is such.
+
+    Raises:
+        RunDirError: It cannot be made, is no folder, or belongs to somebody else.
+    """
+    try:
+        path.mkdir(mode=0o700, exist_ok=True)
+        found = path.lstat()
+        if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
+            raise RunDirError(
+                f"{path} is not a folder of user {os.getuid()}; remove it or set XDG_RUNTIME_DIR"
+            )
+        if stat.S_IMODE(found.st_mode) != stat.S_IRWXU:
+            path.chmod(stat.S_IRWXU)
+    except OSError as error:
+        raise RunDirError(f"cannot use {path} for sockets: {error}") from error
+    return path

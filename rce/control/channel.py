@@ -1,0 +1,266 @@
+"""The task set's side of the control channel: dials the master for ever.
+
+One task, :meth:`TaskSetChannel.run`, owns everything. A connection starts with ``Hello``, which says all that
+is there, so nothing needs to be kept while there is none. Requests are kept until they are answered: they are
+idempotent, and are sent again on the next connection.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+import random
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import msgspec
+from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
+
+from rce.control.exceptions import MasterUnavailableError
+from rce.control.messages import (
+    ClientReply,
+    ClientRequest,
+    Login,
+    LoginReply,
+    Refused,
+    Welcome,
+    decode_to_task_set,
+    encode,
+)
+from rce.control.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, MAX_QUEUED, ControlTimeouts
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from websockets.asyncio.client import ClientConnection
+
+    from rce.config.secret import Secret
+    from rce.control.messages import Hello, ToMaster, ToTaskSet
+
+_log = logging.getLogger(__name__)
+
+Reply = TypeVar("Reply", LoginReply, ClientReply)
+
+
+class _RefusedError(Exception):
+    """The master said no."""
+
+
+class _Pending:
+    """A request that waits for its answer."""
+
+    def __init__(self, message: Login | ClientRequest, reply: asyncio.Future[Any]) -> None:
+        self.message = message
+        self.reply = reply
+
+
+class TaskSetChannel:
+    """The way to the master.
+
+    Args:
+        url: Where the master is, ``ws://host:8080`` (or ``wss://``).
+        secret: Proves that this is a task set of the same engine.
+        hello: Makes the first message of every connection: all that is there now.
+        handler: Called with each message of the master but the answers to requests; one after the other, in
+            order, and never cancelled by a lost connection. An exception from it is logged, and after a
+            while the master is dialed anew so that it says everything again.
+        timeouts: Times of this end.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        secret: Secret,
+        hello: Callable[[], Hello],
+        handler: Callable[[ToTaskSet], Awaitable[None]],
+        *,
+        timeouts: ControlTimeouts = DEFAULT_TIMEOUTS,
+    ) -> None:
+        self._url = url
+        self._secret = secret
+        self._hello = hello
+        self._handler = handler
+        self._timeouts = timeouts
+        self._numbers = itertools.count(1)
+        self._pending: dict[int, _Pending] = {}
+        self._outbox: asyncio.Queue[ToMaster] | None = None  # there is one while there is a connection
+        self._inbox: asyncio.Queue[ToTaskSet] = asyncio.Queue(MAX_QUEUED)
+        self._socket: ClientConnection | None = None
+        self._failures = 0
+        self._handler_failed = False
+        self._welcomed = asyncio.Event()
+
+    @property
+    def connected(self) -> bool:
+        """Whether the master has taken this task set and is there."""
+        return self._welcomed.is_set()
+
+    async def wait_connected(self) -> None:
+        """Wait until :attr:`connected`."""
+        await self._welcomed.wait()
+
+    def send(self, message: ToMaster) -> None:
+        """Send a message; it is dropped while there is no connection, as ``Hello`` will say it all again."""
+        if self._outbox is None:
+            return
+        try:
+            self._outbox.put_nowait(message)
+        except asyncio.QueueFull:
+            self._abort(f"{MAX_QUEUED} messages wait for the master")
+
+    async def login(self, user: str, robot: str, password: str) -> LoginReply:
+        """Ask whether a robot may come in.
+
+        Raises:
+            MasterUnavailableError: No answer in time.
+        """
+        message = Login(request=next(self._numbers), user=user, robot=robot, password=password)
+        return await self._request(message, LoginReply)
+
+    async def client_request(self, id: str, type: str, data: Any) -> ClientReply:  # noqa: A002 - wire names
+        """Have a client's request carried out.
+
+        Args:
+            id: Endpoint id of the robot that asks.
+            type: ``CC``, ``DC``, ``CN`` or ``CX``.
+            data: As the client sent it.
+
+        Raises:
+            MasterUnavailableError: No answer in time.
+        """
+        message = ClientRequest(request=next(self._numbers), id=id, type=type, data=data)
+        return await self._request(message, ClientReply)
+
+    async def run(self) -> None:
+        """Dial, talk, and dial again, until cancelled."""
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._handle_inbox())
+            while True:
+                delay = await self._connect_once()
+                await asyncio.sleep(delay)
+
+    async def _request(self, message: Login | ClientRequest, kind: type[Reply]) -> Reply:
+        pending = _Pending(message, asyncio.get_running_loop().create_future())
+        self._pending[message.request] = pending
+        self.send(message)
+        try:
+            async with asyncio.timeout(self._timeouts.request):
+                reply: Reply = await pending.reply
+        except TimeoutError as error:
+            raise MasterUnavailableError(self._timeouts.request) from error
+        finally:
+            del self._pending[message.request]
+        assert isinstance(reply, kind)
+        return reply
+
+    async def _connect_once(self) -> float:
+        """Run one connection to its end; return how long to wait before the next, in seconds."""
+        try:
+            async with connect(
+                self._url,
+                additional_headers={"Authorization": f"Bearer {self._secret.reveal()}"},
+                compression=None,
+                proxy=None,
+                open_timeout=self._timeouts.open,
+                ping_interval=self._timeouts.ping_interval,
+                ping_timeout=self._timeouts.ping_timeout,
+                close_timeout=self._timeouts.close,
+                max_size=MAX_FRAME,
+            ) as socket:
+                await self._talk(socket)
+        except InvalidStatus as error:
+            status = error.response.status_code
+            if status in (HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN):
+                _log.error("the master at %s refuses our secret (HTTP %d)", self._url, status)
+                return self._timeouts.backoff_refused
+            _log.warning("the master at %s answered HTTP %d", self._url, status)
+        except _RefusedError as error:
+            _log.error("the master at %s refuses this task set: %s", self._url, error)
+            return self._timeouts.backoff_refused
+        except (OSError, TimeoutError, WebSocketException) as error:
+            level = logging.INFO if self._failures == 0 else logging.DEBUG
+            _log.log(level, "no connection to the master at %s: %s", self._url, error)
+        if self._handler_failed:  # it may fail again, so not at once
+            self._handler_failed = False
+            return self._timeouts.backoff_refused
+        return self._next_delay()
+
+    def _next_delay(self) -> float:
+        """Draw a wait below a bound that doubles (full jitter), so that task sets do not all dial at once."""
+        bound = min(self._timeouts.backoff_max, self._timeouts.backoff_min * 2 ** min(self._failures, 16))
+        self._failures += 1
+        return random.uniform(0.0, bound)  # noqa: S311 - spreads load, keeps no secret
+
+    async def _talk(self, socket: ClientConnection) -> None:
+        self._socket = socket
+        outbox: asyncio.Queue[ToMaster] = asyncio.Queue(MAX_QUEUED)
+        self._outbox = outbox
+        failure: Exception | None = None
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                writer = tasks.create_task(self._write(socket, outbox))
+                await self._read(socket)
+                writer.cancel()
+        except* (ConnectionClosed, _RefusedError) as group:
+            failure = group.exceptions[0]
+        finally:
+            self._socket = self._outbox = None
+            self._welcomed.clear()
+            while not self._inbox.empty():  # the next connection's Sync says it all again
+                self._inbox.get_nowait()
+        if failure is not None:
+            raise failure
+
+    async def _write(self, socket: ClientConnection, outbox: asyncio.Queue[ToMaster]) -> None:
+        # Hello is made in the same step in which sending begins to count, so no change falls between the two.
+        first = [self._hello(), *(pending.message for pending in self._pending.values())]
+        while not outbox.empty():
+            outbox.get_nowait()
+        for message in first:
+            await socket.send(encode(message))
+        while True:
+            await socket.send(encode(await outbox.get()))
+
+    async def _read(self, socket: ClientConnection) -> None:
+        async for frame in socket:
+            try:
+                message = decode_to_task_set(frame)
+            except (msgspec.MsgspecError, UnicodeError) as error:
+                _log.error("the master sent garbage: %s", error)
+                await socket.close(1007, "garbage")
+                return
+            await self._take(message)
+
+    async def _take(self, message: ToTaskSet) -> None:
+        match message:
+            case Welcome():
+                _log.info("connected to master %s at %s", message.master, self._url)
+                self._failures = 0
+                self._welcomed.set()
+                await self._inbox.put(message)
+            case Refused():
+                raise _RefusedError(message.reason)
+            case LoginReply() | ClientReply():
+                pending = self._pending.get(message.request)
+                if pending is not None and not pending.reply.done():
+                    pending.reply.set_result(message)
+            case _:
+                await self._inbox.put(message)
+
+    async def _handle_inbox(self) -> None:
+        while True:
+            message = await self._inbox.get()
+            try:
+                await self._handler(message)
+            except Exception:  # noqa: BLE001 - one bad message must not end the task set
+                _log.exception("%s from the master failed", type(message).__name__)
+                self._handler_failed = True
+                self._abort("a message from the master failed")
+
+    def _abort(self, reason: str) -> None:
+        """Cut the connection off; the next one starts with Hello."""
+        _log.warning("dialing the master anew: %s", reason)
+        if self._socket is not None:
+            self._socket.transport.abort()

@@ -1,0 +1,227 @@
+"""The master's side of the control channel: task sets dial in, one :class:`Peer` each."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from http import HTTPStatus
+from typing import TYPE_CHECKING
+
+import msgspec
+from websockets.asyncio.server import serve
+from websockets.exceptions import ConnectionClosed
+
+from rce.control.exceptions import PeerRefusedError
+from rce.control.messages import (
+    CONTROL_VERSION,
+    Hello,
+    LogChunk,
+    Refused,
+    Welcome,
+    decode_to_master,
+    encode,
+)
+from rce.control.peer import Peer
+from rce.control.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, ControlTimeouts
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+    from types import TracebackType
+    from typing import Self
+
+    from websockets.asyncio.server import Server, ServerConnection
+    from websockets.http11 import Request, Response
+
+    from rce.config.secret import Secret
+    from rce.control.messages import ToMaster
+
+_log = logging.getLogger(__name__)
+
+_GARBAGE, _POLICY, _INTERNAL, _GOING_AWAY = 1007, 1008, 1011, 1001
+_MAX_REASON = 123  # bytes of a WebSocket close frame's reason
+
+
+class ControlServer:
+    """Takes task sets in. An async context manager: listens inside.
+
+    Callbacks are awaited one after the other for each peer, so a slow one slows that peer only. What they
+    raise is logged and ends that peer's connection, nothing else.
+
+    Args:
+        secret: What task sets must prove to have.
+        on_hello: A task set came. What it sends to the peer follows ``Welcome``. May raise
+            :class:`PeerRefusedError`; then no other callback is called for that peer.
+        on_message: A task set sent something (answers to :meth:`Peer.read_log` are not passed on).
+        on_gone: A task set that ``on_hello`` took has left, however it ended.
+        master: This master's name, for the task sets' logs.
+        host: Address to listen on.
+        port: Port to listen on; 0 takes a free one.
+        timeouts: Times of this end.
+    """
+
+    def __init__(
+        self,
+        secret: Secret,
+        *,
+        on_hello: Callable[[Peer, Hello], Awaitable[None]],
+        on_message: Callable[[Peer, ToMaster], Awaitable[None]],
+        on_gone: Callable[[Peer], Awaitable[None]],
+        master: str = "master",
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        timeouts: ControlTimeouts = DEFAULT_TIMEOUTS,
+    ) -> None:
+        self._secret = secret
+        self._on_hello = on_hello
+        self._on_message = on_message
+        self._on_gone = on_gone
+        self._master = master
+        self._host = host
+        self._port = port
+        self._timeouts = timeouts
+        self._peers: dict[str, Peer] = {}
+        self._server: Server | None = None
+
+    @property
+    def port(self) -> int:
+        """The port that is listened on."""
+        if self._server is not None:
+            for socket in self._server.sockets:
+                return int(socket.getsockname()[1])
+        return self._port
+
+    @property
+    def peers(self) -> tuple[Peer, ...]:
+        """All task sets that are connected now."""
+        return tuple(self._peers.values())
+
+    async def __aenter__(self) -> Self:
+        self._server = await serve(
+            self._serve,
+            self._host,
+            self._port,
+            process_request=self._authenticate,
+            origins=[None],  # no browser's page has any business here
+            compression=None,
+            open_timeout=self._timeouts.open,
+            ping_interval=self._timeouts.ping_interval,
+            ping_timeout=self._timeouts.ping_timeout,
+            close_timeout=self._timeouts.close,
+            max_size=MAX_FRAME,
+        )
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        assert self._server is not None
+        self._server.close(code=_GOING_AWAY, reason="the master is shutting down")
+        await self._server.wait_closed()
+
+    def _authenticate(self, socket: ServerConnection, request: Request) -> Response | None:
+        given = request.headers.get_all("Authorization")
+        scheme, _, token = given[0].partition(" ") if len(given) == 1 else ("", "", "")
+        if scheme.lower() == "bearer" and self._secret.matches(token.strip()):
+            return None
+        _log.warning("a task set at %s came with a wrong secret", socket.remote_address)
+        return socket.respond(HTTPStatus.UNAUTHORIZED, "Task sets prove themselves by the engine's secret.\n")
+
+    async def _serve(self, socket: ServerConnection) -> None:
+        try:
+            hello = await self._greet(socket)
+            if hello is not None:
+                await self._serve_peer(Peer(hello, socket, self._timeouts), socket)
+        except ConnectionClosed as error:
+            _log.debug("a task set's connection ended: %s", error)
+
+    async def _greet(self, socket: ServerConnection) -> Hello | None:
+        try:
+            async with asyncio.timeout(self._timeouts.open):
+                message = await self._receive(socket)
+        except TimeoutError:
+            await socket.close(_POLICY, "no Hello came")
+            return None
+        if message is None:
+            return None
+        if not isinstance(message, Hello):
+            await socket.close(_POLICY, "the first message must be Hello")
+            return None
+        if message.version != CONTROL_VERSION:
+            await self._refuse(socket, f"control version {message.version} does not fit {CONTROL_VERSION}")
+            return None
+        return message
+
+    async def _receive(self, socket: ServerConnection) -> ToMaster | None:
+        """Take one message; on garbage close the connection and return None."""
+        frame = await socket.recv()
+        try:
+            if isinstance(frame, bytes):
+                raise msgspec.DecodeError("a binary frame")
+            return decode_to_master(frame)
+        except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
+            _log.warning("garbage from %s: %s", socket.remote_address, error)
+            await socket.close(_GARBAGE, _clip(f"garbage: {error}"))
+            return None
+
+    async def _refuse(self, socket: ServerConnection, reason: str) -> None:
+        _log.warning("refused a task set at %s: %s", socket.remote_address, reason)
+        await socket.send(encode(Refused(reason=reason)))
+        await socket.close(_POLICY, _clip(reason))
+
+    async def _serve_peer(self, peer: Peer, socket: ServerConnection) -> None:
+        while (older := self._peers.get(peer.process)) is not None:
+            _log.info("%r dialed anew", peer)
+            older.abort()
+            await older.finished.wait()
+        self._peers[peer.process] = peer
+        try:
+            await self._introduce(peer, socket)
+        finally:
+            peer.leave()
+            del self._peers[peer.process]
+            peer.finished.set()
+
+    async def _introduce(self, peer: Peer, socket: ServerConnection) -> None:
+        peer.send(Welcome(version=CONTROL_VERSION, master=self._master))
+        try:
+            await self._on_hello(peer, peer.hello)
+        except PeerRefusedError as error:
+            await self._refuse(socket, error.reason)
+            return
+        except Exception:  # noqa: BLE001 - one peer must not end the server
+            _log.exception("taking %r failed", peer)
+            await socket.close(_INTERNAL, "the master failed")
+            return
+        try:
+            await self._converse(peer, socket)
+        finally:
+            peer.leave()
+            await self._on_gone(peer)
+
+    async def _converse(self, peer: Peer, socket: ServerConnection) -> None:
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                writer = tasks.create_task(peer.pump())
+                await self._read(peer, socket)
+                writer.cancel()
+        except* ConnectionClosed as group:
+            _log.info("%r left: %s", peer, group.exceptions[0])
+        except* Exception:  # noqa: BLE001 - one peer must not end the server
+            _log.exception("serving %r failed", peer)
+            await socket.close(_INTERNAL, "the master failed")
+
+    async def _read(self, peer: Peer, socket: ServerConnection) -> None:
+        while (message := await self._receive(socket)) is not None:
+            match message:
+                case LogChunk():
+                    peer.answer(message)
+                case Hello():
+                    await socket.close(_POLICY, "Hello came twice")
+                    return
+                case _:
+                    await self._on_message(peer, message)
+
+
+def _clip(reason: str) -> str:
+    """Shorten a text to what a close frame can hold."""
+    return reason.encode()[:_MAX_REASON].decode(errors="ignore")

@@ -1,0 +1,34 @@
+"""Times and sizes of the control channel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlTimeouts:
+    """Times of both ends, in seconds."""
+
+    open: float = 5.0
+    """A dial, with its handshake, and the first message after it."""
+    ping_interval: float = 5.0
+    ping_timeout: float = 5.0
+    """A peer that does not answer a ping for so long is gone."""
+    close: float = 1.0
+    request: float = 10.0
+    """An answer of the master; long enough for a master that is being restarted."""
+    log: float = 5.0
+    """A piece of a node's log."""
+    backoff_min: float = 0.05
+    backoff_max: float = 2.0
+    """The longest wait before the next dial; waits are spread at random between zero and a growing bound."""
+    backoff_refused: float = 5.0
+    """The wait after the master refused this task set or its secret, which will hardly help itself."""
+
+
+DEFAULT_TIMEOUTS = ControlTimeouts()
+
+MAX_FRAME = 16 * 2**20
+"""Longest message, in bytes."""
+MAX_QUEUED = 8192
+"""How many messages may wait for a peer; one that is further behind is cut off and starts anew."""
