@@ -75,8 +75,8 @@ class PendingCalls:
 class CallServer:
     """Answers the requests that peers send to one interface.
 
-    At most :attr:`LinkLimits.serving` requests are served at a time; :attr:`LinkLimits.waiting` more wait in order, and what
-    comes then is answered with a fault at once.
+    At most :attr:`LinkLimits.serving` requests are served at a time; :attr:`LinkLimits.waiting` more wait in
+    order, and what comes then is answered with a fault at once.
     """
 
     def __init__(self, serve: Callable[[bytes], Awaitable[Buffer]], limits: LinkLimits, name: str) -> None:

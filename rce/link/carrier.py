@@ -44,11 +44,11 @@ class Carrier(ABC):
 
     @abstractmethod
     def control(self, frame: Frame) -> None:
-        """Send a small frame of the link itself, before all messages that wait. Ignored when the carrier ended."""
+        """Send a small frame of the link itself, before all messages. Ignored when the carrier ended."""
 
     @abstractmethod
     def send(self, queue: OutgoingQueue, frame: Frame) -> None:
-        """Send a message of a channel, after those that wait in the channel's queue. Ignored when the carrier ended.
+        """Send a message of a channel, after those that wait in its queue. Ignored when the carrier ended.
 
         Raises:
             Overloaded: The queue is full and its policy is to refuse.
@@ -74,8 +74,9 @@ class Carrier(ABC):
 class LocalCarrier(Carrier):
     """One half of a link between two endpoints of one process.
 
-    Payloads are handed over as they are. Delivery is a later step of the event loop, so that interfaces which answer at
-    once cannot recurse, and takes what lay there when it began, so that two of them cannot hold the loop.
+    Payloads are handed over as they are. Delivery is a later step of the event loop, so that interfaces which
+    answer at once cannot recurse, and takes what lay there when it began, so that two of them cannot hold the
+    loop.
     """
 
     kind = "local"

@@ -16,7 +16,7 @@ from rce.link.exceptions import (
     PeerLost,
     ProtocolError,
 )
-from rce.link.frames import Flag, Frame, FrameType
+from rce.link.frames import LATCHED, OVERLOADED, Frame, FrameType
 from rce.link.queues import OutgoingQueue, OverflowPolicy
 
 if TYPE_CHECKING:
@@ -34,8 +34,8 @@ _MAX_FAULT = 4096
 class Channel:
     """An interface's end of a connection.
 
-    It is *established* while both ends are open: this one since its interface has started, the peer's since its OPEN came
-    on the link's present carrier.
+    It is *established* while both ends are open: this one since its interface has started, the peer's since
+    its OPEN came on the link's present carrier.
 
     Attributes:
         spec: The connection.
@@ -110,7 +110,7 @@ class Channel:
         """Send a message of a topic; the caller has looked at its size."""
         carrier = self.link.carrier
         if self.established and carrier is not None:
-            flags = Flag.LATCHED if latched else 0
+            flags = LATCHED if latched else 0
             carrier.send(self._queue, Frame(FrameType.DATA, self.number, 0, flags, payload))
 
     async def call(self, payload: bytes | memoryview, deadline: float) -> bytes:
@@ -150,7 +150,7 @@ class Channel:
         carrier = self.link.carrier
         if carrier is not None:
             text = (str(error) or type(error).__name__).encode(errors="replace")[:_MAX_FAULT]
-            flags = Flag.OVERLOADED if isinstance(error, Overloaded) else 0
+            flags = OVERLOADED if isinstance(error, Overloaded) else 0
             carrier.control(Frame(FrameType.FAULT, self.number, call_id, flags, text))
 
     # Receiving
@@ -166,7 +166,7 @@ class Channel:
         payload = bytes(frame.payload)
         match frame.type:
             case FrameType.DATA:
-                self.slot.receive(payload, latched=bool(frame.flags & Flag.LATCHED))
+                self.slot.receive(payload, latched=bool(frame.flags & LATCHED))
             case FrameType.CALL:
                 self._request_received(frame.id, payload)
             case FrameType.REPLY:
@@ -174,7 +174,7 @@ class Channel:
                 self._calls.answer(frame.id, payload)
             case FrameType.FAULT:
                 text = payload.decode(errors="replace")
-                overloaded = frame.flags & Flag.OVERLOADED
+                overloaded = frame.flags & OVERLOADED
                 self._calls.fail(frame.id, Overloaded(text) if overloaded else PeerFault(text))
             case FrameType.CANCEL:
                 if self.slot.server is not None:

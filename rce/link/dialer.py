@@ -21,7 +21,7 @@ _LONG_ENOUGH = 1.0
 
 
 def pauses(first: float, last: float) -> Iterator[float]:
-    """Yield the pauses between attempts, in seconds: doubling from ``first`` to ``last``, each by half at random.
+    """Yield the pauses between attempts in seconds: doubling from ``first`` to ``last``, by half at random.
 
     The randomness keeps the peers of a restarted process from dialing it all at the same moment.
     """

@@ -31,7 +31,8 @@ class Endpoint:
         id: The endpoint.
         factory: Makes its interfaces.
         hub: Reaches its peers.
-        on_change: Called when :attr:`interfaces` or :attr:`connections` changed; once for changes that come together.
+        on_change: Called when :attr:`interfaces` or :attr:`connections` changed; once for changes that come
+            together.
         on_fault: Called with a text for the user when an interface cannot do its work.
     """
 
@@ -77,9 +78,10 @@ class Endpoint:
     async def apply(self, spec: EndpointSpec) -> None:
         """Make up the difference between ``spec`` and what is there.
 
-        What is equal in both is not touched. Returns when what is no longer desired is gone, and what is new has begun to
-        be made: interfaces start and links are dialed in the background. An interface that cannot be made or started is
-        reported to ``on_fault`` and does not hinder the others; it is not tried again before its spec changes.
+        What is equal in both is not touched. Returns when what is no longer desired is gone, and what is new
+        has begun to be made: interfaces start and links are dialed in the background. An interface that
+        cannot be made or started is reported to ``on_fault`` and does not hinder the others; it is not tried
+        again before its spec changes.
 
         Raises:
             RuntimeError: The endpoint is closed.

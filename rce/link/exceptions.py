@@ -27,11 +27,11 @@ class ProtocolError(LinkError):
     """The peer broke the rules of the frames."""
 
 
-class LinkRefused(LinkError):
+class LinkRefused(LinkError):  # noqa: N818
     """The accepting end turned the dialing end away; the text is its reason."""
 
 
-class LinkLost(LinkError):
+class LinkLost(LinkError):  # noqa: N818
     """The connection of a link ended."""
 
 
@@ -43,14 +43,14 @@ class CallError(LinkError):
     """A service call got no answer."""
 
 
-class NotConnected(CallError):
+class NotConnected(CallError):  # noqa: N818
     """There is no peer to ask."""
 
     def __str__(self) -> str:
         return super().__str__() or "not connected"
 
 
-class PeerFault(CallError):
+class PeerFault(CallError):  # noqa: N818
     """The peer answered with a fault.
 
     Attributes:
@@ -62,19 +62,19 @@ class PeerFault(CallError):
         self.text = text
 
 
-class PeerLost(CallError):
+class PeerLost(CallError):  # noqa: N818
     """The peer went away before it answered."""
 
 
-class CallTimeout(CallError):
+class CallTimeout(CallError):  # noqa: N818
     """No answer came in time."""
 
 
-class Overloaded(CallError):
+class Overloaded(CallError):  # noqa: N818
     """Too many calls wait already, here or at the peer."""
 
 
-class MessageTooLarge(CallError):
+class MessageTooLarge(CallError):  # noqa: N818
     """The message is larger than a link carries.
 
     Attributes:

@@ -4,16 +4,16 @@ Every frame starts with 24 bytes in network order::
 
     offset  size  field
          0     1  type     FrameType
-         1     1  flags    Flag
+         1     1  flags    LATCHED, OVERLOADED
          2     2  zero
          4     4  id       of a service call; 0 elsewhere
          8     8  channel  0 for frames of the link itself
         16     4  length   bytes of payload in this frame
         20     4  total    bytes of payload in the whole message
 
-A message with ``total`` above ``length`` goes on in FRAGMENT frames of the same channel. A channel has at most one
-unfinished message at a time; frames of other channels, and frames that carry a whole message, may come in between.
-ABORT says that the rest of the channel's unfinished message will not come.
+A message with ``total`` above ``length`` goes on in FRAGMENT frames of the same channel. A channel has at
+most one unfinished message at a time; frames of other channels, and frames that carry a whole message, may
+come in between. ABORT says that the rest of the channel's unfinished message will not come.
 
 Since the first frame tells the total, the reader allocates the message once and has the socket read straight
 into it.
@@ -23,12 +23,12 @@ from __future__ import annotations
 
 import io
 import struct
-from enum import IntEnum, IntFlag
+from enum import IntEnum
 from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
-from rce.link.exceptions import ProtocolError
+from rce.link.exceptions import LinkRefused, ProtocolError
 from rce.link.settings import KIB
 
 if TYPE_CHECKING:
@@ -38,9 +38,13 @@ VERSION = 1
 HEADER = struct.Struct("!BBHIQII")
 HEADER_SIZE = HEADER.size
 FRAGMENT_SIZE = 128 * KIB
-"""Most bytes of payload that a sender puts in one frame: 1 ms at 1 Gbit/s, the longest an urgent frame waits for it."""
+"""Most bytes of payload that a sender puts in one frame: an urgent frame waits for it 1 ms at 1 Gbit/s."""
 HANDSHAKE_SIZE = 4 * KIB
 """Most bytes of payload before the peer has shown who it is."""
+LATCHED = 1
+"""Flag of DATA: the topic's last message, kept for those who come late."""
+OVERLOADED = 2
+"""Flag of FAULT: the peer has too many requests already."""
 MAX_CHANNEL = 2**64 - 1
 MAX_ID = 2**32 - 1
 
@@ -75,16 +79,6 @@ class FrameType(IntEnum):
     """The caller no longer waits for the answer to the CALL with this id."""
     FRAGMENT = 24
     ABORT = 25
-
-
-class Flag(IntFlag):
-    """More about a frame."""
-
-    NONE = 0
-    LATCHED = 1
-    """DATA: the topic's last message, kept for those who come late."""
-    OVERLOADED = 2
-    """FAULT: the peer has too many requests already."""
 
 
 class Frame(NamedTuple):
@@ -150,11 +144,24 @@ def parse_hello(frame: Frame) -> Hello:
     return hello
 
 
+def check_answer(frame: Frame) -> None:
+    """Read the accepting end's answer to HELLO.
+
+    Raises:
+        LinkRefused: It does not want the link.
+        ProtocolError: It is no answer.
+    """
+    if frame.type is FrameType.REFUSE:
+        raise LinkRefused(bytes(frame.payload).decode(errors="replace"))
+    if frame.type is not FrameType.WELCOME:
+        raise ProtocolError(f"HELLO was answered by {frame.type.name}")
+
+
 class _Message:
     """A message that is being received.
 
-    ``BytesIO`` is used because it is the one place of the standard library where bytes can be filled in place and
-    then taken as ``bytes`` without copying them.
+    ``BytesIO`` is used because it is the one place of the standard library where bytes can be filled in place
+    and then taken as ``bytes`` without copying them.
     """
 
     __slots__ = ("_buffer", "filled", "first", "total", "view")
@@ -201,8 +208,8 @@ class FrameReader:
     def get_buffer(self) -> memoryview:
         """Return where the next bytes go; never empty."""
         message = self._current
-        # The last byte of a frame goes through the scratch: as long as whoever fills a buffer holds on to it, which
-        # event loops do until `advance` returns, the message could not be taken without a copy.
+        # The last byte of a frame goes through the scratch: as long as whoever fills a buffer holds on to it,
+        # which event loops do until `advance` returns, the message could not be taken without a copy.
         if message is not None and self._missing > 1:
             return message.view[message.filled : message.filled + self._missing - 1]
         return self._scratch[self._end :]

@@ -1,8 +1,8 @@
 """Hand accepted TCP connections over to the process whose endpoint they are for.
 
-One process of a machine accepts links for all its containers. It reads the HELLO of each connection, which names the
-link, and passes the socket with those bytes to the container's process, over a unix socket with ``SCM_RIGHTS``. From then
-on data goes straight to that process::
+One process of a machine accepts links for all its containers. It reads the HELLO of each connection, which
+names the link, and passes the socket with those bytes to the container's process, over a unix socket with
+``SCM_RIGHTS``. From then on data goes straight to that process::
 
     peer --TCP--> Doorman --(socket, HELLO)--> HandoverSender ==unix==> HandoverReceiver --> LinkHub.adopt
 
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 _MAX_GREETINGS = 1024
 """Accepted connections that have not been handed over yet."""
 _BUSY_PAUSE = 0.1
-"""Seconds to wait before accepting again after the system refused, for want of file descriptors for example."""
+"""Seconds to wait after the system refused to accept, for want of file descriptors for example."""
 _FD = array.array("i")
 
 
@@ -71,7 +71,7 @@ class HandoverSender:
     async def _writable(self) -> None:
         loop = asyncio.get_running_loop()
         ready = loop.create_future()
-        loop.add_writer(self._sock, lambda: ready.done() or ready.set_result(None))
+        loop.add_writer(self._sock, _resolve, ready)
         try:
             await ready
         finally:
@@ -136,6 +136,11 @@ class HandoverReceiver:
             await self._adopt(socket.socket(fileno=descriptor), received)
         except OSError as error:
             log.info("a handed-over connection is of no use: %s", error)
+
+
+def _resolve(ready: asyncio.Future[None]) -> None:
+    if not ready.done():
+        ready.set_result(None)
 
 
 def _receive(sock: socket.socket) -> tuple[bytes, list[int]]:

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rce.link.carrier import Carrier, LocalCarrier
-from rce.link.exceptions import LinkError, LinkLost, LinkRefused, ProtocolError
-from rce.link.frames import Frame, FrameType, encode, encode_hello, parse_hello
+from rce.link.exceptions import LinkError, LinkLost, LinkRefused
+from rce.link.frames import Frame, FrameType, check_answer, encode, encode_hello, parse_hello
 from rce.link.settings import LinkLimits, LinkTimeouts
 from rce.link.socket_carrier import SocketCarrier
 from rce.link.tasks import TaskScope
@@ -68,18 +68,14 @@ class LinkHub:
         Raises:
             OSError: The path is too long (107 bytes at most), is no socket, or another process listens there.
         """
-        _remove_stale_socket(path)
-        sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        sock, inode = _bind_unix(path)
         try:
-            sock.setblocking(False)
-            sock.bind(str(path))
-            path.chmod(stat.S_IRUSR | stat.S_IWUSR)
             server = await self.loop.create_unix_server(self._accept, sock=sock, backlog=512)
         except BaseException:
             sock.close()
             raise
         self._servers.append(server)
-        self._unix_sockets[path] = path.stat().st_ino
+        self._unix_sockets[path] = inode
 
     async def listen_tcp(self, host: str, port: int) -> int:
         """Accept links on TCP.
@@ -119,9 +115,7 @@ class LinkHub:
         for server in self._servers:
             server.close()
         for path, inode in self._unix_sockets.items():
-            with contextlib.suppress(FileNotFoundError):
-                if path.stat().st_ino == inode:
-                    path.unlink()
+            _unlink(path, inode)
         await self._greetings.close()
         for carrier in list(self._carriers):
             carrier.abort(LinkLost("the hub is closed"))
@@ -147,7 +141,7 @@ class LinkHub:
             del self._accepting[link.spec.id]
 
     async def wait_registered(self, link_id: str, timeout: float | None) -> None:
-        """Wait until the accepting end of a link is registered anew, at most ``timeout`` seconds; none is for ever."""
+        """Wait until the accepting end of a link is registered anew, or ``timeout`` seconds (none: ever)."""
         waiter = self.loop.create_future()
         self._waiters.setdefault(link_id, set()).add(waiter)
         try:
@@ -211,11 +205,7 @@ class LinkHub:
         try:
             carrier.greet(encode_hello(spec.id, spec.token))
             async with asyncio.timeout(self.timeouts.handshake):
-                answer = await carrier.handshake_frame()
-            if answer.type is FrameType.REFUSE:
-                raise LinkRefused(bytes(answer.payload).decode(errors="replace"))
-            if answer.type is not FrameType.WELCOME:
-                raise ProtocolError(f"HELLO was answered by {answer.type.name}")
+                check_answer(await carrier.handshake_frame())
         except BaseException as error:
             carrier.abort(LinkLost(f"no handshake: {error}"))
             raise
@@ -272,6 +262,27 @@ class LinkHub:
 def _check_token(link: Link, token: str) -> None:
     if not hmac.compare_digest(link.spec.token.encode(), token.encode()):
         raise LinkRefused(f"wrong token for link {link.spec.id!r}")
+
+
+def _bind_unix(path: Path) -> tuple[socket.socket, int]:
+    """Bind a unix socket that only this user may use; return it and the inode of its file."""
+    _remove_stale_socket(path)
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        sock.setblocking(False)
+        sock.bind(str(path))
+        path.chmod(stat.S_IRUSR | stat.S_IWUSR)  # before it listens: nobody can connect earlier
+    except BaseException:
+        sock.close()
+        raise
+    return sock, path.stat().st_ino
+
+
+def _unlink(path: Path, inode: int) -> None:
+    """Remove a socket file unless another process has put its own there."""
+    with contextlib.suppress(FileNotFoundError):
+        if path.stat().st_ino == inode:
+            path.unlink()
 
 
 def _remove_stale_socket(path: Path) -> None:

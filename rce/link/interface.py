@@ -24,8 +24,8 @@ class Port(Protocol):
     def send(self, payload: Buffer, *, latched: bool = False) -> None:
         """Send a message to every peer. For subscriber interfaces.
 
-        Never blocks and never fails: where a peer's queue is full its oldest messages are dropped and counted. The
-        newest latched message is kept and sent to each peer that comes later.
+        Never blocks and never fails: where a peer's queue is full its oldest messages are dropped and
+        counted. The newest latched message is kept and sent to each peer that comes later.
 
         Raises:
             TypeError: The interface is not a subscriber.
@@ -56,8 +56,8 @@ class Port(Protocol):
 class Interface(ABC):
     """An end of connections: a ROS topic or service, a converter, a forwarder.
 
-    :meth:`close` is called once for every interface that was made, also if :meth:`start` failed or was cancelled.
-    No other method is called after it.
+    :meth:`close` is called once for every interface that was made, also if :meth:`start` failed or was
+    cancelled. No other method is called after it.
     """
 
     def __init__(self, port: Port) -> None:
@@ -80,14 +80,14 @@ class Interface(ABC):
         raise NotImplementedError(f"{type(self).__name__} takes no messages")
 
     async def serve(self, payload: bytes) -> Buffer:
-        """Answer a peer's request. For service client interfaces; cancelled when the peer does not wait any more.
+        """Answer a peer's request. For service client interfaces; cancelled when the peer waits no more.
 
         Raises:
             Exception: Anything; its text is what the peer gets.
         """
         raise NotImplementedError(f"{type(self).__name__} serves no requests")
 
-    def on_active(self, active: bool) -> None:
+    def on_active(self, active: bool) -> None:  # noqa: B027 - not everybody wants to know
         """Notice that the first connection was established or the last one lost. Must not block."""
 
 

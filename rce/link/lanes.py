@@ -6,9 +6,9 @@ Three classes, served in this order:
 2. the *control lane*: channels whose oldest waiting message is small, in turn;
 3. the *data lane*: channels whose oldest waiting message is large, one fragment each in turn.
 
-A channel stands in one lane at a time, by its oldest message, so that its messages are never reordered: a small
-message overtakes the images of other channels, not its own channel's. After every :data:`URGENT_BURST` bytes of
-small messages the data lane gets one fragment, so that it is never starved.
+A channel stands in one lane at a time, by its oldest message, so that its messages are never reordered: a
+small message overtakes the images of other channels, not its own channel's. After every :data:`URGENT_BURST`
+bytes of small messages the data lane gets one fragment, so that it is never starved.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Lanes:
         return self.next() if self._urgent else None
 
     def _may_begin(self, queue: OutgoingQueue) -> bool:
-        """Whether the next part of the queue fits in what the peer accepts; true for one queue of the lane at least."""
+        """Whether the peer accepts the next part of the queue; true for one queue of the lane at least."""
         return (
             bool(queue.sent)
             or not self._begun_bytes

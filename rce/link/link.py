@@ -25,7 +25,7 @@ class Link:
         spec: What the master desires.
         limits: Of everything on this link.
         carrier: What carries the frames at present.
-        peer_open: Channels that the peer opened on this carrier; also those that this end knows nothing of yet.
+        peer_open: Channels that the peer opened on this carrier; also those that are unknown here yet.
     """
 
     def __init__(self, spec: LinkSpec, limits: LinkLimits) -> None:

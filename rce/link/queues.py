@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 SMALL_MESSAGE = 4 * KIB
 """Messages up to this size are urgent.
 
-Poses, goals, cancellations, states and most service calls fit; images, maps and long scans do not. A whole one adds
-no more to anybody's waiting than a thirtieth of a fragment.
+Poses, goals, cancellations, states and most service calls fit; images, maps and long scans do not. A whole
+one adds no more to anybody's waiting than a thirtieth of a fragment.
 """
 
 
@@ -27,9 +27,9 @@ class OverflowPolicy(Enum):
     """What happens when a queue is full."""
 
     DROP_OLDEST = "drop oldest"
-    """The oldest waiting messages are thrown away and counted: topics, where the newest message is worth most."""
+    """The oldest waiting messages are thrown away and counted: topics, where the newest is worth most."""
     REFUSE = "refuse"
-    """The new message is refused with :class:`~rce.link.exceptions.Overloaded`: services, where none may be lost."""
+    """The new message is refused with ``Overloaded``: services, where none may be lost."""
 
 
 @dataclass(slots=True)

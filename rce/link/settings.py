@@ -41,7 +41,7 @@ class LinkLimits:
     max_message: int = 64 * MIB
     """A larger message is not sent, and ends the link if a peer sends it."""
     unfinished_bytes: int = 256 * MIB
-    """Messages that are partly sent on one link, together; a sender begins no other before, a receiver accepts no more."""
+    """Of all messages on one link that are partly sent; a sender waits, a receiver ends the link."""
     max_channels: int = 4096
     """Channels that a peer may have open on one link."""
     queue_messages: int = 64
@@ -49,7 +49,7 @@ class LinkLimits:
     queue_bytes: int = 32 * MIB
     """Bytes of one topic connection that wait to be sent; a single larger message may still wait alone."""
     max_calls: int = 1024
-    """Calls of one service connection without an answer; also how many requests or answers wait to be sent."""
+    """Calls of one service connection without an answer; also requests or answers that wait to be sent."""
     serving: int = 64
     """Requests that one interface serves at the same time."""
     waiting: int = 1024

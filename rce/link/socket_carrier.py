@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 _HIGH_WATER = 64 * KIB
 _LOW_WATER = 16 * KIB
-"""With so little in the transport's buffer, urgent frames wait for a fragment or two there and not for a message."""
+"""So little lies in the transport's buffer that urgent frames wait for a fragment or two only."""
 _NOT_SENT = 128 * KIB
 """What the kernel may hold unsent of a TCP link, for the same reason."""
 _TURN = 1 * MIB
@@ -35,7 +35,8 @@ _TURN = 1 * MIB
 class SocketCarrier(asyncio.BufferedProtocol, Carrier):
     """A link's connection over a socket, from its first byte on.
 
-    Until :meth:`start` only small frames are accepted, and kept; :meth:`handshake_frame` returns the first of them.
+    Until :meth:`start` only small frames are accepted, and kept; :meth:`handshake_frame` returns the first of
+    them.
     """
 
     def __init__(

@@ -210,7 +210,7 @@ class Rig:
         link: str = "L",
         addr: str = "",
     ) -> None:
-        """Connect interface ``i1`` of both, and so on; ``ends`` holds the types at the dialing and accepting end."""
+        """Connect interface ``i1`` of both, and so on; ``ends`` are types at both ends."""
         for side, (party, dial) in enumerate(((dialing, True), (accepting, False))):
             peer = accepting if dial else dialing
             await party.apply(
