@@ -1,0 +1,225 @@
+"""The Master API and the Parameter Server API: checks arguments, asks the graph, words the answers.
+
+http://wiki.ros.org/ROS/Master_API, http://wiki.ros.org/ROS/Parameter%20Server%20API
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+from rce.ros import names
+from rce.ros.core.events import Outcome
+from rce.ros.core.graph import ANY_TYPE, Graph
+from rce.ros.core.registrations import Kind
+from rce.ros.xmlrpc.dispatch import ERROR, SUCCESS, BadArgument, Method
+
+Answer = tuple[int, str, Any]
+
+
+class MasterApi:
+    """The methods of a core. Their parameters and answers are those of the ROS specification."""
+
+    def __init__(self, graph: Graph, uri: Callable[[], str], perform: Callable[[Outcome], None]) -> None:
+        """Wire the API.
+
+        Args:
+            graph: The state.
+            uri: Tells the core's own URI.
+            perform: Takes what follows from an operation.
+        """
+        self._graph = graph
+        self._uri = uri
+        self._perform = perform
+
+    def methods(self) -> dict[str, Method]:
+        """Return the method table."""
+        return {
+            "getUri": self._get_uri,
+            "getPid": self._get_pid,
+            "registerPublisher": self._register_publisher,
+            "unregisterPublisher": self._unregister_publisher,
+            "registerSubscriber": self._register_subscriber,
+            "unregisterSubscriber": self._unregister_subscriber,
+            "registerService": self._register_service,
+            "unregisterService": self._unregister_service,
+            "lookupNode": self._lookup_node,
+            "lookupService": self._lookup_service,
+            "getPublishedTopics": self._get_published_topics,
+            "getTopicTypes": self._get_topic_types,
+            "getSystemState": self._get_system_state,
+            "setParam": self._set_param,
+            "getParam": self._get_param,
+            "deleteParam": self._delete_param,
+            "hasParam": self._has_param,
+            "searchParam": self._search_param,
+            "subscribeParam": self._subscribe_param,
+            "unsubscribeParam": self._unsubscribe_param,
+            "getParamNames": self._get_param_names,
+        }
+
+    # ------------------------------------------------------------------ the core itself
+
+    def _get_uri(self, _caller: str) -> Answer:
+        return SUCCESS, "", self._uri()
+
+    def _get_pid(self, _caller: str) -> Answer:
+        return SUCCESS, "", os.getpid()
+
+    # ------------------------------------------------------------------ registrations
+
+    def _register_publisher(self, caller: str, topic: Any, topic_type: Any, uri: Any) -> Answer:
+        topic = _name("topic", topic, caller)
+        self._perform(
+            self._graph.register_publisher(topic, _type(topic_type), caller, _slave("caller_api", uri))
+        )
+        return SUCCESS, f"{caller} publishes {topic}", list(self._graph.subscribers(topic).values())
+
+    def _register_subscriber(self, caller: str, topic: Any, topic_type: Any, uri: Any) -> Answer:
+        topic = _name("topic", topic, caller)
+        self._perform(
+            self._graph.register_subscriber(topic, _type(topic_type), caller, _slave("caller_api", uri))
+        )
+        return SUCCESS, f"{caller} subscribes to {topic}", list(self._graph.publishers(topic).values())
+
+    def _register_service(self, caller: str, service: Any, service_uri: Any, uri: Any) -> Answer:
+        service = _name("service", service, caller)
+        service_uri = _uri("service_api", service_uri, "rosrpc")
+        self._perform(self._graph.register_service(service, service_uri, caller, _slave("caller_api", uri)))
+        return SUCCESS, f"{caller} provides {service}", 1
+
+    def _unregister_publisher(self, caller: str, topic: Any, uri: Any) -> Answer:
+        return self._unregister(
+            Kind.PUBLISHER, _name("topic", topic, caller), caller, _slave("caller_api", uri)
+        )
+
+    def _unregister_subscriber(self, caller: str, topic: Any, uri: Any) -> Answer:
+        return self._unregister(
+            Kind.SUBSCRIBER, _name("topic", topic, caller), caller, _slave("caller_api", uri)
+        )
+
+    def _unregister_service(self, caller: str, service: Any, service_uri: Any) -> Answer:
+        service = _name("service", service, caller)
+        return self._unregister(Kind.SERVICE, service, caller, _uri("service_api", service_uri, "rosrpc"))
+
+    def _unregister(self, kind: Kind, name: str, caller: str, uri: str) -> Answer:
+        was_there, outcome = self._graph.unregister(kind, name, caller, uri)
+        self._perform(outcome)
+        if was_there:
+            return SUCCESS, f"{caller} is no longer a {kind.value} of {name}", 1
+        return SUCCESS, f"{caller} at {uri} is not a {kind.value} of {name}", 0
+
+    # ------------------------------------------------------------------ questions
+
+    def _lookup_node(self, caller: str, node: Any) -> Answer:
+        node = _name("node", node, caller)
+        uri = self._graph.nodes.get(node)
+        return (SUCCESS, "node api", uri) if uri else (ERROR, f"unknown node [{node}]", "")
+
+    def _lookup_service(self, caller: str, service: Any) -> Answer:
+        uri = self._graph.service(_name("service", service, caller))
+        return (SUCCESS, f"rosrpc URI: [{uri}]", uri) if uri else (ERROR, "no provider", "")
+
+    def _get_published_topics(self, caller: str, namespace: Any) -> Answer:
+        if not isinstance(namespace, str):
+            raise BadArgument("parameter [subgraph] must be a string")
+        below = (
+            names.resolve(namespace, caller).rstrip(names.SEPARATOR) + names.SEPARATOR if namespace else ""
+        )
+        return SUCCESS, "current topics", self._graph.published(below)
+
+    def _get_topic_types(self, _caller: str) -> Answer:
+        return SUCCESS, "current topic types", [list(pair) for pair in self._graph.topic_types.items()]
+
+    def _get_system_state(self, _caller: str) -> Answer:
+        return SUCCESS, "current system state", self._graph.system_state()
+
+    # ------------------------------------------------------------------ parameters
+
+    def _set_param(self, caller: str, key: Any, value: Any) -> Answer:
+        name = _key(key, caller)
+        self._perform(self._graph.set_parameter(name, value, by=caller))
+        return SUCCESS, f"parameter {name} set", 0
+
+    def _get_param(self, caller: str, key: Any) -> Answer:
+        name = _key(key, caller)
+        try:
+            return SUCCESS, f"Parameter [{name}]", self._graph.parameters.get(name)
+        except KeyError:
+            return ERROR, f"Parameter [{name}] is not set", 0
+
+    def _delete_param(self, caller: str, key: Any) -> Answer:
+        name = _key(key, caller)
+        try:
+            self._perform(self._graph.delete_parameter(name))
+        except KeyError:
+            return ERROR, f"parameter [{name}] is not set", 0
+        return SUCCESS, f"parameter {name} deleted", 0
+
+    def _has_param(self, caller: str, key: Any) -> Answer:
+        name = _key(key, caller)
+        return SUCCESS, name, self._graph.parameters.has(name)
+
+    def _search_param(self, caller: str, key: Any) -> Answer:
+        _key(key, caller)
+        if names.is_private(key):
+            raise BadArgument("a private name cannot be searched")
+        found = self._graph.parameters.search(names.canonical(caller), key)
+        if found is None:
+            return ERROR, f"Cannot find parameter [{key}] in an upwards search", ""
+        return SUCCESS, f"Found [{found}]", found
+
+    def _subscribe_param(self, caller: str, uri: Any, key: Any) -> Answer:
+        name = _key(key, caller)
+        value, outcome = self._graph.subscribe_parameter(name, caller, _slave("caller_api", uri))
+        self._perform(outcome)
+        return SUCCESS, f"Subscribed to parameter [{name}]", value
+
+    def _unsubscribe_param(self, caller: str, uri: Any, key: Any) -> Answer:
+        name = _key(key, caller)
+        was_there, outcome = self._graph.unregister(Kind.PARAMETER, name, caller, _slave("caller_api", uri))
+        self._perform(outcome)
+        return SUCCESS, f"Unsubscribe to parameter [{name}]", int(was_there)
+
+    def _get_param_names(self, _caller: str) -> Answer:
+        return SUCCESS, "Parameter names", self._graph.parameters.all_names()
+
+
+def _name(role: str, value: Any, caller: str) -> str:
+    """Check a topic, service or node name and make it global.
+
+    Only what cannot be a name is refused: real nodes use names that the written rules do not allow.
+    """
+    if not isinstance(value, str) or not value:
+        raise BadArgument(f"parameter [{role}] must be a non-empty string")
+    if ":" in value or any(character.isspace() for character in value):
+        raise BadArgument(f"parameter [{role}] contains illegal characters: {value!r}")
+    resolved = names.resolve(value, caller)
+    if resolved == names.SEPARATOR:
+        raise BadArgument(f"parameter [{role}] cannot be the global namespace")
+    return resolved
+
+
+def _key(value: Any, caller: str) -> str:
+    if not isinstance(value, str) or not value:
+        raise BadArgument("parameter [key] must be a non-empty string")
+    return names.resolve(value, caller)
+
+
+def _type(value: Any) -> str:
+    if value == ANY_TYPE:
+        return ANY_TYPE
+    if not isinstance(value, str) or value.count("/") != 1:
+        raise BadArgument(f"parameter [topic_type] is not of the form package/Type: {value!r}")
+    return value
+
+
+def _uri(role: str, value: Any, scheme: str) -> str:
+    if not isinstance(value, str) or not value.startswith(f"{scheme}://"):
+        raise BadArgument(f"parameter [{role}] is not a URI of the form {scheme}://host:port")
+    return value
+
+
+def _slave(role: str, value: Any) -> str:
+    return _uri(role, value, "http")

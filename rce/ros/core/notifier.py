@@ -1,0 +1,63 @@
+"""Delivers the core's calls to nodes: in order for each node, no node waiting for another."""
+
+from __future__ import annotations
+
+import logging
+
+from rce.ros.core.events import Call
+from rce.ros.errors import RpcUnreachable, XmlRpcError
+from rce.ros.tasks import TaskScope
+from rce.ros.xmlrpc import RpcClient
+
+_log = logging.getLogger(__name__)
+
+CALL_TIMEOUT = 5.0
+"""Seconds that a node may take to answer one call."""
+
+CALLER = "/master"
+"""The name under which a core calls nodes."""
+
+
+class Notifier:
+    """One queue for each node that is owed calls.
+
+    A newer call takes the place of a waiting one with the same key, so a queue is never longer than the number
+    of topics and parameters of its node, however slow the node is.
+    """
+
+    def __init__(self, client: RpcClient, tasks: TaskScope) -> None:
+        """Make a notifier.
+
+        Args:
+            client: Makes the calls.
+            tasks: Owns a task for each node while it is owed something.
+        """
+        self._client = client
+        self._tasks = tasks
+        self._waiting: dict[str, dict[object, Call]] = {}
+
+    def submit(self, call: Call) -> None:
+        """Queue a call; returns at once."""
+        queue = self._waiting.get(call.uri)
+        if queue is None:
+            queue = self._waiting[call.uri] = {}
+            self._tasks.start(self._deliver(call.uri, queue), name=f"notify {call.uri}")
+        queue.pop(call.key, None)
+        queue[call.key] = call
+
+    async def _deliver(self, uri: str, queue: dict[object, Call]) -> None:
+        try:
+            while queue:
+                call = queue.pop(next(iter(queue)))
+                await self._call(call, queue)
+        finally:
+            del self._waiting[uri]
+
+    async def _call(self, call: Call, queue: dict[object, Call]) -> None:
+        try:
+            await self._client.call(call.uri, call.method, (CALLER, *call.arguments), timeout=CALL_TIMEOUT)
+        except RpcUnreachable as error:
+            _log.info("%s is not delivered: %s", call.method, error)
+            queue.clear()  # nobody is there; whoever takes the address over registers and learns the state anew
+        except XmlRpcError as error:
+            _log.warning("%s to %s: %s", call.method, call.uri, error)

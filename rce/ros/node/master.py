@@ -1,0 +1,78 @@
+"""A node's view of its master: the Master API and Parameter Server API as typed coroutines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from rce.ros.errors import MasterRefused, MasterUnreachable, XmlRpcError
+from rce.ros.xmlrpc import RpcClient
+from rce.ros.xmlrpc.dispatch import SUCCESS
+
+
+@dataclass(slots=True)
+class MasterClient:
+    """Calls the master in the name of one node. Every method raises MasterError."""
+
+    uri: str
+    caller: str
+    """The node's global name."""
+    slave_uri: str
+    """The node's own API."""
+    rpc: RpcClient
+    timeout: float = 10.0
+    """Seconds for each call."""
+
+    async def call(self, method: str, *arguments: Any) -> Any:
+        """Call any method; the node's name is put before ``arguments``.
+
+        Returns:
+            The value of the answer.
+
+        Raises:
+            MasterUnreachable: No usable answer.
+            MasterRefused: The status is not success.
+        """
+        try:
+            answer = await self.rpc.call(self.uri, method, (self.caller, *arguments), timeout=self.timeout)
+            status, text, value = answer
+        except XmlRpcError as error:
+            raise MasterUnreachable(self.uri, str(error)) from error
+        except (TypeError, ValueError) as error:
+            raise MasterUnreachable(self.uri, f"{method} was answered in no known form") from error
+        if status != SUCCESS:
+            raise MasterRefused(method, status, text)
+        return value
+
+    async def register_publisher(self, topic: str, kind: str) -> None:
+        """Say that the node publishes ``topic``."""
+        await self.call("registerPublisher", topic, kind, self.slave_uri)
+
+    async def unregister_publisher(self, topic: str) -> None:
+        """Say that the node publishes ``topic`` no longer."""
+        await self.call("unregisterPublisher", topic, self.slave_uri)
+
+    async def register_subscriber(self, topic: str, kind: str) -> list[str]:
+        """Say that the node subscribes to ``topic``; return the slave APIs of its publishers."""
+        publishers: list[str] = await self.call("registerSubscriber", topic, kind, self.slave_uri)
+        return publishers
+
+    async def unregister_subscriber(self, topic: str) -> None:
+        """Say that the node subscribes to ``topic`` no longer."""
+        await self.call("unregisterSubscriber", topic, self.slave_uri)
+
+    async def register_service(self, name: str, service_uri: str) -> None:
+        """Say that the node provides a service at ``service_uri``."""
+        await self.call("registerService", name, service_uri, self.slave_uri)
+
+    async def unregister_service(self, name: str, service_uri: str) -> None:
+        """Say that the node no longer provides a service."""
+        await self.call("unregisterService", name, service_uri)
+
+    async def lookup_service(self, name: str) -> str | None:
+        """Return the ``rosrpc`` URI of a service's provider, if there is one."""
+        try:
+            uri: str = await self.call("lookupService", name)
+        except MasterRefused:
+            return None
+        return uri

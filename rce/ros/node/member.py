@@ -1,0 +1,241 @@
+"""Being part of a ROS graph: joining it, being told to stop, leaving it."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable
+from contextlib import AsyncExitStack
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+from rce.ros.errors import HandshakeRefused, MasterError, MasterUnreachable, NodeClosed
+from rce.ros.node import rosout, signals
+from rce.ros.node.master import MasterClient
+from rce.ros.node.parameters import Parameters
+from rce.ros.node.publisher import Publisher
+from rce.ros.node.runtime import Runtime, Types
+from rce.ros.node.service import Service
+from rce.ros.node.service_client import ServiceClient
+from rce.ros.node.settings import NodeSettings
+from rce.ros.node.slave import SlaveApi
+from rce.ros.node.topics import Topics
+from rce.ros.tasks import TaskScope
+from rce.ros.tcpros.connection import Connection
+from rce.ros.tcpros.framing import SCRATCH_SIZE
+from rce.ros.tcpros.listener import Listener
+from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer
+
+if TYPE_CHECKING:
+    from rce.ros.types import TypeRegistry
+
+_log = logging.getLogger(__name__)
+
+DEFAULT_QUEUE = 100
+"""How many messages wait for a slow peer before the oldest is dropped."""
+
+GOODBYE_TIMEOUT = 3.0
+"""Seconds that the master gets to take a node's registrations back."""
+
+RETRY = 0.2
+"""Seconds between attempts to reach the master."""
+
+
+class GraphMember:
+    """The life of a node; :class:`rce.ros.node.Node` adds what a program does with it."""
+
+    def __init__(
+        self,
+        settings: NodeSettings,
+        types: TypeRegistry | None,
+        *,
+        signals: bool,
+        master_timeout: float | None,
+    ) -> None:
+        self.log = logging.getLogger("ros" + settings.resolver.node_name.replace("/", "."))
+        self._settings = settings
+        self._types = Types(types)
+        self._signals = signals
+        self._master_timeout = master_timeout
+        self._topics = Topics()
+        self._services: dict[str, Service] = {}
+        self._clients: list[ServiceClient] = []
+        self._stop = asyncio.Event()
+        self._stack = AsyncExitStack()
+        self._runtime: Runtime | None = None
+        self._parameters: Parameters
+        self._listener: Listener
+
+    # ------------------------------------------------------------------ for programs
+
+    @property
+    def name(self) -> str:
+        """The node's global name."""
+        return self._settings.resolver.node_name
+
+    @property
+    def namespace(self) -> str:
+        """The node's namespace, with a trailing slash."""
+        return self._settings.resolver.namespace
+
+    @property
+    def master_uri(self) -> str:
+        """The master's URI."""
+        return self._settings.master_uri
+
+    @property
+    def uri(self) -> str:
+        """The URI of the node's own API."""
+        return self._running.master.slave_uri
+
+    @property
+    def is_shutdown(self) -> bool:
+        """Whether the node was told to stop."""
+        return self._stop.is_set()
+
+    def shutdown(self, reason: str = "the program asked for it") -> None:
+        """Tell the node to stop: iterators, :meth:`spin` and :meth:`sleep` end."""
+        if not self._stop.is_set():
+            _log.info("%s stops: %s", self.name, reason)
+            self._stop.set()
+            for source in self._topics.inputs.values():
+                for subscriber in source.subscribers:
+                    subscriber.sink.end()
+
+    async def spin(self) -> None:
+        """Wait until the node is told to stop, by the master, another node or a signal."""
+        if self._signals:
+            await self._stop.wait()
+            return
+        with signals.handled(self.shutdown):
+            await self._stop.wait()
+
+    async def sleep(self, seconds: float) -> bool:
+        """Sleep, or wake up early because the node is told to stop.
+
+        Returns:
+            Whether the node goes on: ``while await node.sleep(0.1): ...``.
+        """
+        try:
+            async with asyncio.timeout(seconds):
+                await self._stop.wait()
+        except TimeoutError:
+            return True
+        return False
+
+    async def reregister(self) -> None:
+        """Tell the master again of all topics and services: it may have been restarted.
+
+        Raises:
+            MasterError: The master cannot be told.
+        """
+        master = self._running.master
+        for topic, output in list(self._topics.outputs.items()):
+            await master.register_publisher(topic, output.kind_name)
+        for topic, source in list(self._topics.inputs.items()):
+            source.set_publishers(await master.register_subscriber(topic, source.kind_name))
+        for name in list(self._services):
+            await master.register_service(name, self._service_uri)
+
+    # ------------------------------------------------------------------ life
+
+    async def __aenter__(self) -> Self:
+        settings = self._settings
+        async with AsyncExitStack() as stack:
+            scratch = memoryview(bytearray(SCRATCH_SIZE))
+            rpc = await stack.enter_async_context(RpcClient())
+            self._listener = await stack.enter_async_context(
+                Listener(settings.bind, scratch, topic=self._topics.accept, service=self._accept_service)
+            )
+            tasks = await stack.enter_async_context(TaskScope())
+            slave = SlaveApi(
+                self._topics,
+                settings.master_uri,
+                lambda: (settings.host, self._listener.port),
+                self.shutdown,
+                lambda name, value: self._parameters.changed(name, value),
+            )
+            server = await stack.enter_async_context(RpcServer(Dispatcher(slave.methods()), settings.bind))
+            slave_uri = f"http://{settings.host}:{server.port}/"
+            master = MasterClient(settings.master_uri, self.name, slave_uri, rpc)
+            self._runtime = Runtime(self.name, self._types, tasks, rpc, master, scratch)
+            self._parameters = Parameters(master)
+            stack.push_async_callback(self._leave_graph)
+            await self._join_graph(stack)
+            if self._signals:
+                stack.enter_context(signals.handled(self.shutdown))
+            self._stack = stack.pop_all()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.shutdown("the program left the node's block")
+        await self._stack.aclose()
+        self._runtime = None
+
+    async def _join_graph(self, stack: AsyncExitStack) -> None:
+        publisher = await self._until_master_answers(
+            lambda: self._topics.advertise(
+                self._running, rosout.TOPIC, rosout.KIND, latch=False, queue_size=DEFAULT_QUEUE
+            )
+        )
+        handler = rosout.RosoutHandler(publisher, self.name)
+        publisher.on_subscriber = handler.flush
+        self.log.addHandler(handler)
+        stack.callback(self.log.removeHandler, handler)
+        for name, value in self._settings.parameters.items():
+            await self._parameters.set(f"{self.name}/{name}", value)
+
+    async def _until_master_answers(self, attempt: Callable[[], Awaitable[Publisher]]) -> Publisher:
+        loop = asyncio.get_running_loop()
+        deadline = None if self._master_timeout is None else loop.time() + self._master_timeout
+        while True:
+            try:
+                return await attempt()
+            except MasterUnreachable as error:
+                if deadline is not None and loop.time() >= deadline:
+                    raise
+                _log.info("%s; trying again", error)
+                await asyncio.sleep(RETRY)
+
+    async def _leave_graph(self) -> None:
+        """Unregister everything, as far as there is still a master that listens."""
+        try:
+            async with asyncio.timeout(GOODBYE_TIMEOUT):
+                for service in list(self._services.values()):
+                    await service.close()
+                for output in list(self._topics.outputs.values()):
+                    for publisher in list(output.publishers):
+                        await publisher.close()
+                for source in list(self._topics.inputs.values()):
+                    for subscriber in list(source.subscribers):
+                        await subscriber.close()
+                await self._parameters.unwatch_all()
+        except (MasterError, TimeoutError) as error:
+            _log.info("%s left without telling its master: %s", self.name, str(error) or "it took too long")
+        for client in self._clients:
+            await client.close()
+
+    # ------------------------------------------------------------------ inside
+
+    @property
+    def _running(self) -> Runtime:
+        """What the node works with.
+
+        Raises:
+            NodeClosed: It is not part of the graph (yet, or any longer).
+        """
+        if self._runtime is None:
+            raise NodeClosed(f"node {self.name} is used outside its 'async with' block")
+        return self._runtime
+
+    @property
+    def _service_uri(self) -> str:
+        return f"rosrpc://{self._settings.host}:{self._listener.port}"
+
+    def _accept_service(self, connection: Connection, fields: dict[str, str]) -> None:
+        service = self._services.get(fields["service"])
+        if service is None:
+            raise HandshakeRefused(f"service {fields['service']} is not provided here")
+        service.accept(connection, fields)

@@ -1,0 +1,300 @@
+"""The node: a peer of a ROS graph, and all that a program does with it."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from rce.ros.errors import TypeMismatch
+from rce.ros.node.member import DEFAULT_QUEUE, GraphMember
+from rce.ros.node.parameters import REQUIRED, ParameterCallback
+from rce.ros.node.publisher import Publisher
+from rce.ros.node.service import Handler, SerializedHandler, Service, coding
+from rce.ros.node.service_client import ServiceClient, answers
+from rce.ros.node.settings import NodeSettings
+from rce.ros.node.subscriber import (
+    MessageCallback,
+    QueueSink,
+    SerializedCallback,
+    Subscriber,
+    decoding,
+    serialized_sink,
+)
+from rce.ros.tcpros.header import ANY
+
+if TYPE_CHECKING:
+    from rce.ros.types import MessageType, ServiceType, TypeRegistry
+
+SERVICE_POLL = 0.1
+"""Seconds between two looks for a service that is not there yet."""
+
+
+class Node(GraphMember):
+    """A ROS node. An async context manager: it is part of the graph inside its block.
+
+    ``async with Node("listener") as node: await node.subscribe("chatter", "std_msgs/String", print)``
+
+    Leaving the block unregisters everything and closes all connections. A node that is told to stop (by the
+    master, by ``rosnode kill`` or by a signal) ends its iterators, :meth:`spin` and :meth:`sleep`; the program
+    then leaves the block.
+
+    All names may be global, relative or private and are remapped. Types are given by name or as objects.
+
+    Attributes:
+        log: A logger whose records go to ``/rosout`` too.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        namespace: str = "",
+        argv: Sequence[str] | None = None,
+        master_uri: str | None = None,
+        types: TypeRegistry | None = None,
+        anonymous: bool = False,
+        signals: bool | None = None,
+        master_timeout: float | None = 10.0,
+    ) -> None:
+        """Prepare a node.
+
+        Args:
+            name: Its name without namespace.
+            namespace: Its namespace; if empty, ``ROS_NAMESPACE``.
+            argv: Command line with remappings; ``None`` takes the program's own.
+            master_uri: The master; if ``None``, ``ROS_MASTER_URI``.
+            types: Where types come from; if ``None``, those that are built in.
+            anonymous: Make the name unique.
+            signals: Stop the node at SIGINT and SIGTERM; ``None`` means: if it is the program's main node, which
+                is the one that takes the program's command line.
+            master_timeout: Seconds to wait for a master that is not up yet; ``None`` for ever.
+
+        Raises:
+            InvalidName: A name or remapping is not legal.
+        """
+        settings = NodeSettings.gather(
+            name,
+            namespace=namespace,
+            argv=sys.argv[1:] if argv is None else argv,
+            environ=os.environ,
+            master_uri=master_uri,
+            anonymous=anonymous,
+        )
+        handle_signals = argv is None if signals is None else signals
+        super().__init__(settings, types, signals=handle_signals, master_timeout=master_timeout)
+
+    def resolve(self, name: str) -> str:
+        """Return the global name that ``name`` stands for, after remapping.
+
+        Raises:
+            InvalidName: It is not legal.
+        """
+        return self._settings.resolver.resolve(name)
+
+    # ------------------------------------------------------------------ topics
+
+    async def advertise(
+        self, topic: str, kind: str | MessageType, *, latch: bool = False, queue_size: int = DEFAULT_QUEUE
+    ) -> Publisher:
+        """Publish on a topic.
+
+        Args:
+            topic: The topic.
+            kind: Its type.
+            latch: Give the last message to later subscribers.
+            queue_size: How many messages wait for a slow subscriber before its oldest is dropped.
+
+        Raises:
+            TypeMismatch: This node publishes the topic with another type.
+            UnknownType: There is no such type.
+            MasterError: The master cannot be told.
+        """
+        runtime = self._running
+        message_type = runtime.types.message(kind)
+        return await self._topics.advertise(
+            runtime, self.resolve(topic), message_type, latch=latch, queue_size=queue_size
+        )
+
+    async def subscribe(
+        self,
+        topic: str,
+        kind: str | MessageType,
+        callback: MessageCallback | None = None,
+        *,
+        queue_size: int = DEFAULT_QUEUE,
+    ) -> Subscriber:
+        """Take the messages of a topic.
+
+        Args:
+            topic: The topic.
+            kind: Its type.
+            callback: Called with each message, in order. A plain function is called as soon as a message is there
+                and must not block; a coroutine function is awaited before the next message. Without a
+                callback, iterate over the subscriber.
+            queue_size: How many messages wait for a coroutine or an iteration before the oldest is dropped.
+
+        Raises:
+            TypeMismatch: This node subscribes to the topic with another type.
+            UnknownType: There is no such type.
+            MasterError: The master cannot be told.
+        """
+        runtime = self._running
+        name = self.resolve(topic)
+        message_type = runtime.types.message(kind)
+        if callback is None:
+            return await self._topics.subscribe(runtime, name, message_type, QueueSink(queue_size))
+        sink = serialized_sink(decoding(message_type, callback), queue_size, name, runtime.tasks)
+        return await self._topics.subscribe(runtime, name, message_type, sink)
+
+    async def subscribe_serialized(
+        self,
+        topic: str,
+        kind: str | MessageType,
+        callback: SerializedCallback,
+        *,
+        queue_size: int = DEFAULT_QUEUE,
+    ) -> Subscriber:
+        """Take the messages of a topic as they are on the wire.
+
+        Args:
+            topic: The topic.
+            kind: Its type; ``*`` for any.
+            callback: Called with ``(payload, latched)``; ``latched`` is what the publisher says of itself. Plain
+                function or coroutine function, as for :meth:`subscribe`.
+            queue_size: As for :meth:`subscribe`.
+
+        Raises:
+            TypeMismatch: This node subscribes to the topic with another type.
+            UnknownType: There is no such type.
+            MasterError: The master cannot be told.
+        """
+        runtime = self._running
+        name = self.resolve(topic)
+        sink = serialized_sink(callback, queue_size, name, runtime.tasks)
+        message_type = None if kind == ANY else runtime.types.message(kind)
+        return await self._topics.subscribe(runtime, name, message_type, sink)
+
+    # ------------------------------------------------------------------ services
+
+    async def advertise_service(self, name: str, kind: str | ServiceType, handler: Handler) -> Service:
+        """Provide a service.
+
+        Args:
+            name: The service.
+            kind: Its type.
+            handler: Called with each request; returns a response or a mapping of its fields. A plain function must
+                not block; coroutine functions run side by side for different clients. What it raises is the
+                caller's answer: :class:`~rce.ros.errors.ServiceFault` with its text, anything else is logged too.
+
+        Raises:
+            TypeMismatch: This node provides the service already.
+            UnknownType: There is no such type.
+            MasterError: The master cannot be told.
+        """
+        service_type = self._running.types.service(kind)
+        return await self._advertise_service(name, service_type, coding(service_type, handler))
+
+    async def advertise_service_serialized(
+        self, name: str, kind: str | ServiceType, handler: SerializedHandler
+    ) -> Service:
+        """Provide a service whose requests and responses are passed as they are on the wire.
+
+        Raises:
+            TypeMismatch: This node provides the service already.
+            UnknownType: There is no such type.
+            MasterError: The master cannot be told.
+        """
+        return await self._advertise_service(name, self._running.types.service(kind), handler)
+
+    def service_client(self, name: str, kind: str | ServiceType, *, persistent: bool = True) -> ServiceClient:
+        """Make a client of a service, which need not be there yet.
+
+        Args:
+            name: The service.
+            kind: Its type.
+            persistent: Keep connections for later calls; else every call looks the provider up anew.
+
+        Raises:
+            UnknownType: There is no such type.
+        """
+        runtime = self._running
+        client = ServiceClient(
+            runtime, self.resolve(name), runtime.types.service(kind), persistent=persistent
+        )
+        self._clients.append(client)
+        return client
+
+    async def wait_for_service(self, name: str, *, timeout: float | None = None) -> None:  # noqa: ASYNC109
+        """Wait until a service has a provider that answers.
+
+        Raises:
+            TimeoutError: There was none within ``timeout`` seconds.
+            MasterError: The master cannot be asked.
+        """
+        runtime, service = self._running, self.resolve(name)
+        async with asyncio.timeout(timeout):
+            while not await answers(runtime, service):
+                await asyncio.sleep(SERVICE_POLL)
+
+    async def _advertise_service(self, name: str, kind: ServiceType, handler: SerializedHandler) -> Service:
+        runtime, resolved, uri = self._running, self.resolve(name), self._service_uri
+        if resolved in self._services:
+            raise TypeMismatch(f"this node provides {resolved} already")
+
+        async def release(service: Service) -> None:
+            del self._services[service.name]
+            await runtime.master.unregister_service(service.name, uri)
+
+        service = self._services[resolved] = Service(runtime, resolved, kind, handler, release)
+        try:
+            await runtime.master.register_service(resolved, uri)
+        except BaseException:
+            del self._services[resolved]
+            raise
+        return service
+
+    # ------------------------------------------------------------------ parameters
+
+    async def get_param(self, name: str, default: Any = REQUIRED) -> Any:
+        """Return a parameter, or all of a namespace as a dictionary.
+
+        Raises:
+            ParameterMissing: It is not set and there is no ``default``.
+            MasterUnreachable: The master does not answer.
+        """
+        return await self._parameters.get(self.resolve(name), default)
+
+    async def set_param(self, name: str, value: Any) -> None:
+        """Set a parameter, or a whole namespace from a dictionary."""
+        await self._parameters.set(self.resolve(name), value)
+
+    async def has_param(self, name: str) -> bool:
+        """Tell whether a parameter or namespace is set."""
+        return await self._parameters.has(self.resolve(name))
+
+    async def delete_param(self, name: str) -> None:
+        """Delete a parameter or namespace.
+
+        Raises:
+            ParameterMissing: It is not set.
+        """
+        await self._parameters.delete(self.resolve(name))
+
+    async def search_param(self, name: str) -> str | None:
+        """Look for a relative name in the node's namespace and then upwards; return the global name."""
+        return await self._parameters.search(name)
+
+    async def get_param_names(self) -> list[str]:
+        """Return the names of all parameters of the graph."""
+        return await self._parameters.all_names()
+
+    async def watch_param(self, name: str, callback: ParameterCallback) -> Any:
+        """Call ``callback(name, value)`` whenever a parameter, or one below it, is changed by another node.
+
+        Returns:
+            The value now; an empty dictionary while it is not set.
+        """
+        return await self._parameters.watch(self.resolve(name), callback)

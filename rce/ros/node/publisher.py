@@ -1,0 +1,223 @@
+"""Publishing: the topics that a node offers, and the handles that a program publishes with."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from rce.ros.errors import NodeClosed, TypeMismatch
+from rce.ros.node.queue import DropOldest
+from rce.ros.node.runtime import Runtime
+from rce.ros.tcpros.connection import Connection
+from rce.ros.tcpros.framing import Chunks, frame
+from rce.ros.tcpros.header import ANY, check_type, encode_header, require
+
+if TYPE_CHECKING:
+    from rce.ros.types import Message, MessageType
+
+Payload = bytes | bytearray | memoryview
+"""A serialized message. Large ones are not copied: they must not be changed after they were published."""
+
+
+class Link:
+    """One subscriber of a topic, at the end of a TCPROS connection."""
+
+    def __init__(self, output: TopicOutput, connection: Connection, subscriber: str) -> None:
+        self.subscriber = subscriber
+        self.connection = connection
+        self.messages = 0
+        self.bytes_out = 0
+        self._output = output
+        self._queue: DropOldest[Chunks] = DropOldest(output.queue_size)
+
+    @property
+    def dropped(self) -> int:
+        """How many messages the subscriber was too slow for."""
+        return self._queue.dropped
+
+    def send(self, chunks: Chunks, size: int) -> None:
+        """Send a frame, or queue it while the connection is full."""
+        if self.connection.full:
+            self._queue.put(chunks, size)
+            return
+        self.messages += 1
+        self.bytes_out += size
+        self.connection.write(chunks)
+
+    def connection_made(self, connection: Connection) -> None:
+        """A link begins when the header came."""
+
+    def frame_received(self, connection: Connection, payload: bytes) -> None:
+        """Ignore what a subscriber says: it has nothing to say."""
+
+    def connection_lost(self, connection: Connection, error: Exception | None) -> None:
+        """Forget the subscriber."""
+        del connection, error  # it will come back if it wants to
+        self._output.drop(self)
+
+    def writable(self, connection: Connection) -> None:
+        """Send what waits."""
+        while self._queue and not connection.full:
+            chunks = self._queue.take()
+            self.send(chunks, sum(map(len, chunks)))
+
+
+class TopicOutput:
+    """A topic that the node publishes, shared by all its :class:`Publisher` handles."""
+
+    def __init__(self, runtime: Runtime, topic: str, kind: str | MessageType, queue_size: int) -> None:
+        self.topic = topic
+        self.kind_name = kind if isinstance(kind, str) else kind.name
+        self.queue_size = queue_size
+        self.links: list[Link] = []
+        self.publishers: list[Publisher] = []
+        self.lost = 0
+        """Messages dropped on links that are gone."""
+        self.changed = asyncio.Event()
+        self._runtime = runtime
+        self._kind = kind
+
+    @property
+    def kind(self) -> MessageType:
+        """The topic's type."""
+        if isinstance(self._kind, str):
+            self._kind = self._runtime.types.message(self._kind)
+        return self._kind
+
+    def accept(self, connection: Connection, fields: Mapping[str, str]) -> None:
+        """Take a subscriber.
+
+        Raises:
+            HandshakeRefused: It means another type.
+        """
+        require(fields, "md5sum")
+        kind = self.kind
+        check_type(fields, md5sum=kind.md5sum, kind=kind.name, subject=f"topic {self.topic}")
+        latched = [chunks for publisher in self.publishers if (chunks := publisher.latched) is not None]
+        latching = bool(latched) or any(publisher.latch for publisher in self.publishers)
+        reply = {
+            "callerid": self._runtime.name,
+            "topic": self.topic,
+            "type": kind.name,
+            "md5sum": kind.md5sum,
+            "message_definition": kind.definition,
+            "latching": "1" if latching else "0",
+        }
+        link = Link(self, connection, fields.get("callerid", ANY))
+        connection.owner = link
+        connection.write((encode_header(reply),))
+        for chunks in latched:
+            link.send(chunks, sum(map(len, chunks)))
+        self.links.append(link)
+        self.changed.set()
+        for publisher in self.publishers:
+            if publisher.on_subscriber is not None:
+                publisher.on_subscriber()
+
+    def drop(self, link: Link) -> None:
+        """Forget a subscriber that is gone."""
+        self.lost += link.dropped
+        self.links.remove(link)
+        self.changed.set()
+
+    def close(self) -> None:
+        """Close all links."""
+        for link in self.links:
+            link.connection.close()
+
+
+class Publisher:
+    """Publishes on one topic. Made by :meth:`rce.ros.node.Node.advertise`.
+
+    Publishing never waits: a subscriber that is too slow loses its own oldest messages and delays nobody.
+
+    Attributes:
+        latch: Whether the last message is given to later subscribers.
+        latched: The frame that later subscribers get.
+        on_subscriber: Called whenever another subscriber is connected; to be set by the program.
+    """
+
+    def __init__(
+        self, output: TopicOutput, *, latch: bool, release: Callable[[Publisher], Awaitable[None]]
+    ) -> None:
+        self.latch = latch
+        self.latched: Chunks | None = None
+        self.on_subscriber: Callable[[], None] | None = None
+        self._output = output
+        self._release = release
+        self._closed = False
+
+    @property
+    def topic(self) -> str:
+        """The topic's global name."""
+        return self._output.topic
+
+    @property
+    def type(self) -> MessageType:
+        """The topic's type."""
+        return self._output.kind
+
+    @property
+    def connections(self) -> int:
+        """How many subscribers are connected to the topic."""
+        return len(self._output.links)
+
+    @property
+    def dropped(self) -> int:
+        """How many messages of the topic subscribers were too slow for, counted once for each subscriber."""
+        return self._output.lost + sum(link.dropped for link in self._output.links)
+
+    def publish(self, message: Message | Mapping[str, Any] | None = None, /, **fields: Any) -> None:
+        """Publish a message, given as an object, as a mapping of its fields, or by its fields.
+
+        Raises:
+            SerializationError: A value does not fit its field.
+            TypeMismatch: The message is of another type.
+            NodeClosed: The publisher was closed.
+        """
+        kind = self._output.kind
+        if message is None:
+            message = kind.new(**fields)
+        elif fields:
+            raise TypeError("give a message or its fields, not both")
+        elif message.__class__ is not kind.cls and not isinstance(message, Mapping):
+            raise TypeMismatch(f"{self.topic} carries {kind.name}, not {type(message).__name__}")
+        self.publish_serialized(kind.serialize(message))
+
+    def publish_serialized(self, payload: Payload, latch: bool = False) -> None:
+        """Publish a serialized message, untouched.
+
+        Args:
+            payload: The message's bytes.
+            latch: Remember this message for later subscribers, whatever :attr:`latch` says.
+
+        Raises:
+            NodeClosed: The publisher was closed.
+        """
+        if self._closed:
+            raise NodeClosed(f"the publisher of {self.topic} is closed")
+        chunks = frame(payload)
+        if latch or self.latch:
+            self.latched = chunks
+        size = len(payload)
+        for link in self._output.links:
+            link.send(chunks, size)
+
+    async def wait_for_subscribers(self, count: int = 1, *, timeout: float | None = None) -> None:
+        """Wait until at least ``count`` subscribers are connected.
+
+        Raises:
+            TimeoutError: They did not come within ``timeout`` seconds.
+        """
+        output = self._output
+        async with asyncio.timeout(timeout):
+            while len(output.links) < count:
+                output.changed.clear()
+                await output.changed.wait()
+
+    async def close(self) -> None:
+        """Stop publishing; the last publisher of a topic unregisters it and disconnects its subscribers."""
+        if not self._closed:
+            self._closed = True
+            await self._release(self)

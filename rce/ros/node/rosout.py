@@ -1,0 +1,60 @@
+"""Log records of a node on ``/rosout``."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+
+from rce.ros.errors import NodeClosed
+from rce.ros.node.publisher import Publisher
+
+TOPIC = "/rosout"
+KIND = "rosgraph_msgs/Log"
+
+MAX_WAITING = 100
+"""How many records are kept for the first listener."""
+
+_LEVELS = ((logging.CRITICAL, 16), (logging.ERROR, 8), (logging.WARNING, 4), (logging.INFO, 2))
+_DEBUG = 1
+
+
+class RosoutHandler(logging.Handler):
+    """Publishes log records as ``rosgraph_msgs/Log``.
+
+    Records that come before anybody listens wait for the first listener; the message type is loaded then.
+    """
+
+    def __init__(self, publisher: Publisher, node: str) -> None:
+        super().__init__()
+        self._publisher = publisher
+        self._node = node
+        self._waiting: deque[logging.LogRecord] = deque(maxlen=MAX_WAITING)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Publish a record, after those that waited."""
+        self._waiting.append(record)
+        self.flush()
+
+    def flush(self) -> None:
+        """Publish what waits, if anybody listens."""
+        while self._waiting and self._publisher.connections:
+            record = self._waiting.popleft()
+            try:
+                self._publish(record)
+            except NodeClosed:
+                return
+            except Exception:  # noqa: BLE001 - a record that cannot be formatted must not fail its writer
+                self.handleError(record)
+
+    def _publish(self, record: logging.LogRecord) -> None:
+        secs, fraction = divmod(record.created, 1)
+        stamp = {"secs": int(secs), "nsecs": int(fraction * 1e9)}
+        self._publisher.publish(
+            header={"stamp": stamp},
+            level=next((level for floor, level in _LEVELS if record.levelno >= floor), _DEBUG),
+            name=self._node,
+            msg=self.format(record),
+            file=record.pathname,
+            function=record.funcName or "",
+            line=record.lineno,
+        )

@@ -1,0 +1,52 @@
+"""What all parts of one node share while it runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rce.ros.node.master import MasterClient
+from rce.ros.tasks import TaskScope
+from rce.ros.xmlrpc import RpcClient
+
+if TYPE_CHECKING:
+    from rce.ros.types import MessageType, ServiceType, TypeRegistry
+
+
+class Types:
+    """The node's types, with the registry made when the first is needed: it is slow to import."""
+
+    def __init__(self, registry: TypeRegistry | None) -> None:
+        self._registry = registry
+
+    @property
+    def registry(self) -> TypeRegistry:
+        """Where types come from."""
+        if self._registry is None:
+            from rce.ros.types import TypeRegistry
+
+            self._registry = TypeRegistry()
+        return self._registry
+
+    def message(self, kind: str | MessageType) -> MessageType:
+        """Return a message type by its name, or ``kind`` if it is one."""
+        return self.registry.message(kind) if isinstance(kind, str) else kind
+
+    def service(self, kind: str | ServiceType) -> ServiceType:
+        """Return a service type by its name, or ``kind`` if it is one."""
+        return self.registry.service(kind) if isinstance(kind, str) else kind
+
+
+@dataclass(slots=True)
+class Runtime:
+    """A running node's means."""
+
+    name: str
+    """The node's global name."""
+    types: Types
+    tasks: TaskScope
+    """Owns the node's background work."""
+    rpc: RpcClient
+    master: MasterClient
+    scratch: memoryview
+    """Read buffer of all TCPROS connections."""

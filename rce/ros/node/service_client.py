@@ -1,0 +1,243 @@
+"""Calling services over connections that are kept for the next call."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from rce.ros.errors import (
+    HandshakeRefused,
+    NodeClosed,
+    ServiceFault,
+    ServiceLost,
+    ServiceNotFound,
+    ServiceTimeout,
+)
+from rce.ros.node.runtime import Runtime
+from rce.ros.tcpros.connection import Connection
+from rce.ros.tcpros.framing import frame
+from rce.ros.tcpros.header import ANY, check_type, decode_header, encode_header, raise_error_field
+
+if TYPE_CHECKING:
+    from rce.ros.types import Message, ServiceType
+
+MAX_IDLE = 8
+"""How many idle connections a client keeps."""
+
+MAX_ACTIVE = 64
+"""How many calls of one client are under way at once; more wait."""
+
+
+class ServiceClient:
+    """Calls one service. Made by :meth:`rce.ros.node.Node.service_client`.
+
+    Any number of calls may run at once. A connection carries one call at a time and is kept for later ones
+    while it lasts; when it is lost, the provider is looked up anew.
+    """
+
+    def __init__(self, runtime: Runtime, name: str, kind: ServiceType, *, persistent: bool) -> None:
+        self.name = name
+        """The service's global name."""
+        self.type = kind
+        self._runtime = runtime
+        self._persistent = persistent
+        self._idle: list[_Call] = []
+        self._open: set[_Call] = set()
+        self._slots = asyncio.Semaphore(MAX_ACTIVE)
+        self._closed = False
+
+    async def __call__(self, request: Message | Mapping[str, Any] | None = None, /, **fields: Any) -> Message:
+        """Call the service with a request, or with its fields; without a time limit.
+
+        Raises:
+            ServiceError: There is no response; see its subclasses.
+        """
+        return await self.call(self.type.request.new(**fields) if request is None else request)
+
+    async def call(self, request: Message | Mapping[str, Any], *, timeout: float | None = None) -> Message:  # noqa: ASYNC109
+        """Call the service.
+
+        Args:
+            request: A request or a mapping of its fields.
+            timeout: Seconds, of everything.
+
+        Raises:
+            ServiceError: There is no response; see its subclasses.
+            SerializationError: The request does not fit its type.
+        """
+        payload = self.type.request.serialize(request)
+        return self.type.response.deserialize(await self.call_serialized(payload, timeout=timeout))
+
+    async def call_serialized(
+        self,
+        payload: bytes | bytearray | memoryview,
+        *,
+        timeout: float | None = None,  # noqa: ASYNC109
+    ) -> bytes:
+        """Call the service with a serialized request; return the serialized response.
+
+        A call that is cancelled or times out loses its connection, so its late answer reaches nobody.
+
+        Raises:
+            ServiceNotFound: Nobody provides the service.
+            ServiceLost: The provider cannot be reached or went away before it answered.
+            ServiceFault: The provider answered with an error.
+            ServiceTimeout: No answer within ``timeout`` seconds.
+        """
+        if self._closed:
+            raise NodeClosed(f"the client of {self.name} is closed")
+        try:
+            async with asyncio.timeout(timeout), self._slots:
+                return await self._exchange(payload)
+        except TimeoutError as error:
+            raise ServiceTimeout(self.name) from error
+
+    async def close(self) -> None:
+        """Close the kept connections; calls under way end with ServiceLost."""
+        self._closed = True
+        for call in list(self._open):
+            await call.close()
+
+    async def _exchange(self, payload: bytes | bytearray | memoryview) -> bytes:
+        call = self._take_idle() or await self._connect()
+        try:
+            answer = await call.ask(payload)
+        except ServiceFault:
+            await self._give_back(call)
+            raise
+        except BaseException:
+            self._open.discard(call)
+            await call.close()
+            raise
+        await self._give_back(call)
+        return answer
+
+    def _take_idle(self) -> _Call | None:
+        while self._idle:
+            call = self._idle.pop()
+            if call.connection.is_open:
+                return call
+            self._open.discard(call)
+        return None
+
+    async def _give_back(self, call: _Call) -> None:
+        if self._persistent and not self._closed and len(self._idle) < MAX_IDLE:
+            self._idle.append(call)
+        else:
+            self._open.discard(call)
+            await call.close()
+
+    async def _connect(self) -> _Call:
+        uri = await self._runtime.master.lookup_service(self.name)
+        if uri is None:
+            raise ServiceNotFound(self.name)
+        call = await _Call.open(self.name, uri, self._runtime.scratch)
+        self._open.add(call)
+        try:
+            await self._greet(call)
+        except BaseException:
+            self._open.discard(call)
+            await call.close()
+            raise
+        return call
+
+    async def _greet(self, call: _Call) -> None:
+        header = {
+            "callerid": self._runtime.name,
+            "service": self.name,
+            "type": self.type.name,
+            "md5sum": self.type.md5sum,
+        }
+        if self._persistent:
+            header["persistent"] = "1"
+        answer = decode_header(await call.exchange((encode_header(header),)))
+        try:
+            raise_error_field(answer)
+            check_type(answer, md5sum=self.type.md5sum, kind=self.type.name, subject=f"service {self.name}")
+        except HandshakeRefused as error:
+            raise ServiceFault(self.name, str(error)) from error
+        call.connection.header_done(has_lead=True)
+
+
+async def answers(runtime: Runtime, name: str) -> bool:
+    """Tell whether a service has a provider that can be reached."""
+    uri = await runtime.master.lookup_service(name)
+    if uri is None:
+        return False
+    probe = {"callerid": runtime.name, "service": name, "md5sum": ANY, "probe": "1"}
+    try:
+        call = await _Call.open(name, uri, runtime.scratch)
+        try:
+            return "error" not in decode_header(await call.exchange((encode_header(probe),)))
+        finally:
+            await call.close()
+    except ServiceLost:
+        return False
+
+
+class _Call:
+    """A connection to a provider, for one call at a time; owns the connection."""
+
+    def __init__(self, service: str) -> None:
+        self.connection: Connection
+        self._service = service
+        self._answer: asyncio.Future[bytes] | None = None
+
+    @classmethod
+    async def open(cls, service: str, uri: str, scratch: memoryview) -> _Call:
+        """Connect to a ``rosrpc`` URI."""
+        call = cls(service)
+        address = urlsplit(uri)
+        loop = asyncio.get_running_loop()
+        try:
+            host, port = address.hostname, address.port
+            if host is None or port is None:
+                raise ServiceLost(service, f"the provider's URI {uri!r} is not of the form rosrpc://host:port")
+            _, call.connection = await loop.create_connection(lambda: Connection(call, scratch), host, port)
+        except (OSError, ValueError) as error:
+            raise ServiceLost(service, f"the provider at {uri} cannot be reached: {error}") from error
+        return call
+
+    async def ask(self, payload: bytes | bytearray | memoryview) -> bytes:
+        """Send a request and wait for the answer."""
+        return await self.exchange(frame(payload))
+
+    async def exchange(self, chunks: tuple[bytes, ...]) -> bytes:
+        """Send a frame and wait for the one that answers it."""
+        if not self.connection.is_open:
+            raise ServiceLost(self._service)
+        self._answer = asyncio.get_running_loop().create_future()
+        try:
+            self.connection.write(chunks)
+            return await self._answer
+        finally:
+            self._answer = None
+
+    async def close(self) -> None:
+        """Close and wait until it is."""
+        self.connection.abort()
+        await self.connection.gone.wait()
+
+    def connection_made(self, connection: Connection) -> None:
+        """The header is sent by who connected."""
+
+    def frame_received(self, connection: Connection, payload: bytes) -> None:
+        """Give the answer to who waits for it."""
+        if self._answer is None or self._answer.done():
+            connection.abort()  # nobody asked
+        elif connection.reader.lead:
+            self._answer.set_result(payload)
+        else:
+            self._answer.set_exception(ServiceFault(self._service, payload.decode(errors="replace")))
+
+    def connection_lost(self, connection: Connection, error: Exception | None) -> None:
+        """Tell who waits for an answer."""
+        if self._answer is not None and not self._answer.done():
+            lost = ServiceLost(self._service)
+            lost.__cause__ = error
+            self._answer.set_exception(lost)
+
+    def writable(self, connection: Connection) -> None:
+        """Nothing waits to be written."""

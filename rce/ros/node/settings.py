@@ -1,0 +1,123 @@
+"""What a node is told from outside: environment variables and command line. Pure but for asking for addresses."""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import socket
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlsplit
+
+from rce.ros.names import Resolver, parse_arguments
+
+DEFAULT_MASTER_URI = "http://127.0.0.1:11311/"
+LOOPBACK = "127.0.0.1"
+EVERYWHERE = "0.0.0.0"  # noqa: S104
+
+
+@dataclass(frozen=True, slots=True)
+class NodeSettings:
+    """How one node presents itself."""
+
+    resolver: Resolver
+    master_uri: str
+    host: str
+    """Name or address under which others reach the node."""
+    bind: str
+    """Address to listen on."""
+    parameters: Mapping[str, Any]
+    """Private parameters to set: name without ``~`` to value."""
+
+    @classmethod
+    def gather(
+        cls,
+        name: str,
+        *,
+        namespace: str,
+        argv: Sequence[str],
+        environ: Mapping[str, str],
+        master_uri: str | None = None,
+        anonymous: bool = False,
+    ) -> NodeSettings:
+        """Combine what the program says with its environment and its command line; the command line wins.
+
+        Args:
+            name: The node's name without namespace.
+            namespace: Its namespace; if empty, ``ROS_NAMESPACE``.
+            argv: The command line, remappings among it.
+            environ: ``ROS_MASTER_URI``, ``ROS_NAMESPACE``, ``ROS_IP`` and ``ROS_HOSTNAME`` are read.
+            master_uri: The master, in place of ``ROS_MASTER_URI``.
+            anonymous: Make the name unique.
+
+        Raises:
+            InvalidName: A name or remapping is not legal.
+        """
+        arguments = parse_arguments(argv)
+        specials = arguments.specials
+        if anonymous:
+            name = anonymous_name(name)
+        resolver = Resolver(
+            specials.get("__name", name),
+            specials.get("__ns") or namespace or environ.get("ROS_NAMESPACE", ""),
+            arguments.remappings,
+        )
+        master = specials.get("__master") or master_uri or environ.get("ROS_MASTER_URI") or DEFAULT_MASTER_URI
+        host = (
+            specials.get("__hostname")
+            or specials.get("__ip")
+            or environ.get("ROS_HOSTNAME")
+            or environ.get("ROS_IP")
+            or address_towards(master)
+        )
+        bind = LOOPBACK if is_loopback(host) else EVERYWHERE
+        parameters = {key: parse_value(text) for key, text in arguments.parameters.items()}
+        return cls(resolver, master, host, bind, parameters)
+
+
+def anonymous_name(name: str) -> str:
+    """Make a name that no other node has: with the host's name, the process's id and the time in it."""
+    host = "".join(character if character.isalnum() else "_" for character in socket.gethostname())
+    return f"{name}_{host}_{os.getpid()}_{time.time_ns() // 1000}"
+
+
+def is_loopback(host: str) -> bool:
+    """Tell whether only programs of this machine can reach ``host``."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def address_towards(uri: str) -> str:
+    """Return the address of this machine that faces the server at ``uri``.
+
+    A master on loopback means that the whole graph is on this machine: loopback then. Where that is not so
+    (nodes of other machines join by another address of this one), ``ROS_IP`` must be set, as ROS advises.
+    No packet is sent.
+    """
+    host = urlsplit(uri).hostname or LOOPBACK
+    if is_loopback(host):
+        return LOOPBACK
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((host, 9))
+            address: str = probe.getsockname()[0]
+        except OSError:
+            return socket.gethostname()
+    return address
+
+
+def parse_value(text: str) -> Any:
+    """Read a parameter's value as YAML, as ``_name:=value`` gives it; what is not YAML is a string."""
+    import yaml
+
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        return text
+    return "" if value is None else value

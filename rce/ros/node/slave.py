@@ -1,0 +1,99 @@
+"""The Slave API of a node: what the master and other nodes may ask of it.
+
+http://wiki.ros.org/ROS/Slave_API
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from rce.ros.node.topics import Topics
+from rce.ros.xmlrpc.dispatch import ERROR, FAILURE, SUCCESS, BadArgument, Method
+
+Answer = tuple[int, str, Any]
+
+
+@dataclass(slots=True)
+class SlaveApi:
+    """Answers for one node."""
+
+    topics: Topics
+    master_uri: str
+    tcpros_address: Callable[[], tuple[str, int]]
+    """Where subscribers connect to."""
+    on_shutdown: Callable[[str], None]
+    """Takes the reason for which the node is told to stop."""
+    on_parameter: Callable[[str, Any], None]
+    """Takes a parameter's name and new value."""
+
+    def methods(self) -> dict[str, Method]:
+        """Return the method table."""
+        return {
+            "getBusStats": self._get_bus_stats,
+            "getBusInfo": self._get_bus_info,
+            "getMasterUri": self._get_master_uri,
+            "getPid": self._get_pid,
+            "getSubscriptions": self._get_subscriptions,
+            "getPublications": self._get_publications,
+            "requestTopic": self._request_topic,
+            "publisherUpdate": self._publisher_update,
+            "paramUpdate": self._param_update,
+            "shutdown": self._shutdown,
+        }
+
+    def _request_topic(self, _caller: str, topic: Any, protocols: Any) -> Answer:
+        if not isinstance(topic, str) or not isinstance(protocols, list):
+            raise BadArgument("a topic's name and a list of protocols are needed")
+        if topic not in self.topics.outputs:
+            return ERROR, f"{topic} is not published here", 0
+        if any(isinstance(protocol, list) and protocol[:1] == ["TCPROS"] for protocol in protocols):
+            host, port = self.tcpros_address()
+            return SUCCESS, f"ready on {host}:{port}", ["TCPROS", host, port]
+        return FAILURE, "TCPROS is the only protocol here", []
+
+    def _publisher_update(self, _caller: str, topic: Any, publishers: Any) -> Answer:
+        if not isinstance(publishers, list) or not all(isinstance(uri, str) for uri in publishers):
+            raise BadArgument("the publishers must be a list of URIs")
+        source = self.topics.inputs.get(topic) if isinstance(topic, str) else None
+        if source is not None:
+            source.set_publishers(publishers)
+        return SUCCESS, "", 0
+
+    def _param_update(self, _caller: str, key: Any, value: Any) -> Answer:
+        if not isinstance(key, str) or not key:
+            raise BadArgument("parameter [key] must be a non-empty string")
+        self.on_parameter(key, value)
+        return SUCCESS, "", 0
+
+    def _shutdown(self, caller: str, reason: Any = "") -> Answer:
+        self.on_shutdown(f"{caller} asked for it: {reason}")
+        return SUCCESS, "shutdown", 0
+
+    def _get_master_uri(self, _caller: str) -> Answer:
+        return SUCCESS, "", self.master_uri
+
+    def _get_pid(self, _caller: str) -> Answer:
+        return SUCCESS, "", os.getpid()
+
+    def _get_subscriptions(self, _caller: str) -> Answer:
+        return (
+            SUCCESS,
+            "subscriptions",
+            [[topic, source.kind_name] for topic, source in self.topics.inputs.items()],
+        )
+
+    def _get_publications(self, _caller: str) -> Answer:
+        return (
+            SUCCESS,
+            "publications",
+            [[topic, output.kind_name] for topic, output in self.topics.outputs.items()],
+        )
+
+    def _get_bus_stats(self, _caller: str) -> Answer:
+        return SUCCESS, "bus stats", [self.topics.publish_stats(), self.topics.subscribe_stats(), []]
+
+    def _get_bus_info(self, _caller: str) -> Answer:
+        return SUCCESS, "bus info", self.topics.bus_info()

@@ -1,0 +1,195 @@
+"""Subscribing, the program's side: handles that take messages in order, by callback or by iteration."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import logging
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import TYPE_CHECKING, Any, Protocol
+
+from rce.ros.errors import NodeClosed
+from rce.ros.node.queue import DropOldest
+from rce.ros.tasks import TaskScope
+
+if TYPE_CHECKING:
+    from rce.ros.types import Message, MessageType
+
+_log = logging.getLogger(__name__)
+
+MessageCallback = Callable[[Any], Awaitable[None] | None]
+SerializedCallback = Callable[[bytes, bool], Awaitable[None] | None]
+
+
+class Sink(Protocol):
+    """What a topic's messages are given to."""
+
+    @property
+    def dropped(self) -> int:
+        """How many messages were dropped, the oldest first, because they were not taken in time."""
+
+    def deliver(self, payload: bytes, latched: bool) -> None:
+        """Take a message; must neither wait nor raise."""
+
+    def end(self) -> None:
+        """Learn that no more will come."""
+
+
+class CallbackSink:
+    """Calls a function that is not a coroutine, at once."""
+
+    def __init__(self, callback: Callable[[bytes, bool], object], topic: str) -> None:
+        self._callback = callback
+        self._topic = topic
+
+    @property
+    def dropped(self) -> int:
+        """Nothing ever is."""
+        return 0
+
+    def deliver(self, payload: bytes, latched: bool) -> None:
+        """Call."""
+        try:
+            self._callback(payload, latched)
+        except Exception:
+            _log.exception("the callback of %s failed", self._topic)
+
+    def end(self) -> None:
+        """Nothing is kept."""
+
+
+class QueueSink:
+    """Keeps messages until a task takes them; drops the oldest when they are too many."""
+
+    def __init__(self, queue_size: int) -> None:
+        self._queue: DropOldest[tuple[bytes, bool]] = DropOldest(queue_size)
+        self._arrived = asyncio.Event()
+        self._ended = False
+
+    @property
+    def dropped(self) -> int:
+        """How many messages were dropped."""
+        return self._queue.dropped
+
+    def deliver(self, payload: bytes, latched: bool) -> None:
+        """Keep."""
+        self._queue.put((payload, latched), len(payload))
+        self._arrived.set()
+
+    def end(self) -> None:
+        """Let those who wait go."""
+        self._ended = True
+        self._arrived.set()
+
+    async def take(self) -> tuple[bytes, bool]:
+        """Wait for the next message.
+
+        Raises:
+            EOFError: There is none and none will come.
+        """
+        while not self._queue:
+            if self._ended:
+                raise EOFError
+            self._arrived.clear()
+            await self._arrived.wait()
+        return self._queue.take()
+
+
+async def call_in_order(
+    sink: QueueSink, callback: Callable[[bytes, bool], Awaitable[None]], topic: str
+) -> None:
+    """Give a sink's messages to a coroutine function, one after the other, until the sink ends."""
+    while True:
+        try:
+            payload, latched = await sink.take()
+        except EOFError:
+            return
+        try:
+            await callback(payload, latched)
+        except Exception:
+            _log.exception("the callback of %s failed", topic)
+
+
+def serialized_sink(callback: SerializedCallback, queue_size: int, topic: str, tasks: TaskScope) -> Sink:
+    """Make what gives messages to ``callback``, a function or coroutine function."""
+    if not inspect.iscoroutinefunction(callback):
+        return CallbackSink(callback, topic)
+    sink = QueueSink(queue_size)
+    tasks.start(call_in_order(sink, callback, topic), name=f"callback of {topic}")
+    return sink
+
+
+def decoding(kind: MessageType, callback: MessageCallback) -> SerializedCallback:
+    """Turn a callback that takes messages into one that takes their bytes."""
+    if inspect.iscoroutinefunction(callback):
+
+        async def decode_and_wait(payload: bytes, latched: bool) -> None:
+            del latched
+            await callback(kind.deserialize(payload))
+
+        return decode_and_wait
+
+    def decode(payload: bytes, latched: bool) -> None:
+        del latched
+        callback(kind.deserialize(payload))
+
+    return decode
+
+
+class Subscriber:
+    """A subscription. Made by :meth:`rce.ros.node.Node.subscribe`.
+
+    Without a callback it is an async iterator over the messages: it ends when the subscriber is closed or the
+    node is told to stop.
+    """
+
+    def __init__(
+        self,
+        topic: str,
+        kind: MessageType | None,
+        sink: Sink,
+        release: Callable[[Subscriber], Awaitable[None]],
+        connections: Callable[[], int],
+    ) -> None:
+        self.topic = topic
+        """The topic's global name."""
+        self.sink = sink
+        """Takes what arrives."""
+        self._kind = kind
+        self._release = release
+        self._connections = connections
+        self._closed = False
+
+    @property
+    def dropped(self) -> int:
+        """How many messages were dropped because the program was too slow."""
+        return self.sink.dropped
+
+    @property
+    def connections(self) -> int:
+        """How many publishers are connected."""
+        return self._connections()
+
+    def __aiter__(self) -> AsyncIterator[Message]:
+        return self
+
+    async def __anext__(self) -> Message:
+        """Wait for the next message.
+
+        Raises:
+            NodeClosed: The subscriber has a callback, which takes the messages.
+        """
+        if not isinstance(self.sink, QueueSink) or self._kind is None:
+            raise NodeClosed(f"the messages of {self.topic} go to a callback")
+        try:
+            payload, _ = await self.sink.take()
+        except EOFError:
+            raise StopAsyncIteration from None
+        return self._kind.deserialize(payload)
+
+    async def close(self) -> None:
+        """Stop taking messages; the last subscriber of a topic unregisters it."""
+        if not self._closed:
+            self._closed = True
+            self.sink.end()
+            await self._release(self)

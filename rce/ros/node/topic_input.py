@@ -1,0 +1,185 @@
+"""Subscribing, the network's side: a connection to each publisher of a topic, made again when it is lost."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import random
+from collections.abc import Iterable, Iterator, Mapping
+
+from rce.ros.errors import HandshakeRefused, RosError, TcprosError, TypeMismatch
+from rce.ros.node.runtime import Runtime
+from rce.ros.node.subscriber import Subscriber
+from rce.ros.tcpros.connection import Connection
+from rce.ros.tcpros.header import ANY, check_type, decode_header, encode_header, raise_error_field
+from rce.ros.xmlrpc.dispatch import SUCCESS
+
+_log = logging.getLogger(__name__)
+
+CONNECT_TIMEOUT = 10.0
+RETRY_FIRST = 0.05
+RETRY_MOST = 5.0
+"""Seconds between attempts to reach a publisher: the first wait and the longest."""
+
+
+class TopicInput:
+    """A topic that the node subscribes to, shared by all its :class:`Subscriber` handles."""
+
+    def __init__(self, runtime: Runtime, topic: str, kind_name: str, md5sum: str) -> None:
+        self.topic = topic
+        self.kind_name = kind_name
+        self.md5sum = md5sum
+        self.subscribers: list[Subscriber] = []
+        self.links: list[InputLink] = []
+        self._runtime = runtime
+        self._following: dict[str, asyncio.Task[None]] = {}
+
+    def check(self, kind_name: str, md5sum: str) -> None:
+        """Check that another subscriber of the node means the same type; the first concrete one counts.
+
+        Raises:
+            TypeMismatch: It does not.
+        """
+        if md5sum in (ANY, self.md5sum):
+            return
+        if self.md5sum != ANY:
+            raise TypeMismatch(f"{self.topic} is subscribed to as {self.kind_name} already, not {kind_name}")
+        self.kind_name, self.md5sum = kind_name, md5sum
+
+    def deliver(self, payload: bytes, latched: bool) -> None:
+        """Give a message to all subscribers."""
+        for subscriber in self.subscribers:
+            subscriber.sink.deliver(payload, latched)
+
+    def set_publishers(self, uris: Iterable[str]) -> None:
+        """Follow these publishers, given by their slave APIs, and no others."""
+        wanted = set(uris)
+        for uri in self._following.keys() - wanted:
+            self._following.pop(uri).cancel()
+        for uri in wanted - self._following.keys():
+            self._following[uri] = self._runtime.tasks.start(
+                self._follow(uri), name=f"{self.topic} from {uri}"
+            )
+
+    def close(self) -> None:
+        """Follow nobody any longer."""
+        self.set_publishers(())
+
+    async def _follow(self, uri: str) -> None:
+        """Receive from one publisher for as long as the master names it, over as many connections as it takes."""
+        waits = _waits()
+        while True:
+            link = InputLink(self, uri)
+            try:
+                await self._receive(link)
+            except HandshakeRefused as error:
+                _log.warning("no messages of %s from %s: %s", self.topic, uri, error)
+            except (RosError, OSError) as error:
+                _log.info("%s from %s: %s", self.topic, uri, str(error) or type(error).__name__)
+            if link.messages:
+                waits = _waits()
+            await asyncio.sleep(next(waits))
+
+    async def _receive(self, link: InputLink) -> None:
+        loop = asyncio.get_running_loop()
+        host, port = await self._ask_for_address(link.uri)
+        async with asyncio.timeout(CONNECT_TIMEOUT):
+            _, connection = await loop.create_connection(
+                lambda: Connection(link, self._runtime.scratch), host, port
+            )
+        self.links.append(link)
+        try:
+            connection.write((encode_header(self._header()),))
+            await link.ended
+        finally:
+            self.links.remove(link)
+            connection.abort()
+            await connection.gone.wait()
+
+    async def _ask_for_address(self, uri: str) -> tuple[str, int]:
+        protocols = [["TCPROS"]]
+        answer = await self._runtime.rpc.call(
+            uri, "requestTopic", (self._runtime.name, self.topic, protocols)
+        )
+        try:
+            status, text, protocol = answer
+            if status != SUCCESS:
+                raise TcprosError(f"{uri} does not offer {self.topic}: {text}")
+            _, host, port = protocol
+        except (TypeError, ValueError) as error:
+            raise TcprosError(f"{uri} answers requestTopic in no known form: {answer!r}") from error
+        return str(host), int(port)
+
+    def _header(self) -> dict[str, str]:
+        return {
+            "callerid": self._runtime.name,
+            "topic": self.topic,
+            "type": self.kind_name,
+            "md5sum": self.md5sum,
+            "tcp_nodelay": "1",
+        }
+
+
+class InputLink:
+    """One publisher of a topic; owns the connection to it."""
+
+    def __init__(self, target: TopicInput, uri: str) -> None:
+        self.uri = uri
+        self.messages = 0
+        self.bytes_in = 0
+        self.ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        """Done when the connection is gone; failed if the publisher refused."""
+        self.publisher = ""
+        """The publishing node's name, once it said so."""
+        self._target = target
+        self._greeted = False
+        self._latched = False
+
+    def connection_made(self, connection: Connection) -> None:
+        """The header is sent by who connected."""
+
+    def frame_received(self, connection: Connection, payload: bytes) -> None:
+        """Take the publisher's header, then messages."""
+        if self._greeted:
+            self.messages += 1
+            self.bytes_in += len(payload)
+            self._target.deliver(payload, self._latched)
+            return
+        self._greeted = True
+        try:
+            self._greet(decode_header(payload))
+        except TcprosError as error:
+            self._end(error)
+            connection.abort()
+        else:
+            connection.header_done()
+
+    def connection_lost(self, connection: Connection, error: Exception | None) -> None:
+        """Let who waits for the end go on."""
+        self._end(error)
+
+    def writable(self, connection: Connection) -> None:
+        """Nothing waits to be written."""
+
+    def _greet(self, fields: Mapping[str, str]) -> None:
+        raise_error_field(fields)
+        target = self._target
+        check_type(fields, md5sum=target.md5sum, kind=target.kind_name, subject=f"topic {target.topic}")
+        self.publisher = fields.get("callerid", "")
+        self._latched = fields.get("latching") == "1"
+
+    def _end(self, error: Exception | None) -> None:
+        if self.ended.done():
+            return
+        if error is None:
+            self.ended.set_result(None)
+        else:
+            self.ended.set_exception(error)
+
+
+def _waits() -> Iterator[float]:
+    """Yield growing waits, jittered so that many subscribers do not come back at once."""
+    wait = RETRY_FIRST
+    while True:
+        yield wait * random.uniform(0.5, 1.0)  # noqa: S311 - no secret
+        wait = min(RETRY_MOST, 2 * wait)

@@ -1,0 +1,152 @@
+"""All topics of a node: which are published and subscribed to, and what flows over their connections."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rce.ros.errors import HandshakeRefused, TypeMismatch
+from rce.ros.node.publisher import Publisher, TopicOutput
+from rce.ros.node.runtime import Runtime
+from rce.ros.node.subscriber import Sink, Subscriber
+from rce.ros.node.topic_input import TopicInput
+from rce.ros.tcpros.connection import Connection
+from rce.ros.tcpros.header import ANY
+
+if TYPE_CHECKING:
+    from rce.ros.types import MessageType
+
+
+class Topics:
+    """Topics by their global names.
+
+    Several handles of a program may publish or subscribe to one topic: the first registers it at the master,
+    the last takes that back.
+    """
+
+    def __init__(self) -> None:
+        self.outputs: dict[str, TopicOutput] = {}
+        self.inputs: dict[str, TopicInput] = {}
+
+    async def advertise(
+        self, runtime: Runtime, topic: str, kind: str | MessageType, *, latch: bool, queue_size: int
+    ) -> Publisher:
+        """Make a publisher; return once the master knows of the topic.
+
+        Raises:
+            TypeMismatch: The node publishes the topic with another type already.
+            MasterError: The master cannot be told.
+        """
+        name = kind if isinstance(kind, str) else kind.name
+        output = self.outputs.get(topic)
+        is_first = output is None
+        if output is None:
+            output = self.outputs[topic] = TopicOutput(runtime, topic, kind, queue_size)
+        elif output.kind_name != name:
+            raise TypeMismatch(f"{topic} is published as {output.kind_name} already, not {name}")
+        output.queue_size = max(output.queue_size, queue_size)
+
+        async def release(publisher: Publisher) -> None:
+            output.publishers.remove(publisher)
+            if not output.publishers:
+                del self.outputs[topic]
+                output.close()
+                await runtime.master.unregister_publisher(topic)
+
+        publisher = Publisher(output, latch=latch, release=release)
+        output.publishers.append(publisher)
+        if is_first:
+            try:
+                await runtime.master.register_publisher(topic, name)
+            except BaseException:
+                self.outputs.pop(topic, None)
+                raise
+        return publisher
+
+    async def subscribe(
+        self, runtime: Runtime, topic: str, kind: MessageType | None, sink: Sink
+    ) -> Subscriber:
+        """Make a subscriber; return once the master knows of it. Publishers are connected to after that.
+
+        Args:
+            runtime: The node's means.
+            topic: The topic.
+            kind: Its type; ``None`` for any.
+            sink: Takes the messages.
+
+        Raises:
+            TypeMismatch: The node subscribes to the topic with another type already.
+            MasterError: The master cannot be told.
+        """
+        name, md5sum = (kind.name, kind.md5sum) if kind is not None else (ANY, ANY)
+        source = self.inputs.get(topic)
+        is_first = source is None
+        if source is None:
+            source = self.inputs[topic] = TopicInput(runtime, topic, name, md5sum)
+        source.check(name, md5sum)
+
+        async def release(subscriber: Subscriber) -> None:
+            source.subscribers.remove(subscriber)
+            if not source.subscribers:
+                del self.inputs[topic]
+                source.close()
+                await runtime.master.unregister_subscriber(topic)
+
+        subscriber = Subscriber(topic, kind, sink, release, lambda: len(source.links))
+        source.subscribers = [*source.subscribers, subscriber]  # a new list: one may be in use by a delivery
+        if is_first:
+            try:
+                source.set_publishers(await runtime.master.register_subscriber(topic, name))
+            except BaseException:
+                self.inputs.pop(topic, None)
+                raise
+        return subscriber
+
+    def accept(self, connection: Connection, fields: dict[str, str]) -> None:
+        """Take a subscriber's connection.
+
+        Raises:
+            HandshakeRefused: The topic is not published here, or as another type.
+        """
+        output = self.outputs.get(fields["topic"])
+        if output is None:
+            raise HandshakeRefused(f"topic {fields['topic']} is not published here")
+        output.accept(connection, fields)
+
+    # ------------------------------------------------------------------ what the slave API tells
+
+    def bus_info(self) -> list[list[object]]:
+        """Return ``[id, destination, direction, protocol, topic, connected, text]`` of each connection."""
+        info: list[list[object]] = []
+        for topic, output in self.outputs.items():
+            info += [
+                [_id(link), link.subscriber, "o", "TCPROS", topic, True, str(link.connection)]
+                for link in output.links
+            ]
+        for topic, source in self.inputs.items():
+            info += [
+                [_id(link), link.uri, "i", "TCPROS", topic, True, link.publisher] for link in source.links
+            ]
+        return info
+
+    def publish_stats(self) -> list[list[object]]:
+        """Return ``[topic, bytes, [[id, bytes, messages, connected], ...]]`` of each published topic."""
+        return [
+            [
+                topic,
+                sum(link.bytes_out for link in output.links),
+                [[_id(link), link.bytes_out, link.messages, True] for link in output.links],
+            ]
+            for topic, output in self.outputs.items()
+        ]
+
+    def subscribe_stats(self) -> list[list[object]]:
+        """Return ``[topic, [[id, bytes, messages, dropped, connected], ...]]`` of each topic subscribed to."""
+        return [
+            [topic, [[_id(link), link.bytes_in, link.messages, -1, True] for link in source.links]]
+            for topic, source in self.inputs.items()
+        ]
+
+
+def _id(link: object) -> int:
+    """A number for a connection, as XML-RPC can carry it."""
+    return id(link) >> 4 & 0x7FFFFFFF

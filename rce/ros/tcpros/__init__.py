@@ -1,0 +1,1 @@
+"""TCPROS, the ROS 1 transport of topics and services: headers, frames, connections."""

@@ -1,0 +1,161 @@
+"""One TCPROS socket: frames in, frames out, with back-pressure.
+
+A connection knows nothing of topics and services: its owner takes the frames and writes others.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import Protocol
+
+from rce.ros.errors import TcprosError
+from rce.ros.tcpros.framing import MAX_FRAME, Chunks, FrameReader
+from rce.ros.tcpros.header import MAX_HEADER
+
+_log = logging.getLogger(__name__)
+
+WRITE_HIGH = 2**16
+"""More bytes than this waiting to be sent, and the connection says that it is full."""
+
+
+class Owner(Protocol):
+    """What a connection's frames are for."""
+
+    def connection_made(self, connection: Connection) -> None:
+        """Learn that the connection is there."""
+
+    def frame_received(self, connection: Connection, payload: bytes) -> None:
+        """Take a frame.
+
+        Raises:
+            TcprosError: The connection cannot go on and shall be closed.
+        """
+
+    def connection_lost(self, connection: Connection, error: Exception | None) -> None:
+        """Learn that the connection is gone."""
+
+    def writable(self, connection: Connection) -> None:
+        """Learn that a full connection takes more again."""
+
+
+class Connection(asyncio.BufferedProtocol):
+    """A TCPROS connection in either direction.
+
+    Attributes:
+        owner: Takes the frames; may be exchanged, for instance when the header told what the connection is for.
+        full: Whether too much waits to be sent already. Writing is possible still, but unwise.
+        bytes_in: Bytes of frames received, without their heads.
+        frames_in: Frames received, the connection header among them.
+        gone: Set when the socket is closed.
+    """
+
+    def __init__(self, owner: Owner, scratch: memoryview, *, siblings: set[Connection] | None = None) -> None:
+        """Make a connection for a transport.
+
+        Args:
+            owner: Takes the frames.
+            scratch: Buffer shared by all connections of one event loop's node.
+            siblings: Where the connection keeps itself while it is there.
+        """
+        self.owner = owner
+        self.full = False
+        self.bytes_in = 0
+        self.frames_in = 0
+        self.gone = asyncio.Event()
+        self.reader = FrameReader(scratch, limit=MAX_HEADER)
+        self._siblings = siblings
+        self._transport: asyncio.Transport | None = None
+        self._closing = False
+        self._peer = "?"
+
+    # ------------------------------------------------------------------ for the owner
+
+    @property
+    def is_open(self) -> bool:
+        """Whether frames can still be written."""
+        return self._transport is not None and not self._closing
+
+    def header_done(self, *, has_lead: bool = False) -> None:
+        """Accept messages from now on: longer than headers and, from a service, with a lead byte."""
+        self.reader.limit = MAX_FRAME
+        self.reader.has_lead = has_lead
+
+    def write(self, chunks: Chunks) -> None:
+        """Send a frame; ignored when the connection is gone."""
+        transport = self._transport
+        if transport is not None and not self._closing:
+            for chunk in chunks:
+                transport.write(chunk)
+
+    def close(self) -> None:
+        """Close once what was written is out."""
+        self._closing = True
+        if self._transport is not None:
+            self._transport.close()
+
+    def abort(self) -> None:
+        """Close now; what was written may be lost."""
+        self._closing = True
+        if self._transport is not None:
+            self._transport.abort()
+
+    def pause_reading(self) -> None:
+        """Let the peer wait."""
+        if self._transport is not None and self._transport.is_reading():
+            self._transport.pause_reading()
+
+    def resume_reading(self) -> None:
+        """Take more from the peer."""
+        if self._transport is not None and not self._transport.is_reading() and not self._closing:
+            self._transport.resume_reading()
+
+    def __str__(self) -> str:
+        return f"TCPROS connection with {self._peer}"
+
+    # ------------------------------------------------------------------ for the transport
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Keep the transport."""
+        self._transport = transport  # type: ignore[assignment]
+        assert self._transport is not None
+        self._transport.set_write_buffer_limits(high=WRITE_HIGH)
+        self._peer = str(transport.get_extra_info("peername"))
+        if self._siblings is not None:
+            self._siblings.add(self)
+        self.owner.connection_made(self)
+
+    def connection_lost(self, error: Exception | None) -> None:
+        """Tell the owner."""
+        self._transport = None
+        self.gone.set()
+        if self._siblings is not None:
+            self._siblings.discard(self)
+        self.owner.connection_lost(self, error)
+
+    def get_buffer(self, sizehint: int) -> memoryview:
+        """Return where the next bytes go."""
+        del sizehint  # the reader knows better
+        return self.reader.buffer()
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """Hand the complete frames to the owner."""
+        reader = self.reader
+        reader.received(nbytes)
+        try:
+            while not self._closing and (payload := reader.next_frame()) is not None:
+                self.bytes_in += len(payload)
+                self.frames_in += 1
+                self.owner.frame_received(self, payload)
+        except TcprosError as error:
+            _log.warning("%s is closed: %s", self, error)
+            self.abort()
+
+    def pause_writing(self) -> None:
+        """Note that the peer takes less than was written."""
+        self.full = True
+
+    def resume_writing(self) -> None:
+        """Tell the owner that there is room again."""
+        self.full = False
+        self.owner.writable(self)

@@ -1,0 +1,90 @@
+"""Connection headers: the first frame in either direction. Pure.
+
+Each field is ``name=value`` after its length (4 bytes, little-endian); the header is the frame of all of them.
+http://wiki.ros.org/ROS/Connection%20Header
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+
+from rce.ros.errors import HandshakeRefused, MalformedFrame
+
+ANY = "*"
+"""Stands for any md5 sum or type."""
+
+MAX_HEADER = 2**20
+"""Longest connection header in bytes; full message definitions are some 10 kB."""
+
+_LENGTH = struct.Struct("<I")
+
+
+def encode_header(fields: Mapping[str, str]) -> bytes:
+    """Write a connection header, with the length in front of it."""
+    encoded = [f"{name}={value}".encode() for name, value in fields.items()]
+    body = b"".join(_LENGTH.pack(len(field)) + field for field in encoded)
+    return _LENGTH.pack(len(body)) + body
+
+
+def decode_header(body: bytes) -> dict[str, str]:
+    """Read a connection header, without the length in front of it.
+
+    Raises:
+        MalformedFrame: The bytes are no header.
+    """
+    fields: dict[str, str] = {}
+    position = 0
+    while position < len(body):
+        start = position + _LENGTH.size
+        if start > len(body):
+            raise MalformedFrame("a connection header ends within a field's length")
+        position = start + _LENGTH.unpack_from(body, start - _LENGTH.size)[0]
+        if position > len(body):
+            raise MalformedFrame("a field of a connection header is longer than the header")
+        name, mark, value = body[start:position].partition(b"=")
+        if not mark:
+            raise MalformedFrame("a field of a connection header has no '='")
+        fields[name.decode(errors="replace")] = value.decode(errors="replace")
+    return fields
+
+
+def raise_error_field(fields: Mapping[str, str]) -> None:
+    """Raise what the other end put into its header's ``error`` field, if it did.
+
+    Raises:
+        HandshakeRefused: It did.
+    """
+    if "error" in fields:
+        raise HandshakeRefused(fields["error"])
+
+
+def require(fields: Mapping[str, str], *required: str) -> None:
+    """Check that a header has all ``required`` fields.
+
+    Raises:
+        HandshakeRefused: One is missing.
+    """
+    missing = [name for name in required if not fields.get(name)]
+    if missing:
+        raise HandshakeRefused(f"the connection header lacks {', '.join(missing)}")
+
+
+def check_type(fields: Mapping[str, str], *, md5sum: str, kind: str, subject: str) -> None:
+    """Check that the other end means the same type; ``*`` on either side matches all.
+
+    Args:
+        fields: The other end's header.
+        md5sum: This end's md5 sum.
+        kind: This end's type name.
+        subject: The topic or service, for the error's text.
+
+    Raises:
+        HandshakeRefused: Another md5 sum. An equal sum under another type name is the same type.
+    """
+    theirs = fields.get("md5sum", ANY)
+    if ANY not in (theirs, md5sum) and theirs != md5sum:
+        raise HandshakeRefused(
+            f"{subject} is of type {kind} with md5 sum {md5sum} here,"
+            f" of type {fields.get('type', ANY)} with md5 sum {theirs} there"
+        )

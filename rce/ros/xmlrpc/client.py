@@ -1,0 +1,183 @@
+"""The XML-RPC client: one per process or node, keep-alive connections to every server it has called."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Any
+from urllib.parse import urlsplit
+
+import h11
+
+from rce.ros.errors import RpcUnreachable
+from rce.ros.xmlrpc.codec import decode_response, encode_call
+
+_log = logging.getLogger(__name__)
+
+MAX_ANSWER = 64 * 2**20
+"""Longest answer in bytes."""
+
+MAX_IDLE = 4
+"""How many idle connections are kept to one server."""
+
+DEFAULT_TIMEOUT = 10.0
+
+_CHUNK = 65536
+
+
+class RpcClient:
+    """Calls XML-RPC servers. An async context manager; leaving it closes the connections.
+
+    Any number of calls may run at once; those to one server each take a connection of their own.
+    """
+
+    def __init__(self) -> None:
+        self._idle: dict[tuple[str, int], list[_Connection]] = {}
+        self._closed = False
+
+    async def __aenter__(self) -> RpcClient:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._closed = True
+        for connections in self._idle.values():
+            for connection in connections:
+                await connection.closed()
+        self._idle.clear()
+
+    async def call(
+        self, uri: str, method: str, arguments: Sequence[Any], *, timeout: float = DEFAULT_TIMEOUT
+    ) -> Any:
+        """Call ``method`` of the server at ``uri``.
+
+        Cancelling a call closes its connection.
+
+        Args:
+            uri: ``http://host:port/``.
+            method: The method's name.
+            arguments: Values that XML-RPC can carry.
+            timeout: Seconds for all of it.
+
+        Raises:
+            RpcUnreachable: No answer came, for whatever reason.
+            RemoteFault: The server answered with a fault.
+            MalformedDocument: An argument cannot be sent or the answer cannot be read.
+        """
+        document = encode_call(method, arguments)
+        try:
+            async with asyncio.timeout(timeout):
+                answer = await self._exchange(uri, document)
+        except TimeoutError as error:
+            raise RpcUnreachable(uri, f"{method} took longer than {timeout:g} s") from error
+        except (OSError, h11.ProtocolError, EOFError, ValueError) as error:
+            raise RpcUnreachable(uri, str(error) or type(error).__name__) from error
+        return decode_response(answer)
+
+    async def _exchange(self, uri: str, document: bytes) -> bytes:
+        address = _address(uri)
+        while (idle := self._idle.get(address)) and not self._closed:
+            connection = idle.pop()
+            try:
+                return await self._post(connection, document)
+            except (ConnectionError, EOFError, h11.RemoteProtocolError) as error:
+                # The server closed the idle connection, as it may at any time. ROS calls may be repeated.
+                _log.debug("reconnecting to %s: %s", uri, error)
+        return await self._post(await _Connection.open(*address), document)
+
+    async def _post(self, connection: _Connection, document: bytes) -> bytes:
+        try:
+            answer = await connection.post(document)
+        except BaseException:
+            connection.close()
+            raise
+        self._give_back(connection)
+        return answer
+
+    def _give_back(self, connection: _Connection) -> None:
+        idle = self._idle.setdefault(connection.address, [])
+        if self._closed or not connection.reusable or len(idle) >= MAX_IDLE:
+            connection.close()
+        else:
+            idle.append(connection)
+
+
+class _Connection:
+    """One connection, used for one call at a time."""
+
+    def __init__(
+        self, address: tuple[str, int], reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
+        self.address = address
+        self._reader = reader
+        self._writer = writer
+        self._http = h11.Connection(h11.CLIENT)
+
+    @classmethod
+    async def open(cls, host: str, port: int) -> _Connection:
+        reader, writer = await asyncio.open_connection(host, port)
+        return cls((host, port), reader, writer)
+
+    @property
+    def reusable(self) -> bool:
+        """Whether another call may follow."""
+        return self._http.our_state is h11.IDLE and not self._reader.at_eof()
+
+    def close(self) -> None:
+        self._writer.close()
+
+    async def closed(self) -> None:
+        """Close and wait until it is."""
+        self._writer.close()
+        with contextlib.suppress(OSError):  # it may have been lost already: as good as closed
+            await self._writer.wait_closed()
+
+    async def post(self, document: bytes) -> bytes:
+        host, port = self.address
+        request = h11.Request(
+            method="POST",
+            target="/RPC2",
+            headers=[
+                ("Host", f"{host}:{port}"),
+                ("Content-type", "text/xml"),
+                ("Content-length", str(len(document))),
+            ],
+        )
+        parts = [self._http.send(request), self._http.send(h11.Data(data=document))]
+        self._http.send(h11.EndOfMessage())
+        self._writer.write(b"".join(part for part in parts if part))
+        await self._writer.drain()
+        body = await self._read_answer()
+        if self._http.our_state is h11.DONE and self._http.their_state is h11.DONE:
+            self._http.start_next_cycle()
+        return body
+
+    async def _read_answer(self) -> bytes:
+        body = bytearray()
+        while True:
+            event = self._http.next_event()
+            if event is h11.NEED_DATA:
+                data = await self._reader.read(_CHUNK)
+                if not data and self._http.their_state is h11.SEND_RESPONSE:
+                    raise EOFError("the connection was closed before an answer")
+                self._http.receive_data(data)
+            elif isinstance(event, h11.Response):
+                if event.status_code != 200:  # noqa: PLR2004
+                    raise ValueError(f"HTTP status {event.status_code}")
+            elif isinstance(event, h11.Data):
+                body += event.data
+                if len(body) > MAX_ANSWER:
+                    raise ValueError(f"the answer is longer than {MAX_ANSWER} bytes")
+            elif isinstance(event, h11.EndOfMessage):
+                return bytes(body)
+
+
+def _address(uri: str) -> tuple[str, int]:
+    parts = urlsplit(uri)
+    if parts.scheme != "http" or not parts.hostname or not parts.port:
+        raise ValueError("not a URI of the form http://host:port/")
+    return parts.hostname, parts.port

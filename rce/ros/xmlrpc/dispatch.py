@@ -1,0 +1,101 @@
+"""From a method call's document to its answer's, for APIs in the ROS manner. No I/O.
+
+Every ROS method answers ``[status, message, value]`` with status 1 for success, 0 for a failure and -1 for a
+mistake of the caller. Real clients do not expect faults, so a wrong number or kind of arguments is answered
+``[-1, message, 0]``; a fault says only that there is no such method or that the document is no call.
+"""
+
+from __future__ import annotations
+
+import inspect
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from rce.ros.errors import MalformedDocument
+from rce.ros.xmlrpc.codec import decode_call, encode_fault, encode_response
+
+_log = logging.getLogger(__name__)
+
+Method = Callable[..., Any]
+"""A method of an API: takes the caller's name first, returns ``(status, message, value)``. Must not block."""
+
+ERROR, FAILURE, SUCCESS = -1, 0, 1
+MAX_MULTICALL = 10_000
+"""How many calls one ``system.multicall`` may hold."""
+
+_FAULT_NO_METHOD = -32601
+_FAULT_NO_CALL = -32600
+
+
+class BadArgument(ValueError):  # noqa: N818
+    """Raised by a method for a caller's mistake; answered ``[-1, message, 0]``."""
+
+
+class Dispatcher:
+    """The methods of one server, with ``system.listMethods`` and ``system.multicall`` added."""
+
+    def __init__(self, methods: Mapping[str, Method]) -> None:
+        self._methods = dict(methods)
+        self._arity = {name: _arity(method) for name, method in methods.items()}
+
+    def respond(self, document: bytes) -> bytes:
+        """Answer the call in ``document``. Never raises."""
+        try:
+            method, arguments = decode_call(document)
+        except Exception as error:  # noqa: BLE001 - whatever a document does to the parser, its sender is told
+            return encode_fault(_FAULT_NO_CALL, str(error))
+        try:
+            result = self._call(method, arguments)
+        except _NoSuchMethod as error:
+            return encode_fault(_FAULT_NO_METHOD, str(error))
+        try:
+            return encode_response(result)
+        except MalformedDocument as error:
+            _log.warning("the answer to %s cannot be sent: %s", method, error)
+            return encode_response((FAILURE, str(error), 0))
+
+    def _call(self, method: str, arguments: Sequence[Any]) -> Any:
+        if method == "system.listMethods":
+            return sorted([*self._methods, "system.listMethods", "system.multicall"])
+        if method == "system.multicall":
+            return self._multicall(arguments)
+        handler = self._methods.get(method)
+        if handler is None:
+            raise _NoSuchMethod(f"there is no method {method!r}")
+        at_least, at_most = self._arity[method]
+        if not at_least <= len(arguments) <= at_most:
+            return ERROR, f"{method} takes {at_least} arguments, not {len(arguments)}", 0
+        if not isinstance(arguments[0], str):
+            return ERROR, f"{method}: the caller's id must be a string", 0
+        try:
+            return handler(*arguments)
+        except BadArgument as error:
+            return ERROR, f"{method}: {error}", 0
+        except Exception as error:
+            _log.exception("%s failed for %s", method, arguments[0])
+            return FAILURE, f"internal failure: {error}", 0
+
+    def _multicall(self, arguments: Sequence[Any]) -> list[Any]:
+        if len(arguments) != 1 or not isinstance(arguments[0], list) or len(arguments[0]) > MAX_MULTICALL:
+            raise _NoSuchMethod(f"system.multicall takes one list of at most {MAX_MULTICALL} calls")
+        return [self._one_of_many(call) for call in arguments[0]]
+
+    def _one_of_many(self, call: Any) -> Any:
+        try:
+            method, parameters = call["methodName"], call["params"]
+            if method == "system.multicall" or not isinstance(parameters, list):
+                raise _NoSuchMethod("a call within system.multicall needs a method's name and a list")
+            return [self._call(method, parameters)]
+        except (_NoSuchMethod, KeyError, TypeError) as error:
+            return {"faultCode": _FAULT_NO_METHOD, "faultString": str(error)}
+
+
+class _NoSuchMethod(Exception):  # noqa: N818
+    """Nothing here can take the call."""
+
+
+def _arity(method: Method) -> tuple[int, int]:
+    parameters = inspect.signature(method).parameters.values()
+    required = sum(parameter.default is parameter.empty for parameter in parameters)
+    return required, len(parameters)

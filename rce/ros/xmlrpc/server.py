@@ -1,0 +1,177 @@
+"""The HTTP server under a ROS API: h11 for the framing, a dispatcher for the answers.
+
+All methods of ROS APIs only look at or change state in memory, so a request is answered in the callback that
+received its last byte: no task, no queue, answers of one connection in order.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from types import TracebackType
+
+import h11
+
+from rce.ros.closing import close_all
+from rce.ros.xmlrpc.dispatch import Dispatcher
+
+_log = logging.getLogger(__name__)
+
+MAX_BODY = 16 * 2**20
+"""Longest request in bytes."""
+
+MAX_CONNECTIONS = 4096
+REQUEST_TIMEOUT = 30.0
+"""Seconds from a request's first byte to its last."""
+
+
+class RpcServer:
+    """An XML-RPC server. An async context manager, listening inside its block.
+
+    Attributes:
+        port: The port taken.
+    """
+
+    def __init__(self, dispatcher: Dispatcher, host: str | None = None, port: int = 0) -> None:
+        """Prepare a server.
+
+        Args:
+            dispatcher: Answers the calls.
+            host: Address to listen on; ``None`` for all.
+            port: 0 takes a free one.
+        """
+        self.port = port
+        self._dispatcher = dispatcher
+        self._host = host
+        self._connections: set[_Connection] = set()
+        self._server: asyncio.Server | None = None
+
+    async def __aenter__(self) -> RpcServer:
+        loop = asyncio.get_running_loop()
+        host = self._host or "0.0.0.0"  # noqa: S104 - nodes of other machines must reach it
+        self._server = await loop.create_server(self._accept, host, self.port, backlog=512)
+        self.port = self._server.sockets[0].getsockname()[1]
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._server is not None:
+            self._server.close()
+        await close_all(self._connections)
+
+    def _accept(self) -> _Connection:
+        return _Connection(self._dispatcher, self._connections)
+
+
+class _Connection(asyncio.Protocol):
+    """One client's connection."""
+
+    def __init__(self, dispatcher: Dispatcher, siblings: set[_Connection]) -> None:
+        self._dispatcher = dispatcher
+        self._siblings = siblings
+        self.gone = asyncio.Event()
+        self._http = h11.Connection(h11.SERVER)
+        self._body: list[bytes] = []
+        self._size = 0
+        self._transport: asyncio.Transport | None = None
+        self._deadline: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        if len(self._siblings) >= MAX_CONNECTIONS:
+            _log.warning("more than %d connections: one is turned away", MAX_CONNECTIONS)
+            transport.abort()
+            return
+        self._siblings.add(self)
+
+    def connection_lost(self, error: Exception | None) -> None:
+        del error  # a client that leaves needs no reason
+        self._transport = None
+        self._siblings.discard(self)
+        self._finish_request()
+        self.gone.set()
+
+    def data_received(self, data: bytes) -> None:
+        if self._deadline is None:
+            self._deadline = asyncio.get_running_loop().call_later(REQUEST_TIMEOUT, self.close)
+        try:
+            self._http.receive_data(data)
+            while not self._is_closing() and self._next_event():
+                pass
+        except h11.RemoteProtocolError as error:
+            self._refuse(error.error_status_hint, str(error))
+
+    def eof_received(self) -> None:
+        """Close at once: a client that ends its side has got all its answers."""
+
+    def close(self) -> None:
+        """Close once what was written is out."""
+        if self._transport is not None:
+            self._transport.close()
+
+    def abort(self) -> None:
+        """Close now."""
+        if self._transport is not None:
+            self._transport.abort()
+
+    def _next_event(self) -> bool:
+        """Handle one event; tell whether there may be more."""
+        event = self._http.next_event()
+        if event is h11.NEED_DATA or event is h11.PAUSED:
+            if self._http.they_are_waiting_for_100_continue:
+                self._send(h11.InformationalResponse(status_code=100, headers=[]))
+            return False
+        if isinstance(event, h11.Request):
+            if event.method != b"POST":
+                self._refuse(405, "XML-RPC comes by POST")
+        elif isinstance(event, h11.Data):
+            self._size += len(event.data)
+            if self._size > MAX_BODY:
+                self._refuse(413, f"a request may have {MAX_BODY} bytes")
+            self._body.append(bytes(event.data))
+        elif isinstance(event, h11.EndOfMessage):
+            self._answer()
+        else:
+            self.close()
+            return False
+        return True
+
+    def _answer(self) -> None:
+        document = self._dispatcher.respond(b"".join(self._body))
+        self._finish_request()
+        self._respond(200, b"text/xml", document)
+        if self._http.our_state is h11.MUST_CLOSE:
+            self.close()
+        else:
+            self._http.start_next_cycle()
+
+    def _is_closing(self) -> bool:
+        return self._transport is None or self._transport.is_closing()
+
+    def _finish_request(self) -> None:
+        self._body.clear()
+        self._size = 0
+        if self._deadline is not None:
+            self._deadline.cancel()
+            self._deadline = None
+
+    def _refuse(self, status: int, reason: str) -> None:
+        if self._http.our_state in (h11.IDLE, h11.SEND_RESPONSE):
+            self._respond(status, b"text/plain; charset=utf-8", reason.encode(), last=True)
+        self.close()
+
+    def _respond(self, status: int, kind: bytes, body: bytes, *, last: bool = False) -> None:
+        # The spelling of Content-length is the one that roscpp's parser has always been given.
+        headers = [(b"Content-type", kind), (b"Content-length", b"%d" % len(body))]
+        if last:
+            headers.append((b"Connection", b"close"))
+        self._send(h11.Response(status_code=status, reason=b"OK" if status == 200 else b"", headers=headers))  # noqa: PLR2004
+        self._send(h11.Data(data=body))
+        self._send(h11.EndOfMessage())
+
+    def _send(self, event: h11.Event) -> None:
+        data = self._http.send(event)
+        if data and self._transport is not None:
+            self._transport.write(data)
