@@ -1,0 +1,78 @@
+"""JSON values of single fields, to what is packed and back.
+
+Floats: JSON has no word for NaN and the infinities. They leave as floats and become ``null`` when the message
+is written as text; ``null`` is read as NaN.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+import sys
+from array import array
+from collections.abc import Callable
+from typing import Any
+
+from rce.ros.types.arrays import pack_numbers, unpack_numbers
+from rce.ros.types.codegen import RefusedValueError
+from rce.ros.types.values import Number
+
+BINARY = (bytes, bytearray, memoryview)
+"""What a binary value may come as."""
+
+_INTEGERS = frozenset({int})
+_FLOATS = frozenset({int, float})
+_BOOLS = frozenset({bool})
+
+
+def to_float(value: Any) -> float:
+    """Read a number that is not a float already."""
+    if value.__class__ is int:
+        return float(value)
+    if value is None:
+        return math.nan
+    raise RefusedValueError
+
+
+def to_octets(value: Any) -> bytes | bytearray | memoryview:
+    """Read ``uint8[]`` or ``char[]``: a binary value, a base64 string, or a list of numbers."""
+    if isinstance(value, BINARY):
+        return value
+    if value.__class__ is str:
+        return base64.b64decode(value, validate=True)
+    if isinstance(value, (list, tuple)) and _INTEGERS.issuperset(map(type, value)):
+        return bytes(value)
+    raise RefusedValueError
+
+
+def number_packer(number: Number) -> Callable[[Any], bytes]:
+    """Return the function that turns a list of numbers of one type into its bytes on the wire."""
+    if number.code == "?":
+        return _pack_bools
+    code = number.code
+    allowed = _FLOATS if number.is_float else _INTEGERS
+
+    def pack(values: Any) -> bytes:
+        if not isinstance(values, (list, tuple)):
+            raise RefusedValueError
+        if not allowed.issuperset(map(type, values)):
+            if not number.is_float:
+                raise RefusedValueError
+            values = [value if value.__class__ is float else to_float(value) for value in values]
+        return pack_numbers(code, array(code, values))
+
+    return pack
+
+
+def _pack_bools(values: Any) -> bytes:
+    if not isinstance(values, (list, tuple)) or not _BOOLS.issuperset(map(type, values)):
+        raise RefusedValueError
+    return bytes(values)
+
+
+def unpack_list(code: str, chunk: Any) -> list[Any]:
+    """Read an array of numbers from its bytes on the wire into a list."""
+    if sys.byteorder == "big" and code != "?":
+        return list(unpack_numbers(code, chunk))
+    values: list[Any] = memoryview(chunk).cast(code).tolist()  # type: ignore[call-overload]  # of any code
+    return values
