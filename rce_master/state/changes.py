@@ -21,6 +21,7 @@ from rce_master.state.records import (
     Tombstone,
     User,
 )
+from rce_master.store.base import Row
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -30,16 +31,6 @@ if TYPE_CHECKING:
     from rce_master.state.tables import Table, Tables
 
 R = TypeVar("R")
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """A record as the store keeps it."""
-
-    table: str
-    key: str
-    body: bytes | None
-    """None: remove it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +81,8 @@ class Changes:
     happenings: list[Happening] = field(default_factory=list)
     arrived: str = ""
     """Process name of the task set that is to be synchronised."""
+    answered: str = ""
+    """Id of an endpoint whose spec goes out with the answer to the command, so that it needs no ``Put``."""
     _writes: list[_Write] = field(default_factory=list)
 
     def rows(self) -> list[Row]:

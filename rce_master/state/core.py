@@ -13,12 +13,13 @@ from rce_master.state.changes import Changes, Transaction
 from rce_master.state.invariants import validate
 from rce_master.state.settings import StateSettings
 from rce_master.state.specs import build_spec
-from rce_master.state.tables import Snapshot, Tables
+from rce_master.state.tables import Tables
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rce.control.model import EndpointSpec
+    from rce_master.store.base import Snapshot
 
 _HANDLERS: dict[type, Callable[[Transaction, Any], None]] = {
     commands.AddUser: users.add_user,

@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 from msgspec import Struct
 
-from rce.control.messages import MachineInfo, TaskSetKind  # noqa: TC001 - msgspec reads the annotations
+from rce.control.messages import MachineInfo, TaskSetKind
 from rce.control.model import (
     EndpointKind,
     EndpointStatus,
@@ -20,7 +20,7 @@ from rce.control.model import (
     ParameterValue,
     Resources,
 )
-from rce_master.state.lifecycle import ContainerPhase, RobotSession  # noqa: TC001 - msgspec reads the annotations
+from rce_master.state.lifecycle import ContainerPhase, RobotSession
 
 
 class UserRole(Enum):

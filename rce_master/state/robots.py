@@ -40,6 +40,7 @@ def login(tx: Transaction, command: RobotLogin) -> None:
     elif not isinstance(there, Robot):
         raise Conflict(f"{name.tag!r} is a container of user {name.user!r}; a robot needs another robotID")
     _enter(tx, command.id, command.process)
+    tx.changes.answered = command.id
     tx.happen("robot_connected", command.id, f"at {command.process}")
 
 

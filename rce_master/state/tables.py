@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import msgspec
 
@@ -23,10 +22,10 @@ from rce_master.state.records import (
     User,
 )
 
-R = TypeVar("R")
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
-Snapshot = Mapping[str, Mapping[str, bytes]]
-"""What the store holds: table name to key to encoded record."""
+R = TypeVar("R")
 
 
 class Table(Generic[R]):

@@ -1,0 +1,105 @@
+"""``rce-master``: the Master Task Set as a program."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import signal
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+import uvloop
+
+from rce.config.exceptions import ConfigError, RunDirError, SecretError
+from rce.config.secret import load_secret
+from rce_master.exceptions import MasterError
+from rce_master.master import Master, RunningMaster
+from rce_master.settings import CONTROL_PORT, EVERYWHERE, HTTP_PORT, LOOPBACK, MasterSettings
+from rce_master.state.settings import StateSettings
+from rce_master.store import SqliteStore
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from rce.config.secret import Secret
+
+_DEFAULTS = StateSettings()
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+@app.command()
+def command(  # noqa: PLR0917 - options of a command line
+    bind: Annotated[str, typer.Option(help="Address to listen on; all by default.")] = "",
+    http_port: Annotated[int, typer.Option(help="For clients, REST and metrics.")] = HTTP_PORT,
+    control_port: Annotated[int, typer.Option(help="For task sets.")] = CONTROL_PORT,
+    state_dir: Annotated[Path | None, typer.Option(help="Where users and desired state are kept.")] = None,
+    secret_file: Annotated[Path | None, typer.Option(help="File with the secret of the task sets.")] = None,
+    dev: Annotated[bool, typer.Option("--dev", help="Loopback only, user testUser/testUser.")] = False,
+    tls_cert: Annotated[Path | None, typer.Option(help="Serve HTTPS with this certificate.")] = None,
+    tls_key: Annotated[Path | None, typer.Option(help="The certificate's key.")] = None,
+    allow_origin: Annotated[
+        list[str] | None, typer.Option(help="Let pages of this origin use the server; may be repeated.")
+    ] = None,
+    robot_grace: Annotated[
+        float, typer.Option(help="Seconds that a robot's interfaces outlive its connection.")
+    ] = _DEFAULTS.robot_grace,
+    container_grace: Annotated[
+        float, typer.Option(help="Seconds until the containers of a machine that is away are moved.")
+    ] = _DEFAULTS.container_grace,
+    log_level: Annotated[str, typer.Option(help="debug, info, warning or error.")] = "info",
+) -> None:
+    """Run the Master Task Set: HTTP for clients on 9000, control of task sets on 8080."""
+    logging.basicConfig(level=log_level.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    given = {} if state_dir is None else {"state_dir": state_dir}
+    settings = MasterSettings(
+        bind=bind or (LOOPBACK if dev else EVERYWHERE),
+        http_port=http_port,
+        control_port=control_port,
+        dev=dev,
+        tls_cert=tls_cert,
+        tls_key=tls_key,
+        allowed_origins=tuple(allow_origin or ()),
+        state=StateSettings(robot_grace=robot_grace, container_grace=container_grace),
+        **given,
+    )
+    faults: tuple[BaseException, ...] = ()
+    try:
+        secret = load_secret(secret_file, dev=dev)
+        with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+            runner.run(_run(settings, secret))
+    except* (MasterError, ConfigError, SecretError, RunDirError) as group:
+        faults = group.exceptions
+    for fault in faults:
+        typer.echo(f"rce-master: {fault}", err=True)
+    if faults:
+        raise typer.Exit(1)
+
+
+async def _run(settings: MasterSettings, secret: Secret) -> None:
+    """Run until SIGINT or SIGTERM."""
+    task = asyncio.current_task()
+    assert task is not None
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, task.cancel)
+    store = await SqliteStore.open(settings.state_dir)
+    try:
+        with contextlib.suppress(asyncio.CancelledError):
+            await Master(settings, secret, store).run(_announce)
+    finally:
+        await store.close()
+
+
+def _announce(master: RunningMaster) -> None:
+    typer.echo(f"rce-master ready: {master.url}")
+
+
+def main() -> None:
+    """Run the program."""
+    app(prog_name="rce-master")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,137 @@
+"""Where robots' logins and requests arrive and are answered."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING
+
+from rce.control.messages import ClientReply, ClientRequest, Left, Login, LoginReply, Status
+from rce.control.model import EndpointState
+from rce_master import requests
+from rce_master.exceptions import MasterError, Refused, TooManyFailures, WrongCredentials
+from rce_master.state import commands
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine
+
+    from rce.control.messages import Hello, ToMaster
+    from rce_master.auth import Authenticator
+    from rce_master.realm import Outcome, Realm
+    from rce_master.reconciler import Peer, Reconciler
+
+logger = logging.getLogger(__name__)
+
+MAX_PENDING = 1000
+"""Logins and requests in work at the same time; beyond it, the channels they come by wait."""
+
+_UNAUTHORIZED, _CONFLICT, _TOO_MANY, _UNAVAILABLE = 401, 409, 429, 503
+
+
+class Desk:
+    """Takes what task sets send: reports go on to the reconciler, questions are answered here.
+
+    Reports and requests are taken in the order of arrival; answers wait for the store without holding up what
+    comes after them.
+    """
+
+    def __init__(self, realm: Realm, reconciler: Reconciler, authenticator: Authenticator) -> None:
+        self._realm = realm
+        self._reconciler = reconciler
+        self._authenticator = authenticator
+        self._pending = asyncio.Semaphore(MAX_PENDING)
+        self._group = asyncio.TaskGroup()
+        self._entering: dict[tuple[str, str], bool] = {}
+        """Process and robot of logins in work, and whether the robot left meanwhile."""
+
+    async def run(self) -> None:
+        """Answer until cancelled."""
+        async with self._group:
+            await asyncio.Event().wait()
+
+    async def on_hello(self, peer: Peer, hello: Hello) -> None:
+        """Take a task set that connected."""
+        await self._reconciler.on_hello(peer, hello)
+
+    async def on_gone(self, peer: Peer) -> None:
+        """Note that a task set's channel ended."""
+        await self._reconciler.on_gone(peer)
+
+    async def on_message(self, peer: Peer, message: ToMaster) -> None:
+        """Take a message of a task set."""
+        process = peer.process
+        match message:
+            case Login():
+                await self._spawn(self._login(peer, message))
+            case ClientRequest():
+                await self._request(peer, message)
+            case _:
+                self._note_leaving(process, message)
+                await self._reconciler.on_message(process, message)
+
+    async def _spawn(self, work: Coroutine[None, None, None]) -> None:
+        await self._pending.acquire()
+        self._group.create_task(work).add_done_callback(lambda _: self._pending.release())
+
+    # Logins
+
+    async def _login(self, peer: Peer, login: Login) -> None:
+        process = peer.process
+        id_ = f"{login.user}/{login.robot}"
+        self._entering[process, id_] = False
+        try:
+            reply = await self._answer_login(process, id_, login)
+        finally:
+            left = self._entering.pop((process, id_))
+        peer.send(reply)
+        if left and reply.endpoint is not None:
+            await self._realm.enqueue(
+                [commands.RobotLeft(process=process, id=id_, reason="left at the door")]
+            )
+
+    async def _answer_login(self, process: str, id_: str, login: Login) -> LoginReply:
+        try:
+            await self._authenticator.verify(login.user, login.password)
+            await self._realm.submit(commands.RobotLogin(process=process, id=id_))
+            return LoginReply(request=login.request, endpoint=self._realm.spec(id_))
+        except WrongCredentials as error:
+            status, reason = _UNAUTHORIZED, str(error)
+        except TooManyFailures as error:
+            status, reason = _TOO_MANY, str(error)
+        except Refused as error:
+            status, reason = _CONFLICT, str(error)
+        except MasterError as error:
+            status, reason = _UNAVAILABLE, str(error)
+        except KeyError:
+            status, reason = _UNAVAILABLE, "the robot was removed while it logged in"
+        return LoginReply(request=login.request, status=status, reason=reason)
+
+    def _note_leaving(self, process: str, message: ToMaster) -> None:
+        """A robot may go before its login is done; its session must not stay connected for ever then."""
+        match message:
+            case Left():
+                id_ = message.id
+            case Status() if message.status.state is EndpointState.ABSENT:
+                id_ = message.status.id
+            case _:
+                return
+        if (process, id_) in self._entering:
+            self._entering[process, id_] = True
+
+    # Requests
+
+    async def _request(self, peer: Peer, request: ClientRequest) -> None:
+        user = request.id.partition("/")[0]
+        if self._realm.tables.robot(request.id) is None:
+            error = f"robot {request.id!r} is not known any more; connect again"
+            peer.send(ClientReply(request=request.request, errors=(error,)))
+            return
+        wanted, faults = requests.read(user, request.type, request.data)
+        outcomes = await self._realm.enqueue(wanted)
+        await self._spawn(self._answer(peer, request, outcomes, faults))
+
+    async def _answer(
+        self, peer: Peer, request: ClientRequest, outcomes: asyncio.Future[list[Outcome]], faults: list[str]
+    ) -> None:
+        errors = [f"{request.type}: {error}" for error in await outcomes if error is not None]
+        peer.send(ClientReply(request=request.request, errors=(*faults, *errors)))

@@ -1,0 +1,1 @@
+"""The master's HTTP server: the clients' entry, REST API, events and metrics."""

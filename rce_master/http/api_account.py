@@ -1,0 +1,90 @@
+"""REST: tokens and users."""
+
+from __future__ import annotations
+
+from rce_master.auth import Authenticator, client_digest, token_digest
+from rce_master.exceptions import Forbidden, NotFound
+from rce_master.http import models
+from rce_master.http.routes import Call, RouteTable
+from rce_master.http.views import Views
+from rce_master.state import commands
+from rce_master.state.records import User, UserRole
+
+routes = RouteTable("account")
+
+
+@routes.route("POST", "/login", "Get a bearer token", body=models.LoginIn, reply=models.TokenOut, open=True)
+async def log_in(call: Call) -> models.TokenOut:
+    """Check a password and make a token."""
+    body = call.read(models.LoginIn)
+    services = call.services
+    user = await services.authenticator.verify(body.userID, client_digest(body.password))
+    token, record = Authenticator.new_token(user.name, body.label, services.clock())
+    await services.realm.submit(commands.AddToken(token=record))
+    return models.TokenOut(token=token, userID=user.name, role=user.role.value, expires=record.expires)
+
+
+@routes.route("DELETE", "/login", "Forget the token that this request carries", status=204)
+async def log_out(call: Call) -> None:
+    """Forget the token."""
+    await call.services.realm.submit(commands.RemoveToken(digest=token_digest(call.token)))
+
+
+@routes.route("GET", "/user", "Show who you are", reply=models.UserOut)
+async def show_caller(call: Call) -> models.UserOut:
+    """Show the caller."""
+    return _views(call).user(call.caller)
+
+
+@routes.route("GET", "/users", "List all users", reply=models.UsersOut, admin=True)
+async def list_users(call: Call) -> models.UsersOut:
+    """List all users."""
+    views = _views(call)
+    return models.UsersOut(users=[views.user(user) for user in call.services.realm.tables.users])
+
+
+@routes.route(
+    "POST", "/users", "Make a user", body=models.UserIn, reply=models.UserOut, status=201, admin=True
+)
+async def add_user(call: Call) -> models.UserOut:
+    """Make a user."""
+    body = call.read(models.UserIn)
+    services = call.services
+    user = User(
+        name=body.name,
+        role=UserRole(body.role),
+        password=await services.authenticator.hash(client_digest(body.password)),
+        created=services.clock(),
+    )
+    await services.realm.submit(commands.AddUser(user=user))
+    return _views(call).user(user)
+
+
+@routes.route("DELETE", "/users/{name}", "Remove a user with all that is theirs", status=204, admin=True)
+async def remove_user(call: Call) -> None:
+    """Remove a user."""
+    await call.services.realm.submit(commands.RemoveUser(name=call.path("name")))
+
+
+@routes.route(
+    "PUT",
+    "/users/{name}/password",
+    "Change a password (your own, or anybody's as administrator); ends the user's tokens",
+    body=models.PasswordIn,
+    status=204,
+)
+async def set_password(call: Call) -> None:
+    """Change a password."""
+    name = call.path("name")
+    services = call.services
+    if name != call.caller.name and not call.is_admin:
+        raise Forbidden("only an administrator changes somebody else's password")
+    if name not in services.realm.tables.users:
+        raise NotFound(f"there is no user {name!r}")
+    digest = client_digest(call.read(models.PasswordIn).password)
+    hashed = await services.authenticator.hash(digest)
+    await services.realm.submit(commands.SetPassword(name=name, password=hashed))
+
+
+def _views(call: Call) -> Views:
+    return Views(call.services.realm.tables, call.services.reconciler.usage)

@@ -1,0 +1,102 @@
+"""REST: logs of nodes, and the stream of events."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import msgspec
+from aiohttp import web
+
+from rce_master.exceptions import Invalid
+from rce_master.http import models
+from rce_master.http.routes import OF_USER, Call, Query, RouteTable
+
+if TYPE_CHECKING:
+    from rce_master.events import Event
+
+routes = RouteTable("stream")
+
+MAX_LOG = 1 << 20
+HEARTBEAT_S = 15.0
+
+_LOG_QUERY = (
+    OF_USER,
+    Query(name="offset", description="First byte; negative: that many before the end.", type="integer"),
+    Query(name="limit", description=f"At most so many bytes, up to {MAX_LOG}.", type="integer"),
+)
+
+
+@routes.route(
+    "GET",
+    "/containers/{container}/nodes/{node}/log",
+    "Read a node's log; to follow it, read on from the offset that is given back",
+    reply=models.LogOut,
+    query=_LOG_QUERY,
+)
+async def read_node_log(call: Call) -> models.LogOut:
+    """Read a node's log."""
+    return await _read_log(call, call.path("node"))
+
+
+@routes.route(
+    "GET",
+    "/containers/{container}/log",
+    "Read the log of a container's environment",
+    reply=models.LogOut,
+    query=_LOG_QUERY,
+)
+async def read_container_log(call: Call) -> models.LogOut:
+    """Read the environment's log."""
+    return await _read_log(call, "")
+
+
+async def _read_log(call: Call, node: str) -> models.LogOut:
+    offset, limit = call.number("offset", 0), call.number("limit", 65536)
+    if not 0 < limit <= MAX_LOG:
+        raise Invalid(f"query parameter 'limit' must be 1 to {MAX_LOG}")
+    id_ = f"{call.owner}/{call.path('container')}"
+    chunk = await call.services.reconciler.read_log(id_, node, offset, limit)
+    return models.LogOut(text=chunk.text, offset=chunk.offset)
+
+
+@routes.route(
+    "GET",
+    "/events",
+    "Follow what happens, as server-sent events; Last-Event-ID resumes",
+    media="text/event-stream",
+    query=(
+        OF_USER,
+        Query(name="since", description="Id after which to begin; default: now.", type="integer"),
+    ),
+)
+async def stream_events(call: Call) -> web.StreamResponse:
+    """Stream events until the client or the server ends it."""
+    scope, last = call.scope, _start(call)
+    response = web.StreamResponse(
+        headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+    )
+    await response.prepare(call.request)
+    await response.write(b": hello\n\n")
+    events = call.services.events
+    try:
+        while True:
+            news = await events.wait(last, HEARTBEAT_S)
+            # A comment now and then keeps proxies from giving up, and finds out that a client is gone.
+            frames = [_frame(event) for event in news if scope is None or event.user == scope]
+            await response.write(b"".join(frames) or b":\n\n")
+            last = news[-1].id if news else last
+    except ConnectionResetError:
+        # The client went away: the only way in which a stream ends from its side.
+        return response
+
+
+def _start(call: Call) -> int:
+    resumed = call.request.headers.get("Last-Event-ID", "")
+    if resumed.isascii() and resumed.isdigit():
+        return int(resumed)
+    return call.number("since", call.services.events.last_id)
+
+
+def _frame(event: Event) -> bytes:
+    body = msgspec.json.encode(event)
+    return b"id: %d\nevent: %s\ndata: %s\n\n" % (event.id, event.kind.encode(), body)

@@ -1,0 +1,72 @@
+"""``GET /``: where a client of the robot protocol comes in."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from typing import TYPE_CHECKING
+
+from aiohttp import web
+
+from rce.control.messages import TaskSetKind
+from rce.protocol.exceptions import HandshakeError
+from rce.protocol.http import master_reply, read_master_request
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rce_master.state.records import TaskSet
+    from rce_master.state.tables import Tables
+
+EXPECTED_S = 5.0
+"""How long a robot that was sent somewhere counts there before it has logged in."""
+
+
+class Entry:
+    """Hands out the least loaded robot task set.
+
+    Clients that were sent to one a moment ago and have not logged in yet count as its load, else a fleet
+    that comes at once would go to the same one.
+
+    Args:
+        tables: The state's tables.
+        clock: Seconds that never go back.
+    """
+
+    def __init__(self, tables: Tables, clock: Callable[[], float]) -> None:
+        self._tables = tables
+        self._clock = clock
+        self._sent: deque[tuple[float, str]] = deque()
+
+    async def handle(self, request: web.Request) -> web.Response:
+        """Answer a client with the WebSocket URL that it is to use."""
+        try:
+            wanted = read_master_request(request.url.raw_query_string)
+        except HandshakeError as error:
+            return web.Response(status=error.status, text=f"{error.reason}\n")
+        task_set = self.choose()
+        if task_set is None:
+            return web.Response(
+                status=503, text="No robot process is free; try again later.\n", headers={"Retry-After": "1"}
+            )
+        return web.Response(
+            body=master_reply(wanted, task_set.url), content_type="application/json", charset="utf-8"
+        )
+
+    def choose(self) -> TaskSet | None:
+        """Choose the least loaded robot task set, and expect a robot there."""
+        now = self._clock()
+        while self._sent and self._sent[0][0] <= now - EXPECTED_S:
+            self._sent.popleft()
+        expected = Counter(process for _, process in self._sent)
+        there = [
+            s
+            for s in self._tables.task_sets
+            if s.kind is TaskSetKind.ROBOT and s.url and self._tables.is_connected(s.process)
+        ]
+        chosen = min(there, key=lambda s: (self._load(s) + expected[s.process], s.process), default=None)
+        if chosen is not None:
+            self._sent.append((now, chosen.process))
+        return chosen
+
+    def _load(self, task_set: TaskSet) -> int:
+        return self._tables.endpoints.count("task_set", task_set.process)

@@ -1,0 +1,187 @@
+"""A table of REST routes: each says what it takes and gives, so that server and document are made of one."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from rce_master.exceptions import Forbidden, Invalid, NotFound
+from rce_master.state.records import UserRole
+
+if TYPE_CHECKING:
+    from aiohttp import web
+    from aiohttp.web import StreamResponse
+
+    from rce_master.auth import Authenticator
+    from rce_master.events import EventLog
+    from rce_master.realm import Realm
+    from rce_master.reconciler import Reconciler
+    from rce_master.state.records import User
+
+M = TypeVar("M", bound=BaseModel)
+
+
+@dataclass(frozen=True, slots=True)
+class Services:
+    """What the handlers work with."""
+
+    realm: Realm
+    reconciler: Reconciler
+    authenticator: Authenticator
+    events: EventLog
+    clock: Callable[[], float]
+    """Seconds since 1970."""
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """One request of somebody who proved who they are."""
+
+    request: web.Request
+    services: Services
+    user: User | None
+    """None only on routes that are open to everybody."""
+    token: str
+    body: BaseModel | None
+
+    @property
+    def caller(self) -> User:
+        """Who asks."""
+        assert self.user is not None
+        return self.user
+
+    @property
+    def is_admin(self) -> bool:
+        """Whether an administrator asks."""
+        return self.user is not None and self.user.role is UserRole.ADMIN
+
+    @property
+    def owner(self) -> str:
+        """Whose robots and containers are meant: the caller's, or those of ``?user=`` for an administrator.
+
+        Raises:
+            Forbidden: Somebody else's are asked for.
+            NotFound: There is no such user.
+        """
+        name = self.request.query.get("user", self.caller.name)
+        if name != self.caller.name and not self.is_admin:
+            raise Forbidden("only an administrator sees what belongs to others")
+        if name not in self.services.realm.tables.users:
+            raise NotFound(f"there is no user {name!r}")
+        return name
+
+    @property
+    def scope(self) -> str | None:
+        """Whose things are to be listed; None: everybody's, which administrators get by default."""
+        return None if self.is_admin and "user" not in self.request.query else self.owner
+
+    def path(self, name: str) -> str:
+        """A part of the path."""
+        return self.request.match_info[name]
+
+    def query(self, name: str) -> str:
+        """A query parameter that must be there.
+
+        Raises:
+            Invalid: It is not.
+        """
+        try:
+            return self.request.query[name]
+        except KeyError:
+            raise Invalid(f"query parameter {name!r} is missing") from None
+
+    def number(self, name: str, default: int) -> int:
+        """A query parameter that is a whole number.
+
+        Raises:
+            Invalid: It is none.
+        """
+        text = self.request.query.get(name, str(default))
+        try:
+            return int(text)
+        except ValueError:
+            raise Invalid(f"query parameter {name!r} must be a whole number, not {text!r}") from None
+
+    def read(self, model: type[M]) -> M:
+        """The body, which the route declared to be of this model."""
+        assert isinstance(self.body, model)
+        return self.body
+
+
+Handler = Callable[[Call], Awaitable["BaseModel | StreamResponse | None"]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Query:
+    """A query parameter, for the document."""
+
+    name: str
+    description: str
+    required: bool = False
+    type: str = "string"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Route:
+    """A method of a path."""
+
+    method: str
+    path: str
+    """Below ``/api/v1``, with ``{name}`` for its parts."""
+    handler: Handler
+    summary: str
+    group: str
+    body: type[BaseModel] | None = None
+    reply: type[BaseModel] | None = None
+    """None: no content, unless ``media`` says that the handler streams something."""
+    media: str = "application/json"
+    status: int = 200
+    admin: bool = False
+    open: bool = False
+    """Whether it can be used without a token."""
+    query: tuple[Query, ...] = ()
+
+
+@dataclass(slots=True)
+class RouteTable:
+    """Routes of one group."""
+
+    group: str
+    routes: list[Route] = field(default_factory=list)
+
+    def __iter__(self) -> Iterator[Route]:
+        return iter(self.routes)
+
+    def route(self, method: str, path: str, summary: str, **options: Any) -> Callable[[Handler], Handler]:
+        """Decorate a handler."""
+
+        def add(handler: Handler) -> Handler:
+            self.routes.append(
+                Route(method=method, path=path, handler=handler, summary=summary, group=self.group, **options)
+            )
+            return handler
+
+        return add
+
+
+OF_USER = Query(name="user", description="Whose; administrators only. Default: own, in lists everybody's.")
+
+
+def read_body(model: type[BaseModel], text: bytes) -> BaseModel:
+    """Read a request's body.
+
+    Raises:
+        Invalid: It does not fit; the text names each fault with its path.
+    """
+    try:
+        return model.model_validate_json(text or b"{}")
+    except ValidationError as error:
+        faults = "; ".join(f"{_place(fault['loc'])}: {fault['msg']}" for fault in error.errors())
+        raise Invalid(faults) from None
+
+
+def _place(location: tuple[int | str, ...]) -> str:
+    return ".".join(map(str, location)) or "body"

@@ -1,0 +1,236 @@
+"""Puts the HTTP application together: routes, who may use them, and how errors look."""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import json
+import logging
+from typing import TYPE_CHECKING, Any
+
+from aiohttp import hdrs, web
+from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
+from yarl import URL
+
+from rce_master.exceptions import (
+    AuthError,
+    Forbidden,
+    MasterError,
+    Refused,
+    StoreError,
+    TaskSetAway,
+    TooManyFailures,
+    WrongCredentials,
+)
+from rce_master.http import api_account, api_control, api_read, api_stream
+from rce_master.http.entry import Entry
+from rce_master.http.metrics import make_registry
+from rce_master.http.openapi import PREFIX, build_document
+from rce_master.http.routes import Call, Route, Services, read_body
+from rce_master.state.records import UserRole
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterable
+    from ssl import SSLContext
+    from typing import Self
+
+    from rce_master.state.records import User
+
+    Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+logger = logging.getLogger(__name__)
+
+MAX_BODY = 1 << 20
+SHUTDOWN_S = 0.5
+
+ROUTES: list[Route] = [
+    *api_account.routes,
+    *api_read.routes,
+    *api_control.routes,
+    *api_stream.routes,
+]
+
+
+def make_app(services: Services, *, allowed_origins: Iterable[str] = ()) -> web.Application:
+    """Make the application.
+
+    Args:
+        services: What the handlers work with.
+        allowed_origins: Origins whose pages may use the server from a browser, such as
+            ``https://fleet.example.org``; pages of the server itself always may.
+    """
+    app = web.Application(
+        middlewares=[_origin_guard(frozenset(allowed_origins)), _errors], client_max_size=MAX_BODY
+    )
+    entry = Entry(services.realm.tables, asyncio.get_running_loop().time)
+    app.router.add_get("/", entry.handle)
+    app.router.add_get("/healthz", _health(services))
+    app.router.add_get("/metrics", _metrics(services))
+    app.router.add_get(f"{PREFIX}/openapi.json", _document())
+    for route in ROUTES:
+        app.router.add_route(route.method, PREFIX + route.path, _adapt(route, services))
+    return app
+
+
+class HttpServer:
+    """Serves an application. Use it as an asynchronous context manager.
+
+    Attributes:
+        url: Where it listens, once it does.
+    """
+
+    def __init__(self, app: web.Application, host: str, port: int, ssl: SSLContext | None = None) -> None:
+        self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=SHUTDOWN_S)
+        self._host = host
+        self._port = port
+        self._ssl = ssl
+        self.url = ""
+
+    async def __aenter__(self) -> Self:
+        await self._runner.setup()
+        try:
+            await web.TCPSite(self._runner, self._host, self._port, ssl_context=self._ssl).start()
+        except BaseException:
+            await self._runner.cleanup()
+            raise
+        port = self._runner.addresses[0][1]
+        host = "127.0.0.1" if self._host in ("", "0.0.0.0", "::") else self._host  # noqa: S104 - compared, not bound
+        self.url = str(URL.build(scheme="https" if self._ssl else "http", host=host, port=port, path="/"))
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._runner.cleanup()
+
+
+# Routes
+
+
+def _adapt(route: Route, services: Services) -> Handler:
+    async def handle(request: web.Request) -> web.StreamResponse:
+        token, user = _bearer(request, services)
+        if user is None and not route.open:
+            raise WrongCredentials("a bearer token is needed; get one at /api/v1/login")
+        if route.admin and (user is None or user.role is not UserRole.ADMIN):
+            raise Forbidden("only an administrator may do this")
+        body = read_body(route.body, await request.read()) if route.body else None
+        reply = await route.handler(Call(request, services, user, token, body))
+        if isinstance(reply, web.StreamResponse):
+            return reply
+        if reply is None:
+            return web.Response(status=route.status)
+        return web.Response(
+            body=reply.model_dump_json().encode(), status=route.status, content_type="application/json"
+        )
+
+    return handle
+
+
+def _bearer(request: web.Request, services: Services) -> tuple[str, User | None]:
+    kind, _, token = request.headers.get(hdrs.AUTHORIZATION, "").partition(" ")
+    if kind.lower() != "bearer" or not token:
+        return "", None
+    return token, services.authenticator.bearer(token.strip(), services.clock())
+
+
+def _health(services: Services) -> Handler:
+    async def handle(_: web.Request) -> web.Response:
+        tables = services.realm.tables
+        connected = sum(tables.is_connected(task_set.process) for task_set in tables.task_sets)
+        return web.json_response({"status": "ok", "task_sets": connected})
+
+    return handle
+
+
+def _metrics(services: Services) -> Handler:
+    registry = make_registry(services.realm.tables, services.reconciler.usage)
+
+    async def handle(request: web.Request) -> web.Response:
+        # The labels name everybody's robots and containers.
+        if not _is_local(request):
+            _, user = _bearer(request, services)
+            if user is None or user.role is not UserRole.ADMIN:
+                raise Forbidden(
+                    "metrics are for administrators (bearer token) and for programs on this machine"
+                )
+        return web.Response(body=generate_latest(registry), headers={"Content-Type": CONTENT_TYPE_LATEST})
+
+    return handle
+
+
+def _is_local(request: web.Request) -> bool:
+    if "X-Forwarded-For" in request.headers or "Forwarded" in request.headers:
+        return False
+    peer = request.transport.get_extra_info("peername") if request.transport else None
+    return peer is not None and ipaddress.ip_address(peer[0].partition("%")[0]).is_loopback
+
+
+def _document() -> Handler:
+    text = json.dumps(build_document(ROUTES))
+
+    async def handle(_: web.Request) -> web.Response:
+        return web.Response(text=text, content_type="application/json")
+
+    return handle
+
+
+# What applies to all
+
+
+def _origin_guard(allowed: frozenset[str]) -> Any:
+    @web.middleware
+    async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Refuse pages of other sites: a browser would send them with the user's network position."""
+        origin = request.headers.get(hdrs.ORIGIN)
+        if origin is not None and origin not in allowed and not _is_same_site(origin, request):
+            return _error(403, f"origin {origin} may not use this server")
+        response = await handler(request)
+        if origin in allowed and not response.prepared:
+            response.headers[hdrs.ACCESS_CONTROL_ALLOW_ORIGIN] = str(origin)
+        return response
+
+    return guard
+
+
+def _is_same_site(origin: str, request: web.Request) -> bool:
+    try:
+        return URL(origin).authority == request.headers.get(hdrs.HOST, "")
+    except ValueError:
+        return False
+
+
+@web.middleware
+async def _errors(request: web.Request, handler: Handler) -> web.StreamResponse:
+    try:
+        return await handler(request)
+    except MasterError as error:
+        return _error(_status(error), str(error), _headers(error))
+    except web.HTTPException as error:
+        return _error(error.status, error.reason, {k: v for k, v in error.headers.items() if k == hdrs.ALLOW})
+
+
+def _status(error: MasterError) -> int:
+    match error:
+        case Refused():
+            return error.status
+        case TooManyFailures():
+            return 429
+        case AuthError():
+            return 401
+        case StoreError() | TaskSetAway():
+            return 503
+        case _:
+            return 500
+
+
+def _headers(error: MasterError) -> dict[str, str]:
+    match error:
+        case TooManyFailures():
+            return {hdrs.RETRY_AFTER: f"{error.retry_after:.0f}"}
+        case AuthError():
+            return {hdrs.WWW_AUTHENTICATE: "Bearer"}
+        case _:
+            return {}
+
+
+def _error(status: int, text: str, headers: dict[str, str] | None = None) -> web.Response:
+    return web.json_response({"error": text}, status=status, headers=headers)

@@ -1,0 +1,172 @@
+"""Makes what the API gives of the state's tables."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rce.control.model import EndpointUsage, InterfaceUsage, NodeStatus
+from rce_master.http import models
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rce.control.messages import Usage
+    from rce_master.state.records import Container, Endpoint, Link, Robot, TaskSet, User
+    from rce_master.state.tables import Tables
+
+_NO_USAGE = EndpointUsage()
+_NO_INTERFACE_USAGE = InterfaceUsage()
+
+
+class Views:
+    """Shows users, robots, containers and what belongs to them.
+
+    Args:
+        tables: The state's tables.
+        usage: What each task set last told of what it consumes.
+    """
+
+    def __init__(self, tables: Tables, usage: Mapping[str, Usage]) -> None:
+        self._tables = tables
+        self._usage = usage
+
+    def user(self, user: User) -> models.UserOut:
+        """Show a user."""
+        return models.UserOut(
+            name=user.name,
+            role=user.role.value,
+            created=user.created,
+            robots=len(self._tables.robots(user.name)),
+            containers=len(self._tables.containers(user.name)),
+        )
+
+    def robot(self, robot: Robot) -> models.RobotOut:
+        """Show a robot."""
+        return models.RobotOut(
+            id=robot.id,
+            user=robot.user,
+            tag=robot.tag,
+            state=self._tables.robot_live(robot.id).session.value,
+            task_set=robot.task_set,
+            revision=robot.revision,
+            interfaces=len(robot.interfaces),
+        )
+
+    def container(self, container: Container) -> models.ContainerOut:
+        """Show a container."""
+        live = self._tables.container_live(container.id)
+        task_set = self._tables.task_sets.get(container.task_set)
+        usage = self.usage_of(container)
+        return models.ContainerOut(
+            id=container.id,
+            user=container.user,
+            tag=container.tag,
+            state=live.phase.value,
+            detail=live.status.detail if live.status else "",
+            task_set=container.task_set,
+            machine=task_set.machine.name if task_set else "",
+            revision=container.revision,
+            incarnation=live.status.incarnation if live.status else "",
+            nodes=len(container.nodes),
+            interfaces=len(container.interfaces),
+            cpu_s=usage.cpu_s,
+            memory=usage.memory,
+        )
+
+    def nodes(self, container: Container) -> list[models.NodeOut]:
+        """Show the nodes of a container."""
+        status = self._tables.container_live(container.id).status
+        reported = {node.tag: node for node in status.nodes} if status else {}
+        return [self._node(container, tag, reported.get(tag)) for tag in container.nodes]
+
+    def _node(self, container: Container, tag: str, status: NodeStatus | None) -> models.NodeOut:
+        node = container.nodes[tag]
+        return models.NodeOut(
+            user=container.user,
+            container=container.tag,
+            tag=tag,
+            pkg=node.pkg,
+            exe=node.exe,
+            args=node.args,
+            name=node.name,
+            namespace=node.namespace,
+            state=status.state.value if status else "unknown",
+            pid=status.pid if status else 0,
+            exit_code=status.exit_code if status else None,
+            detail=status.detail if status else "",
+        )
+
+    def parameters(self, container: Container) -> list[models.ParameterOut]:
+        """Show the parameters of a container."""
+        return [
+            models.ParameterOut(user=container.user, container=container.tag, name=name, value=value)
+            for name, value in container.parameters.items()
+        ]
+
+    def interfaces(self, endpoint: Endpoint) -> list[models.InterfaceOut]:
+        """Show the interfaces of a robot or container."""
+        status = self._tables.live[endpoint.id].status
+        active = status.interfaces if status else {}
+        usage = self.usage_of(endpoint).interfaces
+        return [
+            models.InterfaceOut(
+                user=endpoint.user,
+                endpoint=endpoint.tag,
+                tag=tag,
+                type=interface.type,
+                cls=interface.cls,
+                addr=interface.addr,
+                active=active.get(tag, False),
+                **_counters(usage.get(tag, _NO_INTERFACE_USAGE)),
+            )
+            for tag, interface in endpoint.interfaces.items()
+        ]
+
+    def connections(self, link: Link) -> list[models.ConnectionOut]:
+        """Show the connections of a link."""
+        user, _, tag_a = link.a.partition("/")
+        tag_b = link.b.partition("/")[2]
+        open_ = self._open(link.a) & self._open(link.b)
+        return [
+            models.ConnectionOut(
+                id=c.id,
+                user=user,
+                tag_a=f"{tag_a}/{c.interface_a}",
+                tag_b=f"{tag_b}/{c.interface_b}",
+                established=c.id in open_,
+            )
+            for c in link.connections.values()
+        ]
+
+    def machine(self, task_set: TaskSet) -> models.MachineOut:
+        """Show a task set."""
+        usage = self._usage.get(task_set.process)
+        machine = task_set.machine
+        return models.MachineOut(
+            process=task_set.process,
+            kind=task_set.kind.value,
+            machine=machine.name,
+            connected=self._tables.is_connected(task_set.process),
+            endpoints=self._tables.endpoints.count("task_set", task_set.process),
+            cores=machine.cores,
+            memory=machine.memory,
+            runtime=machine.runtime,
+            labels=list(machine.labels),
+            detail=machine.detail,
+            url=task_set.url,
+            cpu_s=usage.cpu_s if usage else 0.0,
+            memory_used=usage.memory if usage else 0,
+        )
+
+    def usage_of(self, endpoint: Endpoint) -> EndpointUsage:
+        """Tell what an endpoint consumes."""
+        usage = self._usage.get(endpoint.task_set)
+        return usage.endpoints.get(endpoint.id, _NO_USAGE) if usage else _NO_USAGE
+
+    def _open(self, endpoint: str) -> set[int]:
+        status = self._tables.live[endpoint].status
+        return set(status.connections) if status else set()
+
+
+def _counters(usage: InterfaceUsage) -> dict[str, int]:
+    return {name: getattr(usage, name) for name in usage.__struct_fields__}

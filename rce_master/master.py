@@ -1,0 +1,152 @@
+"""The Master Task Set, put together from its parts."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rce.control.server import ControlServer
+from rce_master.auth import Authenticator, client_digest
+from rce_master.desk import Desk
+from rce_master.events import EventLog
+from rce_master.exceptions import MasterError
+from rce_master.http.routes import Services
+from rce_master.http.server import HttpServer, make_app
+from rce_master.realm import Realm
+from rce_master.reconciler import Reconciler
+from rce_master.state import commands
+from rce_master.state.records import User, UserRole
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from argon2 import PasswordHasher
+
+    from rce.config.secret import Secret
+    from rce_master.settings import MasterSettings
+    from rce_master.state.changes import Changes
+    from rce_master.store import Store
+
+logger = logging.getLogger(__name__)
+
+TICK_S = 0.5
+DEV_USER = "testUser"
+
+
+@dataclass(frozen=True, slots=True)
+class RunningMaster:
+    """What a running master can be reached by."""
+
+    url: str
+    """Of the HTTP server."""
+    control_port: int
+    realm: Realm
+
+
+class Master:
+    """Runs a master on a store.
+
+    Args:
+        settings: What was set.
+        secret: What task sets prove to have.
+        store: Where the desired state is kept; stays open, whoever opened it closes it.
+        hasher: How passwords are hashed.
+    """
+
+    def __init__(
+        self,
+        settings: MasterSettings,
+        secret: Secret,
+        store: Store,
+        *,
+        hasher: PasswordHasher | None = None,
+    ) -> None:
+        self._settings = settings
+        self._secret = secret
+        self._store = store
+        self._hasher = hasher
+
+    async def run(self, on_ready: Callable[[RunningMaster], None]) -> None:
+        """Run until cancelled.
+
+        Args:
+            on_ready: Called once everything listens.
+
+        Raises:
+            StoreError: The store cannot be read.
+            MasterError: A port or a certificate cannot be used.
+        """
+        realm = await Realm.open(self._store, self._settings.state)
+        events = EventLog(time.time())
+        realm.listeners.append(lambda changes: _log_events(events, changes))
+        reconciler = Reconciler(realm)
+        authenticator = Authenticator(realm.tables, hasher=self._hasher)
+        desk = Desk(realm, reconciler, authenticator)
+        services = Services(realm, reconciler, authenticator, events, time.time)
+        try:
+            async with asyncio.TaskGroup() as group:
+                workers = [group.create_task(work) for work in (realm.run(), desk.run(), _tick(realm))]
+                try:
+                    await self._serve(services, desk, on_ready)
+                finally:
+                    # Only now: task sets that leave while the servers close still need the realm.
+                    for worker in workers:
+                        worker.cancel()
+        finally:
+            authenticator.close()
+
+    async def _serve(self, services: Services, desk: Desk, on_ready: Callable[[RunningMaster], None]) -> None:
+        settings = self._settings
+        if settings.dev:
+            await make_dev_user(services)
+        app = make_app(services, allowed_origins=settings.allowed_origins)
+        control = ControlServer(
+            self._secret,
+            on_hello=desk.on_hello,
+            on_message=desk.on_message,
+            on_gone=desk.on_gone,
+            master="rce-master",
+            host=settings.bind,
+            port=settings.control_port,
+        )
+        http = HttpServer(app, settings.bind, settings.http_port, settings.ssl_context())
+        async with AsyncExitStack() as stack:
+            try:
+                await stack.enter_async_context(control)
+                await stack.enter_async_context(http)
+            except OSError as error:
+                raise MasterError(f"cannot listen: {error}") from error
+            on_ready(RunningMaster(http.url, control.port, services.realm))
+            await asyncio.Event().wait()
+
+
+async def make_dev_user(services: Services) -> None:
+    """Make the user of development mode, if it is not there."""
+    if DEV_USER in services.realm.tables.users:
+        return
+    user = User(
+        name=DEV_USER,
+        role=UserRole.ADMIN,
+        password=await services.authenticator.hash(client_digest(DEV_USER)),
+        created=services.clock(),
+    )
+    await services.realm.submit(commands.AddUser(user=user))
+
+
+async def _tick(realm: Realm) -> None:
+    while True:
+        await asyncio.sleep(TICK_S)
+        (outcome,) = await realm.submit_all([commands.Tick()])
+        if outcome is not None:
+            logger.error("grace times were not looked at: %s", outcome)
+
+
+def _log_events(events: EventLog, changes: Changes) -> None:
+    now = time.time()
+    for happening in changes.happenings:
+        events.add(happening, now)
+        logger.info("%s %s %s", happening.kind, happening.subject, happening.text)

@@ -1,0 +1,163 @@
+"""The realm: takes commands one after the other, keeps what they change, and tells who has to act on it."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from rce_master.exceptions import MasterError, Refused, StoreError
+from rce_master.state.core import State
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from rce.control.model import EndpointSpec
+    from rce_master.state.changes import Changes
+    from rce_master.state.commands import Command
+    from rce_master.state.settings import StateSettings
+    from rce_master.state.tables import Tables
+    from rce_master.store import Store
+
+logger = logging.getLogger(__name__)
+
+MAX_WAITING = 10_000
+MAX_BATCH = 256
+
+Outcome = MasterError | None
+"""What became of a command: None if it was done, else why not."""
+
+
+@dataclass(slots=True)
+class _Job:
+    commands: Sequence[Command]
+    done: asyncio.Future[list[Outcome]]
+    outcomes: list[Outcome] = field(default_factory=list)
+
+
+class Realm:
+    """Owns the state. Every change goes core -> store -> listeners, in this order.
+
+    Commands that wait at the same time are stored in one transaction, so that a storm of logins costs one
+    sync of the disk and not hundreds.
+
+    Args:
+        state: The state.
+        store: Keeps what must survive.
+        clock: Seconds that never go back.
+
+    Attributes:
+        listeners: Called with the changes of each command after they were stored; must not block or raise.
+    """
+
+    def __init__(self, state: State, store: Store, clock: Callable[[], float] = time.monotonic) -> None:
+        self.state = state
+        self.listeners: list[Callable[[Changes], None]] = []
+        self._store = store
+        self._clock = clock
+        self._jobs: asyncio.Queue[_Job] = asyncio.Queue(MAX_WAITING)
+
+    @classmethod
+    async def open(
+        cls,
+        store: Store,
+        settings: StateSettings | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> Realm:
+        """Go on from what a store holds.
+
+        Raises:
+            StoreError: It cannot be read.
+        """
+        return cls(State.load(await store.load(), clock(), settings), store, clock)
+
+    @property
+    def tables(self) -> Tables:
+        """The state's tables, to read from."""
+        return self.state.tables
+
+    def spec(self, endpoint: str) -> EndpointSpec:
+        """Tell what is desired of an endpoint.
+
+        Raises:
+            KeyError: There is no such endpoint.
+        """
+        return self.state.spec(endpoint)
+
+    async def submit(self, command: Command) -> None:
+        """Do a command; returns when it is stored and everybody was told.
+
+        Raises:
+            Refused: It cannot be done; nothing changed.
+            StoreError: It cannot be stored; nothing changed.
+        """
+        (outcome,) = await self.submit_all([command])
+        if outcome is not None:
+            raise outcome
+
+    async def submit_all(self, commands: Sequence[Command]) -> list[Outcome]:
+        """Do commands one after the other; one that is refused does not keep the others from being done.
+
+        Returns:
+            What became of each.
+        """
+        return await (await self.enqueue(commands))
+
+    async def enqueue(self, commands: Sequence[Command]) -> asyncio.Future[list[Outcome]]:
+        """Take commands, in the order of the calls; waits only while too many are waiting already.
+
+        Returns:
+            What becomes of each, once they are done.
+        """
+        job = _Job(commands, asyncio.get_running_loop().create_future())
+        await self._jobs.put(job)
+        return job.done
+
+    async def run(self) -> None:
+        """Work until cancelled."""
+        while True:
+            jobs = [await self._jobs.get()]
+            while len(jobs) < MAX_BATCH and not self._jobs.empty():
+                jobs.append(self._jobs.get_nowait())
+            await self._work(jobs)
+
+    async def _work(self, jobs: list[_Job]) -> None:
+        done: list[Changes] = []
+        for job in jobs:
+            job.outcomes = [self._apply(command, done) for command in job.commands]
+        # Of a key that several commands wrote, every row holds the newest record.
+        rows = [row for changes in done for row in changes.rows()]
+        try:
+            if rows:
+                await self._store.save(rows)
+        except BaseException as error:
+            for changes in reversed(done):
+                changes.revert()
+            if not isinstance(error, StoreError):
+                raise
+            logger.error("%s", error)  # noqa: TRY400 - the text says it all
+            self._answer(jobs, error)
+            return
+        for changes in done:
+            for listener in self.listeners:
+                listener(changes)
+        self._answer(jobs, None)
+
+    def _apply(self, command: Command, done: list[Changes]) -> Outcome:
+        try:
+            done.append(self.state.apply(command, self._clock()))
+        except Refused as error:
+            return error
+        except Exception as error:
+            # A fault of ours in one command must not take the whole cloud down; nothing of it was applied.
+            logger.exception("could not apply %r", command)
+            return MasterError(f"internal error: {error!r}")
+        return None
+
+    @staticmethod
+    def _answer(jobs: list[_Job], error: StoreError | None) -> None:
+        for job in jobs:
+            if not job.done.done():
+                job.done.set_result([outcome or error for outcome in job.outcomes])

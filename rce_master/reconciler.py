@@ -1,0 +1,166 @@
+"""Makes the task sets do what is desired, and the state know what they report."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Protocol
+
+from rce.control.exceptions import ControlError
+from rce.control.messages import (
+    Drop,
+    Fault,
+    Gone,
+    Hello,
+    Left,
+    LogChunk,
+    Notify,
+    Put,
+    Status,
+    Sync,
+    ToMaster,
+    ToTaskSet,
+    Usage,
+)
+from rce_master.exceptions import NotFound, TaskSetAway
+from rce_master.state import commands
+from rce_master.state.lifecycle import RobotSession
+
+if TYPE_CHECKING:
+    from rce_master.realm import Realm
+    from rce_master.state.changes import Changes, Notice
+
+logger = logging.getLogger(__name__)
+
+
+class Peer(Protocol):
+    """A connected task set; in a running master an :class:`rce.control.peer.Peer`."""
+
+    @property
+    def process(self) -> str:
+        """Its name."""
+
+    def send(self, message: ToTaskSet) -> None:
+        """Send a message; one that does not get through is made up for by the next ``Sync``."""
+
+    async def read_log(self, id: str, node: str, offset: int = 0, limit: int = 65536) -> LogChunk:  # noqa: A002
+        """Read a node's log."""
+
+
+class Reconciler:
+    """Sends every change to the task sets that it concerns.
+
+    Changes of one endpoint are never added up: its whole spec goes out, with a new revision, to where it is
+    placed. Listens to the realm, so nothing goes out that is not stored.
+
+    Attributes:
+        usage: What each connected task set last told of what it consumes.
+    """
+
+    def __init__(self, realm: Realm) -> None:
+        self.usage: dict[str, Usage] = {}
+        self._realm = realm
+        self._peers: dict[str, Peer] = {}
+        self._arriving: dict[str, Peer] = {}
+        realm.listeners.append(self.on_changes)
+
+    # From the task sets
+
+    async def on_hello(self, peer: Peer, hello: Hello) -> None:
+        """Take a task set that just connected: adopt what runs there and tell it what is desired.
+
+        Raises:
+            StoreError: It cannot be stored; the task set is not taken.
+        """
+        self._arriving[peer.process] = peer
+        try:
+            await self._realm.submit(commands.TaskSetArrived(hello=hello))
+        finally:
+            self._arriving.pop(peer.process, None)
+
+    async def on_message(self, process: str, message: ToMaster) -> None:
+        """Note a report. It is done in the order of arrival, though not yet when this returns."""
+        command: commands.Command
+        match message:
+            case Status():
+                command = commands.StatusReported(process=process, status=message.status)
+            case Gone():
+                command = commands.EndpointGone(process=process, id=message.id)
+            case Fault():
+                command = commands.FaultReported(id=message.id, text=message.text, robot=message.robot)
+            case Left():
+                command = commands.RobotLeft(process=process, id=message.id, reason=message.reason)
+            case Usage():
+                self.usage[process] = message
+                return
+            case _:
+                logger.warning("%s sent a %s, which means nothing here", process, type(message).__name__)
+                return
+        await self._realm.enqueue([command])
+
+    async def on_gone(self, peer: Peer) -> None:
+        """Note that a task set's channel ended."""
+        if self._peers.get(peer.process) is peer:
+            del self._peers[peer.process]
+            self.usage.pop(peer.process, None)
+            await self._realm.submit(commands.TaskSetLeft(process=peer.process))
+
+    async def read_log(self, id_: str, node: str, offset: int, limit: int) -> LogChunk:
+        """Read the log of a container's node where it is.
+
+        Raises:
+            NotFound: There is no such container or node.
+            TaskSetAway: Its task set is not connected or does not answer.
+        """
+        container = self._realm.tables.container(id_)
+        if container is None:
+            raise NotFound(f"there is no container {id_.partition('/')[2]!r}")
+        if node and node not in container.nodes:
+            raise NotFound(f"container {container.tag!r} has no node {node!r}")
+        peer = self._peers.get(container.task_set)
+        if peer is None:
+            raise TaskSetAway(f"container {container.tag!r} cannot be reached now")
+        try:
+            chunk = await peer.read_log(id_, node, offset=offset, limit=limit)
+        except ControlError as error:
+            raise TaskSetAway(f"container {container.tag!r} cannot be reached: {error}") from error
+        if chunk.error:
+            raise NotFound(chunk.error)
+        return chunk
+
+    # To the task sets
+
+    def on_changes(self, changes: Changes) -> None:
+        """Send what follows from a change."""
+        for withdrawal in changes.withdrawals:
+            message = Drop(id=withdrawal.id, revision=withdrawal.revision, reason=withdrawal.reason)
+            self._send(withdrawal.process, message)
+        for id_ in changes.touched:
+            endpoint = self._realm.tables.endpoints.get(id_)
+            if endpoint is not None and id_ != changes.answered:
+                self._send(endpoint.task_set, Put(endpoint=self._realm.spec(id_)))
+        if changes.arrived:
+            self._sync(changes.arrived)
+        for notice in changes.notices:
+            self._notify(notice)
+
+    def _sync(self, process: str) -> None:
+        peer = self._peers[process] = self._arriving[process]
+        placed = self._realm.tables.endpoints.by("task_set", process)
+        peer.send(Sync(endpoints=tuple(self._realm.spec(endpoint.id) for endpoint in placed)))
+
+    def _notify(self, notice: Notice) -> None:
+        tables = self._realm.tables
+        user, slash, _ = notice.to.partition("/")
+        robots = [tables.robot(notice.to)] if slash else tables.robots(user)
+        connected = (
+            robot.task_set
+            for robot in robots
+            if robot is not None and tables.robot_live(robot.id).session is RobotSession.CONNECTED
+        )
+        for process in dict.fromkeys(connected):
+            self._send(process, Notify(id=notice.to, text=notice.text))
+
+    def _send(self, process: str, message: ToTaskSet) -> None:
+        peer = self._peers.get(process)
+        if peer is not None:
+            peer.send(message)

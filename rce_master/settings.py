@@ -1,0 +1,52 @@
+"""Everything that can be set on a master."""
+
+from __future__ import annotations
+
+import ssl
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from rce.config.folders import default_state_dir
+from rce_master.exceptions import MasterError
+from rce_master.state.settings import StateSettings
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+HTTP_PORT = 9000
+CONTROL_PORT = 8080
+LOOPBACK = "127.0.0.1"
+EVERYWHERE = "0.0.0.0"  # noqa: S104 - what a server for other machines is for
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MasterSettings:
+    """Everything that can be set on a master. Port 0 takes a free one."""
+
+    bind: str = EVERYWHERE
+    http_port: int = HTTP_PORT
+    control_port: int = CONTROL_PORT
+    state_dir: Path = field(default_factory=lambda: default_state_dir() / "master")
+    dev: bool = False
+    """Make the user testUser with the password testUser, an administrator."""
+    tls_cert: Path | None = None
+    tls_key: Path | None = None
+    allowed_origins: tuple[str, ...] = ()
+    state: StateSettings = field(default_factory=StateSettings)
+
+    def ssl_context(self) -> ssl.SSLContext | None:
+        """Make the TLS context of the HTTP server; None: plain HTTP.
+
+        Raises:
+            MasterError: The certificate or its key cannot be used.
+        """
+        if self.tls_cert is None:
+            if self.tls_key is not None:
+                raise MasterError("a TLS key needs its certificate (--tls-cert)")
+            return None
+        context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+        try:
+            context.load_cert_chain(self.tls_cert, self.tls_key)
+        except (OSError, ssl.SSLError) as error:
+            raise MasterError(f"cannot use the certificate {self.tls_cert}: {error}") from error
+        return context

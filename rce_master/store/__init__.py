@@ -1,0 +1,7 @@
+"""Where the desired state is kept: one narrow interface, SQLite behind it by default."""
+
+from rce_master.store.base import Row, Snapshot, Store
+from rce_master.store.memory import MemoryStore
+from rce_master.store.sqlite import SqliteStore
+
+__all__ = ["MemoryStore", "Row", "Snapshot", "SqliteStore", "Store"]

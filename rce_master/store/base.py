@@ -1,0 +1,45 @@
+"""The interface of a store.
+
+A store knows nothing of robots or users: it keeps bytes under a table's name and a key. That is all a
+replicated store would have to do, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+Snapshot = Mapping[str, Mapping[str, bytes]]
+"""All that a store holds: table name to key to encoded record."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A record as a store keeps it."""
+
+    table: str
+    key: str
+    body: bytes | None
+    """None: remove it."""
+
+
+class Store(Protocol):
+    """Keeps records over a restart."""
+
+    async def load(self) -> Snapshot:
+        """Read everything.
+
+        Raises:
+            StoreError: It cannot be read.
+        """
+
+    async def save(self, rows: Sequence[Row]) -> None:
+        """Write rows, all or none; when this returns, they survive a crash.
+
+        Raises:
+            StoreError: Nothing was written.
+        """
+
+    async def close(self) -> None:
+        """Let go of everything; may be called twice."""

@@ -1,0 +1,43 @@
+"""The lock on a state folder: two masters on one folder would undo each other's work."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from typing import TYPE_CHECKING
+
+from rce_master.exceptions import StoreBusy, StoreError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+class FolderLock:
+    """Held while it is open; the kernel gives it back however the process ends.
+
+    Args:
+        folder: Made if it is not there, readable by its owner only.
+
+    Raises:
+        StoreBusy: Another process holds it.
+        StoreError: The folder cannot be used.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        try:
+            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            self._fd = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise StoreError(f"cannot use the state folder {folder}: {error}") from error
+        try:
+            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            os.close(self._fd)
+            self._fd = -1
+            raise StoreBusy(f"a master is running on the state folder {folder}") from error
+
+    def close(self) -> None:
+        """Give it back."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1

@@ -1,0 +1,131 @@
+"""The store in an SQLite file."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from typing import TYPE_CHECKING
+
+import aiosqlite
+
+from rce_master.exceptions import StoreError
+from rce_master.store.lock import FolderLock
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from rce_master.store.base import Row, Snapshot
+
+SCHEMA_VERSION = 1
+FILE_NAME = "rce.sqlite"
+
+_SCHEMA = """
+CREATE TABLE record (
+    kind TEXT NOT NULL, key TEXT NOT NULL, body BLOB NOT NULL, PRIMARY KEY (kind, key)
+) WITHOUT ROWID
+"""
+_PUT = "INSERT INTO record (kind, key, body) VALUES (?, ?, ?) ON CONFLICT DO UPDATE SET body = excluded.body"
+_DELETE = "DELETE FROM record WHERE kind = ? AND key = ?"
+
+
+class SqliteStore:
+    """A store in ``FOLDER/rce.sqlite``; the folder is locked while it is open.
+
+    Written with a write-ahead log and a sync at every commit, so what was saved survives a power cut.
+    """
+
+    def __init__(self, database: aiosqlite.Connection, lock: FolderLock) -> None:
+        self._database = database
+        self._lock = lock
+
+    @classmethod
+    async def open(cls, folder: Path) -> SqliteStore:
+        """Open the store of a folder; made if it is not there.
+
+        Raises:
+            StoreBusy: Another process has it open.
+            StoreError: It cannot be opened, or a newer version of this program wrote it.
+        """
+        lock = FolderLock(folder)
+        try:
+            return cls(await _connect(folder / FILE_NAME), lock)
+        except BaseException:
+            lock.close()
+            raise
+
+    async def load(self) -> Snapshot:
+        """Read everything.
+
+        Raises:
+            StoreError: It cannot be read.
+        """
+        snapshot: dict[str, dict[str, bytes]] = {}
+        try:
+            async with self._database.execute("SELECT kind, key, body FROM record") as cursor:
+                async for kind, key, body in cursor:
+                    snapshot.setdefault(kind, {})[key] = body
+        except sqlite3.Error as error:
+            raise StoreError(f"cannot read the store: {error}") from error
+        return snapshot
+
+    async def save(self, rows: Sequence[Row]) -> None:
+        """Write rows in one transaction.
+
+        Raises:
+            StoreError: Nothing was written.
+        """
+        puts = [(row.table, row.key, row.body) for row in rows if row.body is not None]
+        deletes = [(row.table, row.key) for row in rows if row.body is None]
+        try:
+            await self._database.executemany(_DELETE, deletes)
+            await self._database.executemany(_PUT, puts)
+            await self._database.commit()
+        except sqlite3.Error as error:
+            await self._roll_back()
+            raise StoreError(f"cannot write the store: {error}") from error
+
+    async def close(self) -> None:
+        """Close the file and unlock the folder."""
+        await self._database.close()
+        self._lock.close()
+
+    async def _roll_back(self) -> None:
+        try:
+            await self._database.rollback()
+        except sqlite3.Error as error:
+            raise StoreError(f"cannot write the store, nor take back what was begun: {error}") from error
+
+
+async def _connect(path: Path) -> aiosqlite.Connection:
+    try:
+        # Made first, so that it never exists readable by others: it holds password hashes.
+        os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+        database = await aiosqlite.connect(path)
+    except (OSError, sqlite3.Error) as error:
+        raise StoreError(f"cannot open the store {path}: {error}") from error
+    try:
+        await _prepare(database, path)
+    except sqlite3.Error as error:
+        await database.close()
+        raise StoreError(f"cannot open the store {path}: {error}") from error
+    except BaseException:
+        await database.close()
+        raise
+    return database
+
+
+async def _prepare(database: aiosqlite.Connection, path: Path) -> None:
+    await database.execute("PRAGMA journal_mode = WAL")
+    await database.execute("PRAGMA synchronous = FULL")
+    async with database.execute("PRAGMA user_version") as cursor:
+        row = await cursor.fetchone()
+    version = row[0] if row else 0
+    if version == 0:
+        await database.execute(_SCHEMA)
+        await database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+        await database.commit()
+    elif version != SCHEMA_VERSION:
+        raise StoreError(
+            f"the store {path} has version {version}, this program reads version {SCHEMA_VERSION}"
+        )
