@@ -60,9 +60,8 @@ canvas.addEventListener("pointerleave", () => { view.cursor = null; });
 
 canvas.addEventListener("keydown", (event) => {
   if (!fleet.map) return;
-  const { rows, columns, y_up } = fleet.map;
-  const up = y_up ? columns : -columns;
-  const steps = { ArrowLeft: -1, ArrowRight: 1, ArrowUp: up, ArrowDown: -up };
+  const { rows, columns } = fleet.map;
+  const steps = { ArrowLeft: -1, ArrowRight: 1, ArrowUp: columns, ArrowDown: -columns };
   if (event.key in steps) {
     const next = (view.cursor ?? 0) + steps[event.key];
     if (next >= 0 && next < rows * columns) view.cursor = next;

@@ -3,7 +3,7 @@
 export const TRAIL_LENGTH = 240;
 
 export class Fleet extends EventTarget {
-  map = null;          // {rows, columns, cell_size, origin: [x, y], y_up}
+  map = null;          // {rows, columns, cell_size, origin: [x, y], robot_radius}; row 0 is the lowest
   robots = new Map();  // id -> {id, state, cell, goal, plan, granted, replans, pose, seen, trail}
   blocked = new Set();
   pending = new Set();
@@ -73,18 +73,15 @@ export class Fleet extends EventTarget {
   }
 
   cellAt(x, y) {
-    const { rows, columns, cell_size, origin, y_up } = this.map;
+    const { rows, columns, cell_size, origin } = this.map;
     const column = Math.floor((x - origin[0]) / cell_size);
-    let row = Math.floor((y - origin[1]) / cell_size);
-    if (!y_up) row = rows - 1 - row;
+    const row = Math.floor((y - origin[1]) / cell_size);
     return column >= 0 && column < columns && row >= 0 && row < rows ? row * columns + column : null;
   }
 
   centre(cell) {
-    const { rows, columns, cell_size, origin, y_up } = this.map;
-    const row = Math.floor(cell / columns);
-    const up = y_up ? row : rows - 1 - row;
-    return [origin[0] + ((cell % columns) + 0.5) * cell_size, origin[1] + (up + 0.5) * cell_size];
+    const { columns, cell_size, origin } = this.map;
+    return [origin[0] + ((cell % columns) + 0.5) * cell_size, origin[1] + (Math.floor(cell / columns) + 0.5) * cell_size];
   }
 
   #robot(id) {

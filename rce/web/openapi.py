@@ -1,0 +1,122 @@
+"""Makes the OpenAPI document of a route table, so that it cannot tell anything but what the server does."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic.json_schema import models_json_schema
+
+from rce import __version__
+
+PREFIX = "/api/v1"
+_REF = "#/components/schemas/{model}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Query:
+    """A query parameter."""
+
+    name: str
+    description: str
+    required: bool = False
+    type: str = "string"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Operation:
+    """What the document tells of a method of a path."""
+
+    name: str
+    method: str
+    path: str
+    """Below :data:`PREFIX`, with ``{name}`` for its parts."""
+    summary: str
+    group: str
+    body: type[BaseModel] | None = None
+    reply: type[BaseModel] | None = None
+    """None: no content, unless ``media`` says that something is streamed."""
+    media: str = "application/json"
+    status: int = 200
+    open: bool = False
+    """Whether it can be used without a token."""
+    query: tuple[Query, ...] = ()
+
+
+def build_document(
+    operations: Iterable[Operation], *, title: str, description: str, error: type[BaseModel]
+) -> dict[str, Any]:
+    """Describe operations as OpenAPI 3.1.
+
+    Args:
+        operations: All operations of the server.
+        title: Names the server.
+        description: What it is for.
+        error: Model of every answer that is not a success.
+    """
+    operations = list(operations)
+    models = {model for known in operations for model in (known.body, known.reply) if model} | {error}
+    ordered = sorted(models, key=lambda model: model.__name__)
+    _, schemas = models_json_schema([(model, "validation") for model in ordered], ref_template=_REF)
+    paths: dict[str, dict[str, Any]] = {}
+    for known in operations:
+        paths.setdefault(PREFIX + known.path, {})[known.method.lower()] = _describe(known, error)
+    return {
+        "openapi": "3.1.0",
+        "info": {"title": title, "version": __version__, "description": description},
+        "paths": paths,
+        "components": {
+            "schemas": schemas["$defs"],
+            "securitySchemes": {"bearer": {"type": "http", "scheme": "bearer"}},
+        },
+        "security": [{"bearer": []}],
+    }
+
+
+def _describe(known: Operation, error: type[BaseModel]) -> dict[str, Any]:
+    described: dict[str, Any] = {
+        "operationId": known.name,
+        "summary": known.summary,
+        "tags": [known.group],
+        "parameters": [_path_parameter(name) for name in re.findall(r"{(\w+)}", known.path)]
+        + [_query_parameter(query) for query in known.query],
+        "responses": {
+            str(known.status): _success(known),
+            "default": {"description": "It was not done, and why", "content": _content(error)},
+        },
+    }
+    if known.body is not None:
+        described["requestBody"] = {"required": True, "content": _content(known.body)}
+    if known.open:
+        described["security"] = []
+    return described
+
+
+def _path_parameter(name: str) -> dict[str, Any]:
+    return {"name": name, "in": "path", "required": True, "schema": {"type": "string"}}
+
+
+def _query_parameter(query: Query) -> dict[str, Any]:
+    return {
+        "name": query.name,
+        "in": "query",
+        "required": query.required,
+        "description": query.description,
+        "schema": {"type": query.type},
+    }
+
+
+def _success(known: Operation) -> dict[str, Any]:
+    answer: dict[str, Any] = {"description": known.summary}
+    if known.reply is not None:
+        answer["content"] = _content(known.reply)
+    elif known.media != "application/json":
+        answer["content"] = {known.media: {"schema": {"type": "string"}}}
+    return answer
+
+
+def _content(model: type[BaseModel]) -> dict[str, Any]:
+    return {"application/json": {"schema": {"$ref": _REF.format(model=model.__name__)}}}

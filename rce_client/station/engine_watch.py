@@ -1,0 +1,83 @@
+"""Watches the engine over the master's REST API, for the page."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+import aiohttp
+from yarl import URL
+
+POLL_S = 1.0
+TIMEOUT = aiohttp.ClientTimeout(total=5)
+
+
+class EngineWatch:
+    """Reads containers, nodes and connections of the operator's user again and again.
+
+    Args:
+        master: URL of the master.
+        user: User ID.
+        password: The user's password.
+        on_state: Called with the engine's state whenever it changed; with ``{"error": text}`` if it cannot be read.
+    """
+
+    def __init__(
+        self, master: str, user: str, password: str, *, on_state: Callable[[dict[str, Any]], None]
+    ) -> None:
+        self._api = URL(master) / "api/v1"
+        self._login = {"userID": user, "password": password, "label": "operator station"}
+        self._on_state = on_state
+        self._token = ""
+        self._last: dict[str, Any] = {}
+
+    async def run(self) -> None:
+        """Watch until cancelled."""
+        async with aiohttp.ClientSession(timeout=TIMEOUT, raise_for_status=True) as session:
+            while True:
+                try:
+                    state = await self._read(session)
+                except aiohttp.ClientResponseError as error:
+                    if error.status == 401:
+                        self._token = ""
+                    state = {"error": f"the master says {error.status}: {error.message}"}
+                except (aiohttp.ClientError, TimeoutError) as error:
+                    state = {"error": f"the master cannot be reached: {error}"}
+                if state != self._last:
+                    self._last = state
+                    self._on_state(state)
+                await asyncio.sleep(POLL_S)
+
+    async def _read(self, session: aiohttp.ClientSession) -> dict[str, Any]:
+        if not self._token:
+            async with session.post(self._api / "login", json=self._login) as reply:
+                self._token = (await reply.json())["token"]
+        containers, nodes, connections = [
+            await self._get(session, kind) for kind in ("containers", "nodes", "connections")
+        ]
+        return {
+            "containers": [
+                {
+                    **{key: container[key] for key in ("tag", "state", "machine", "detail")},
+                    "nodes": [
+                        {key: node[key] for key in ("tag", "state", "detail")}
+                        for node in nodes
+                        if node["container"] == container["tag"]
+                    ],
+                }
+                for container in containers
+            ],
+            "connections": [
+                {key: connection[key] for key in ("tag_a", "tag_b", "established")}
+                for connection in connections
+            ],
+        }
+
+    async def _get(self, session: aiohttp.ClientSession, kind: str) -> list[dict[str, Any]]:
+        headers = {"Authorization": f"Bearer {self._token}"}
+        async with session.get(
+            self._api / kind, headers=headers, params={"user": self._login["userID"]}
+        ) as reply:
+            found: list[dict[str, Any]] = (await reply.json())[kind]
+            return found
