@@ -1,0 +1,221 @@
+"""Who waits for answers, who works on them, and how dialing pauses."""
+
+from __future__ import annotations
+
+import asyncio
+from itertools import islice
+from typing import TYPE_CHECKING, cast
+
+import pytest
+
+from rce.link.calls import CallServer, PendingCalls
+from rce.link.carrier import LocalCarrier
+from rce.link.dialer import pauses
+from rce.link.exceptions import MessageTooLarge, NotConnected, Overloaded, PeerFault, PeerLost, ProtocolError
+from rce.link.frames import Frame, FrameType
+from rce.link.settings import LinkLimits
+from rce.link.tasks import TaskScope
+
+if TYPE_CHECKING:
+    from rce.link.carrier import Carrier
+    from rce.link.channel import Channel
+
+
+class FakeChannel:
+    """Notes answers."""
+
+    def __init__(self) -> None:
+        self.replies: dict[int, bytes] = {}
+        self.faults: dict[int, str] = {}
+        self.answered = asyncio.Event()
+
+    def reply(self, call_id: int, answer: bytes) -> None:
+        self.replies[call_id] = answer
+        self.answered.set()
+
+    def fault(self, call_id: int, error: Exception) -> None:
+        self.faults[call_id] = str(error)
+        self.answered.set()
+
+    def as_channel(self) -> Channel:
+        return cast("Channel", self)
+
+
+async def test_pending_calls_have_their_own_ids_and_answers() -> None:
+    calls = PendingCalls(3)
+    (a, first), (b, second), (c, third) = (calls.add() for _ in range(3))
+    assert len({a, b, c}) == 3
+    with pytest.raises(Overloaded):
+        calls.add()
+    calls.answer(b, b"two")
+    calls.fail(a, PeerFault("no"))
+    calls.answer(77, b"nobody asked")
+    assert await second == b"two"
+    with pytest.raises(PeerFault, match="no"):
+        await first
+    calls.fail_all(lambda: PeerLost("gone"))
+    with pytest.raises(PeerLost):
+        await third
+    assert not calls.drop(c)
+    assert len(calls) == 0
+
+
+async def test_server_serves_few_at_a_time_and_refuses_too_many() -> None:
+    release, both = asyncio.Event(), asyncio.Event()
+    running = 0
+    most = 0
+
+    async def serve(payload: bytes) -> bytes:
+        nonlocal running, most
+        running += 1
+        most = max(most, running)
+        if running == 2:
+            both.set()
+        await release.wait()
+        running -= 1
+        return payload
+
+    channel = FakeChannel()
+    server = CallServer(serve, LinkLimits(serving=2, waiting=3), "test")
+    for n in range(5):
+        server.accept(channel.as_channel(), n, b"%d" % n)
+    with pytest.raises(Overloaded):
+        server.accept(channel.as_channel(), 5, b"")
+    assert server.has(channel.as_channel(), 0)
+    assert server.has(channel.as_channel(), 4)
+    await both.wait()
+    release.set()
+    async with asyncio.timeout(5):
+        while len(channel.replies) < 5:
+            channel.answered.clear()
+            await channel.answered.wait()
+    assert channel.replies == {n: b"%d" % n for n in range(5)}
+    assert most == 2
+    await server.close()
+    with pytest.raises(NotConnected):
+        server.accept(channel.as_channel(), 9, b"")
+
+
+async def test_cancelled_requests_get_no_answer() -> None:
+    cancelled: list[bytes] = []
+    started = asyncio.Event()
+
+    async def serve(payload: bytes) -> bytes:
+        started.set()
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            cancelled.append(payload)
+            raise
+        return payload
+
+    one, other = FakeChannel(), FakeChannel()
+    server = CallServer(serve, LinkLimits(serving=2, waiting=3), "test")
+    server.accept(one.as_channel(), 1, b"a")
+    server.accept(other.as_channel(), 1, b"b")
+    server.accept(one.as_channel(), 2, b"c")
+    await started.wait()
+    server.cancel(one.as_channel())
+    assert server.has(other.as_channel(), 1)
+    assert not server.has(one.as_channel(), 2)
+    await server.close()
+    assert sorted(cancelled) == [b"a", b"b"]
+    assert one.replies == other.replies == {}
+    assert one.faults == other.faults == {}
+
+
+async def test_what_a_server_raises_is_told_to_the_peer() -> None:
+    async def serve(payload: bytes) -> bytes:
+        raise ValueError("nothing like that here")
+
+    channel = FakeChannel()
+    server = CallServer(serve, LinkLimits(), "test")
+    server.accept(channel.as_channel(), 1, b"")
+    await channel.answered.wait()
+    assert channel.faults == {1: "nothing like that here"}
+    await server.close()
+
+
+def test_pauses_double_up_to_the_longest() -> None:
+    found = list(islice(pauses(0.02, 1.0), 9))
+    for pause, most in zip(found, [0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1, 1, 1], strict=True):
+        assert most / 2 <= pause <= most
+
+
+async def test_scope_reports_failures_and_ends_its_tasks() -> None:
+    reported: list[BaseException] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, c: reported.append(c["exception"]))
+    scope = TaskScope()
+
+    async def fail() -> None:
+        raise ValueError("oops")
+
+    async def forever() -> None:
+        await asyncio.Event().wait()
+
+    failing = scope.spawn(fail(), "failing")
+    lasting = scope.spawn(forever(), "lasting")
+    await asyncio.wait([failing])
+    await scope.close()
+    assert [str(error) for error in reported] == ["oops"]
+    assert lasting.cancelled()
+    with pytest.raises(RuntimeError):
+        scope.spawn(forever(), "late")
+
+
+def test_errors_have_texts() -> None:
+    assert str(NotConnected()) == "not connected"
+    assert "70 bytes" in str(MessageTooLarge(70, 64))
+    assert "64 bytes" in str(MessageTooLarge(70, 64))
+
+
+class Ping:
+    """Answers every frame at once; refuses ERROR."""
+
+    def __init__(self, carrier: LocalCarrier) -> None:
+        self.carrier = carrier
+        self.count = 0
+        self.lost: list[Exception] = []
+        self.enough = asyncio.Event()
+
+    def frame_received(self, frame: Frame) -> None:
+        if frame.type is FrameType.HELLO:
+            raise ProtocolError("not here")
+        self.count += 1
+        if self.count == 5_000:
+            self.enough.set()
+        else:
+            self.carrier.control(frame)
+
+    def carrier_lost(self, carrier: Carrier, reason: Exception) -> None:
+        self.lost.append(reason)
+        self.enough.set()
+
+
+async def test_local_carrier_does_not_recurse_or_hold_the_loop() -> None:
+    one, other = LocalCarrier.pair()
+    a, b = Ping(one), Ping(other)
+    one.control(Frame(FrameType.PING))
+    one.start(a)
+    other.start(b)
+    turns = 0
+    while not a.enough.is_set() and not b.enough.is_set():
+        await asyncio.sleep(0)
+        turns += 1
+    assert turns > 1_000
+    one.close()
+    other.control(Frame(FrameType.PING))
+    await other.wait_closed()
+    assert len(b.lost) == 1
+    assert a.lost == []
+
+
+async def test_local_carrier_ends_at_broken_rules() -> None:
+    one, other = LocalCarrier.pair()
+    a, b = Ping(one), Ping(other)
+    one.start(a)
+    other.start(b)
+    one.control(Frame(FrameType.HELLO))
+    await a.enough.wait()
+    assert [type(reason) for reason in b.lost] == [ProtocolError]
+    assert len(a.lost) == 1
