@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 REPEAT_AFTER = 1.0
 """Seconds after which a goal or cancellation that had no effect is sent again."""
 
+QUIET_TIME = 1.0
+"""Seconds without any goal under way after which a robot is taken to have none."""
+
 
 class ClientState(Enum):
     """What a move client does."""
@@ -133,6 +136,7 @@ class MoveClient:
     _goal: SendGoal | None = None
     _step: int | None = None
     _sent_at: float = float("-inf")
+    _quiet_since: float | None = None
     _count: int = 0
 
     @property
@@ -289,16 +293,22 @@ class MoveClient:
         return [SendStop(now)]
 
     def _await_stop(self, states: dict[str, GoalState], now: float) -> list[Instruction]:
-        if self._sent_at == float("-inf"):
-            return self.tick(now)
+        """See whether everything is over.
+
+        The goal of this client must be listed so. Of what was lost or is of an earlier life nothing can be
+        known, except that nothing has been under way for a while: what comes later the stop's stamp catches.
+        """
         if any(not state.over for state in states.values()):
+            self._quiet_since = None
             return []
-        # A goal that the robot does not list is lost, or on its way: then the stop's stamp catches it.
-        known = self._goal is None or self._goal.id in states
-        return self._stopped(now) if known or now - self._sent_at >= REPEAT_AFTER / 2 else []
+        if self._goal is not None and self._goal.id in states:
+            return self._stopped(now)
+        if self._quiet_since is None:
+            self._quiet_since = now
+        return self._stopped(now) if now - self._quiet_since >= QUIET_TIME else []
 
     def _stopped(self, now: float) -> list[Instruction]:
-        self._goal = None
+        self._goal = self._quiet_since = None
         self._become(ClientState.IDLE)
         return [*self._proceed(now), self._report]
 
