@@ -47,10 +47,11 @@ class RosoutHandler(logging.Handler):
                 self.handleError(record)
 
     def _publish(self, record: logging.LogRecord) -> None:
+        from rce.ros.types import Time
+
         secs, fraction = divmod(record.created, 1)
-        stamp = {"secs": int(secs), "nsecs": int(fraction * 1e9)}
         self._publisher.publish(
-            header={"stamp": stamp},
+            header={"stamp": Time(int(secs), int(fraction * 1e9))},
             level=next((level for floor, level in _LEVELS if record.levelno >= floor), _DEBUG),
             name=self._node,
             msg=self.format(record),

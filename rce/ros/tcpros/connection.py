@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import Protocol
+from typing import Protocol, cast
 
 from rce.ros.errors import TcprosError
 from rce.ros.tcpros.framing import MAX_FRAME, Chunks, FrameReader
@@ -117,8 +117,7 @@ class Connection(asyncio.BufferedProtocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Keep the transport."""
-        self._transport = transport  # type: ignore[assignment]
-        assert self._transport is not None
+        self._transport = cast("asyncio.Transport", transport)  # uvloop's only behave like one
         self._transport.set_write_buffer_limits(high=WRITE_HIGH)
         self._peer = str(transport.get_extra_info("peername"))
         if self._siblings is not None:

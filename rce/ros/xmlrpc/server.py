@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from types import TracebackType
+from typing import cast
 
 import h11
 
@@ -78,11 +79,10 @@ class _Connection(asyncio.Protocol):
         self._deadline: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        self._transport = transport
+        self._transport = cast("asyncio.Transport", transport)  # uvloop's only behave like one
         if len(self._siblings) >= MAX_CONNECTIONS:
             _log.warning("more than %d connections: one is turned away", MAX_CONNECTIONS)
-            transport.abort()
+            self._transport.abort()
             return
         self._siblings.add(self)
 
