@@ -15,7 +15,10 @@ from rce.control.model import EndpointSpec, EndpointStatus, InterfaceUsage, Link
 
 
 class Boot(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What an environment is told when it is started, as JSON in its first argument. Holds no secret."""
+    """What an environment is told when it is started, as JSON in its first argument. Holds no secret.
+
+    Its standard input is a listening unix socket for managers, its standard output one for peers' links.
+    """
 
     id: str
     """Endpoint id, ``user/tag``."""
@@ -23,10 +26,6 @@ class Boot(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Names this life of the container; see :data:`rce_container.environment.proc.MARK`."""
     machine: str
     """See :class:`rce.control.model.LinkAddress`."""
-    control_fd: int
-    """A listening unix socket; managers connect to it."""
-    link_fd: int
-    """A listening unix socket; peers' links come in on it."""
     home: str
     logs: str
     ros_port: int
@@ -55,11 +54,8 @@ class Apply(_Message):
     spec: EndpointSpec
 
 
-class Adopt(_Message):
-    """A link's socket that the manager accepted for this container. Comes with the descriptor."""
-
-    received: bytes
-    """What was read from it already."""
+class Handover(_Message):
+    """Comes with a socket, on which the manager hands accepted links over (:mod:`rce.link.handover`)."""
 
 
 class Dialed(_Message):
@@ -106,7 +102,7 @@ class Dial(_Message):
     address: LinkAddress
 
 
-ToEnvironment = Union[Apply, Adopt, Dialed, Poll, Stop]
+ToEnvironment = Union[Apply, Handover, Dialed, Poll, Stop]
 ToManager = Union[Report, Fault, Counters, Dial]
 
 encode = msgspec.json.Encoder().encode

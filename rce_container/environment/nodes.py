@@ -21,6 +21,10 @@ from rce_container.environment.reaper import Child, Reaper
 _STRIKE_PAUSE_S = 0.02
 _STRIKES = 50
 _LAST_LINE_LENGTH = 300
+_REGISTERS_WITHIN_S = 10.0
+"""A node that did not register with the ROS core for so long probably never will."""
+_SETTLES_WITHIN_S = 0.5
+"""After a node's first registration its others follow within this time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,9 +77,10 @@ class NodeSet:
         return tuple(self._nodes[tag].status for tag in sorted(self._nodes))
 
     @property
-    def starting(self) -> bool:
-        """Whether a node has not registered with the ROS core yet."""
-        return any(node.status.state is NodeState.STARTING for node in self._nodes.values())
+    def settling(self) -> bool:
+        """Whether a node has yet to take up its topics and services: it started or registered just now."""
+        now = asyncio.get_running_loop().time()
+        return any(now < node.settled_at for node in self._nodes.values())
 
     def registered(self, ros_name: str) -> bool:
         """Note that a node of this global ROS name registered; whether one was told to take that name."""
@@ -116,6 +121,8 @@ class _Node:
         self.desired: NodeSpec | None = spec
         self.status = NodeStatus(tag=spec.tag, state=NodeState.STARTING)
         self.ros_name = ""
+        self.settled_at = 0.0
+        """When the node is taken to have all its topics and services, by the event loop's clock."""
         self.gone = asyncio.Event()
         self._tag = spec.tag
         self._workshop = workshop
@@ -128,6 +135,7 @@ class _Node:
 
     def note_registered(self) -> None:
         if self.status.state is NodeState.STARTING and self.status.pid:
+            self.settled_at = asyncio.get_running_loop().time() + _SETTLES_WITHIN_S
             self._become(NodeState.RUNNING, pid=self.status.pid)
 
     async def run(self) -> None:
@@ -156,6 +164,7 @@ class _Node:
                     await _strike_all(launch.env[NODE_MARK])
             finally:
                 pump.close()
+            self.settled_at = 0.0
             self._note_end(code, log.last_line)
         finally:
             log.close()
@@ -170,6 +179,7 @@ class _Node:
         finally:
             os.close(output)
         self.ros_name = launch.ros_name
+        self.settled_at = asyncio.get_running_loop().time() + _REGISTERS_WITHIN_S
         self._become(NodeState.STARTING, pid=child.pid)
         return child
 

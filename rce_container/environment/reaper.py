@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 from collections.abc import Mapping, Sequence
-from typing import Self
+from typing import Any, Self
 
 
 class Child:
@@ -46,13 +46,16 @@ class Reaper:
 
     def __init__(self) -> None:
         self._children: dict[int, Child] = {}
+        self._before: Any = None
 
     def __enter__(self) -> Self:
-        asyncio.get_running_loop().add_signal_handler(signal.SIGCHLD, self._reap)
+        # Not loop.add_signal_handler: uvloop keeps this signal for its own subprocesses, of which there are none.
+        loop = asyncio.get_running_loop()
+        self._before = signal.signal(signal.SIGCHLD, lambda *_: loop.call_soon_threadsafe(self._reap))
         return self
 
     def __exit__(self, *_: object) -> None:
-        asyncio.get_running_loop().remove_signal_handler(signal.SIGCHLD)
+        signal.signal(signal.SIGCHLD, self._before)
         self._reap()
 
     def spawn(self, argv: Sequence[str], *, env: Mapping[str, str], cwd: str, output: int) -> Child:

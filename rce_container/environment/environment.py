@@ -1,0 +1,292 @@
+"""The environment: applies the container's desired state and reports what is."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import socket
+from collections import deque
+from pathlib import Path
+
+import msgspec
+
+from rce.control.model import EndpointKind, EndpointSpec, EndpointState, EndpointStatus
+from rce.link import Endpoint
+from rce.link.handover import HandoverReceiver
+from rce.protocol.names import EndpointId
+from rce.ros.core import Core
+from rce.ros.core.events import Change
+from rce.ros.errors import RosError
+from rce.ros.node import Node
+from rce.ros.packages import PackageIndex
+from rce.ros.types import TypeRegistry
+from rce.ros.xmlrpc import RpcClient
+from rce_container.environment import messages as m
+from rce_container.environment import proc
+from rce_container.environment.channel import Channel, accept
+from rce_container.environment.exceptions import ChannelError
+from rce_container.environment.interfaces import InterfaceMaker, Readiness
+from rce_container.environment.nodes import NodeSet, Workshop
+from rce_container.environment.parameters import Values, difference, evaluate_all
+from rce_container.environment.reach import ContainerHub, Operator
+from rce_container.environment.reaper import Reaper
+
+log = logging.getLogger(__name__)
+
+NODE_NAME = "rce_environment"
+"""The environment's own node in the container's graph."""
+
+_MAX_UNTOLD = 100
+_STRIKE_PAUSE_S = 0.02
+_GET_PID_TIMEOUT_S = 5.0
+
+
+class Environment:
+    """One container from the inside. Its :meth:`run` lives as long as the container.
+
+    It ends when a manager says so, when :meth:`end` is called, or when no manager was connected for the grace time.
+
+    Args:
+        boot: What the manager says of the container.
+        control: A listening unix socket; managers connect to it.
+        links: A listening unix socket; peers' links come in on it.
+    """
+
+    def __init__(self, boot: m.Boot, control: socket.socket, links: socket.socket) -> None:
+        self._boot = boot
+        self._control = control
+        self._links = links
+        self._loop = asyncio.get_running_loop()
+        self._ending = asyncio.Event()
+        self._desired = EndpointSpec(id=boot.id, kind=EndpointKind.CONTAINER, revision=-1)
+        self._applied_revision = -1
+        self._news = asyncio.Event()
+        self._parameters: Values = {}
+        self._faulty: set[str] = set()
+        self._channel: Channel | None = None
+        self._grace: asyncio.TimerHandle | None = None
+        self._untold: deque[str] = deque(maxlen=_MAX_UNTOLD)
+        self._told: EndpointStatus | None = None
+        self._report_due: asyncio.Handle | None = None
+        self._handover: HandoverReceiver | None = None
+        self._packages = PackageIndex(boot.packages)
+        self._operator = Operator(self._ask)
+
+    async def run(self) -> None:
+        """Live; returns when every process, socket and task of the container has ended."""
+        async with contextlib.AsyncExitStack() as stack:
+            reaper = stack.enter_context(Reaper())
+            self._core = await stack.enter_async_context(Core("127.0.0.1", self._boot.ros_port))
+            types = TypeRegistry(self._packages)
+            node = await stack.enter_async_context(
+                Node(NODE_NAME, argv=[], master_uri=self._core.uri, types=types)
+            )
+            hub = ContainerHub(self._boot.machine, self._operator if self._boot.isolated else None)
+            stack.push_async_callback(hub.close)
+            await hub.listen(self._links)
+            self._hub = hub
+            async with asyncio.TaskGroup() as tasks:
+                self._tasks = tasks
+                self._nodes = NodeSet(self._workshop(reaper), tasks)
+                readiness = Readiness(lambda: self._nodes.settling)
+                self._endpoint = Endpoint(
+                    EndpointId.parse(self._boot.id),
+                    InterfaceMaker(node, types, readiness),
+                    hub,
+                    on_change=self._changed,
+                    on_fault=self._fault,
+                )
+                services = [
+                    tasks.create_task(self._accept_managers(), name="control socket"),
+                    tasks.create_task(self._apply_for_ever(), name="endpoint"),
+                    tasks.create_task(self._watch_graph(), name="graph"),
+                ]
+                self._wait_for_manager()
+                await self._ending.wait()
+                await self._close(services)
+
+    def end(self, reason: str) -> None:
+        """Begin to end the container, whole."""
+        log.info("ending: %s", reason)
+        self._ending.set()
+
+    async def _close(self, services: list[asyncio.Task[None]]) -> None:
+        services[1].cancel()
+        await self._endpoint.close()
+        await self._nodes.close()
+        if not self._boot.isolated:
+            while proc.strike(self._boot.mark):
+                await asyncio.sleep(_STRIKE_PAUSE_S)
+        self._report()
+        for service in services:
+            service.cancel()
+        if self._handover is not None:
+            await self._handover.close()
+        if self._grace is not None:
+            self._grace.cancel()
+        if self._report_due is not None:
+            self._report_due.cancel()
+        if self._channel is not None:
+            self._channel.close()
+
+    def _workshop(self, reaper: Reaper) -> Workshop:
+        return Workshop(
+            reaper=reaper,
+            packages=self._packages,
+            environ=self._environ(),
+            mark=self._boot.mark,
+            home=self._boot.home,
+            logs=Path(self._boot.logs),
+            interrupt_timeout=self._boot.interrupt_timeout,
+            terminate_timeout=self._boot.terminate_timeout,
+            on_change=self._changed,
+            on_fault=self._fault,
+        )
+
+    def _environ(self) -> dict[str, str]:
+        packages = os.pathsep.join(self._boot.packages)
+        return {
+            **os.environ,
+            "ROS_MASTER_URI": self._core.uri,
+            "ROS_IP": "127.0.0.1",
+            "PYTHONUNBUFFERED": "1",
+            "RCE_PACKAGE_PATH": packages,
+            "ROS_PACKAGE_PATH": packages,
+        }
+
+    # What is desired
+
+    def _apply(self, spec: EndpointSpec) -> None:
+        if spec.revision < self._desired.revision or self._ending.is_set():
+            return
+        self._desired = spec
+        self._set_parameters(spec)
+        self._nodes.apply(spec.nodes)
+        self._news.set()
+
+    def _set_parameters(self, spec: EndpointSpec) -> None:
+        desired, faults = evaluate_all(spec.parameters, self._packages, self._environ())
+        change = difference(self._parameters, desired)
+        for name in change.delete:
+            self._core.delete_param(name)
+        for name, value in change.set.items():
+            self._core.set_param(name, value)
+        self._parameters = desired
+        texts = {str(fault) for fault in faults}
+        for text in sorted(texts - self._faulty):
+            self._fault(text)
+        self._faulty = texts
+
+    async def _apply_for_ever(self) -> None:
+        while True:
+            await self._news.wait()
+            self._news.clear()
+            spec = self._desired
+            await self._endpoint.apply(spec)
+            self._applied_revision = spec.revision
+            self._changed()
+
+    # What is
+
+    def _changed(self) -> None:
+        if self._report_due is None:
+            self._report_due = self._loop.call_soon(self._report)
+
+    def _report(self) -> None:
+        self._report_due = None
+        status = EndpointStatus(
+            id=self._boot.id,
+            revision=self._applied_revision,
+            state=EndpointState.STOPPING if self._ending.is_set() else EndpointState.RUNNING,
+            nodes=self._nodes.statuses,
+            interfaces=dict(self._endpoint.interfaces),
+            connections=self._endpoint.connections,
+        )
+        if status != self._told and self._channel is not None:
+            self._told = status
+            self._channel.send(m.encode(m.Report(status=status)))
+
+    def _fault(self, text: str) -> None:
+        log.warning("%s", text)
+        if self._channel is not None:
+            self._channel.send(m.encode(m.Fault(text=text)))
+        else:
+            self._untold.append(text)
+
+    async def _watch_graph(self) -> None:
+        """Notice which of the container's nodes are up."""
+        with self._core.watch() as events:
+            async with RpcClient() as client, asyncio.TaskGroup() as tasks:
+                async for event in events:
+                    if event.change is Change.NODE_APPEARED and not self._nodes.registered(event.node):
+                        tasks.create_task(self._identify(client, event.node), name="identify")
+
+    async def _identify(self, client: RpcClient, name: str) -> None:
+        """Ask a node whose name tells nothing for its process."""
+        uri = self._core.graph.nodes.get(name)
+        if uri is None or name == f"/{NODE_NAME}":
+            return
+        try:
+            _, _, pid = await client.call(uri, "getPid", (NODE_NAME,), timeout=_GET_PID_TIMEOUT_S)
+            self._nodes.registered_process(int(pid))
+        except (RosError, TypeError, ValueError) as error:
+            log.info("node %s does not tell its process: %s", name, error)
+
+    # Managers
+
+    def _wait_for_manager(self) -> None:
+        reason = f"no manager for {self._boot.grace:g} s"
+        self._grace = self._loop.call_later(self._boot.grace, self.end, reason)
+
+    async def _accept_managers(self) -> None:
+        with self._control:
+            await accept(self._control, self._greet)
+
+    def _greet(self, sock: socket.socket) -> None:
+        """Take a new manager in place of the one before."""
+        if self._channel is not None:
+            self._channel.close()
+        elif self._grace is not None:
+            self._grace.cancel()
+        self._channel = Channel(sock)
+        self._told = None
+        self._report()
+        while self._untold:
+            self._channel.send(m.encode(m.Fault(text=self._untold.popleft())))
+        self._tasks.create_task(self._converse(self._channel), name="manager")
+
+    async def _converse(self, channel: Channel) -> None:
+        try:
+            while (line := await channel.receive()) is not None:
+                await self._handle(channel, m.decode_to_environment(line))
+        except (ChannelError, msgspec.DecodeError) as error:
+            log.error("the manager is not understood: %s", error)  # noqa: TRY400 - its text says it all
+        finally:
+            channel.close()
+            if self._channel is channel:
+                self._channel = None
+                if not self._ending.is_set():
+                    self._wait_for_manager()
+
+    async def _handle(self, channel: Channel, message: m.ToEnvironment) -> None:
+        match message:
+            case m.Apply(spec=spec):
+                self._apply(spec)
+            case m.Poll():
+                channel.send(m.encode(m.Counters(interfaces=self._endpoint.usage())))
+            case m.Dialed(request=request, error=error):
+                self._operator.answered(request, error or socket.socket(fileno=channel.take_fd()))
+            case m.Handover():
+                if self._handover is not None:
+                    await self._handover.close()
+                self._handover = HandoverReceiver(socket.socket(fileno=channel.take_fd()), self._hub.adopt)
+            case m.Stop():
+                self.end("the manager says so")
+
+    def _ask(self, message: m.Dial) -> bool:
+        if self._channel is None:
+            return False
+        self._channel.send(m.encode(message))
+        return True

@@ -1,0 +1,191 @@
+"""The container's ends of connections: ROS topics and services, their messages passed through untouched."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING
+
+from rce.link import Buffer, CallError, Interface, InterfaceError, Port
+from rce.protocol.names import Form, InterfaceType, Role
+from rce.ros import names
+from rce.ros.errors import RosError
+
+if TYPE_CHECKING:
+    from rce.ros.node import Node, Publisher, Service, ServiceClient, Subscriber
+    from rce.ros.types import TypeRegistry
+
+READY_TIMEOUT_S = 5.0
+"""How long an interface waits for a node that is starting, at most."""
+_LOOK_AGAIN_S = 0.05
+
+
+class Readiness:
+    """Makes a started interface mean: it will be heard.
+
+    Args:
+        settling: Whether nodes of the container are just starting, and may yet take up a topic or service.
+    """
+
+    def __init__(self, settling: Callable[[], bool]) -> None:
+        self._settling = settling
+
+    async def wait(self, ready: Awaitable[object]) -> None:
+        """Wait for ``ready`` while there is hope for it, and give it up then."""
+        task = asyncio.ensure_future(ready)
+        try:
+            async with asyncio.timeout(READY_TIMEOUT_S):
+                while self._settling() and not task.done():
+                    await asyncio.wait((task,), timeout=_LOOK_AGAIN_S)
+        except TimeoutError:
+            pass
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+
+class RosInterface(Interface):
+    """What the four kinds have in common."""
+
+    def __init__(self, port: Port, node: Node, readiness: Readiness) -> None:
+        super().__init__(port)
+        self.node = node
+        self.readiness = readiness
+        self.addr = names.resolve(port.spec.addr, node.name)
+        self.cls = port.spec.cls
+
+    async def start(self) -> None:
+        """Take up the topic or service, and wait until a starting node did so too."""
+        try:
+            await self.open()
+        except RosError as error:
+            raise InterfaceError(f"interface {self.port.spec.tag} ({self.addr}): {error}") from error
+
+    async def open(self) -> None:
+        """Do the work of :meth:`start`; errors of ROS may go through."""
+        raise NotImplementedError
+
+
+class PublisherInterface(RosInterface):
+    """Publishes in the container what the peers send."""
+
+    publisher: Publisher | None = None
+
+    async def open(self) -> None:
+        """Advertise the topic."""
+        self.publisher = await self.node.advertise(self.addr, self.cls)
+        await self.readiness.wait(self.publisher.wait_for_subscribers(1))
+
+    def receive(self, payload: bytes, *, latched: bool) -> None:
+        """Publish one message."""
+        if self.publisher is not None:
+            self.publisher.publish_serialized(payload, latch=latched)
+
+    async def close(self) -> None:
+        """Take the topic back."""
+        if self.publisher is not None:
+            await self.publisher.close()
+
+
+class SubscriberInterface(RosInterface):
+    """Sends to the peers what is published in the container."""
+
+    subscriber: Subscriber | None = None
+
+    async def open(self) -> None:
+        """Subscribe to the topic."""
+        self.subscriber = await self.node.subscribe_serialized(self.addr, self.cls, self._forward)
+
+    def _forward(self, payload: bytes, latched: bool) -> None:
+        self.port.send(payload, latched=latched)
+
+    async def close(self) -> None:
+        """Unsubscribe."""
+        if self.subscriber is not None:
+            await self.subscriber.close()
+
+
+class ServiceClientInterface(RosInterface):
+    """Calls a service in the container for the peers."""
+
+    client: ServiceClient | None = None
+
+    async def open(self) -> None:
+        """Look for the service."""
+        self.client = self.node.service_client(self.addr, self.cls)
+        await self.readiness.wait(self.node.wait_for_service(self.addr))
+
+    async def serve(self, payload: bytes) -> Buffer:
+        """Pass one request on and return the answer; a failing service's text reaches the caller."""
+        assert self.client is not None
+        return await self.client.call_serialized(payload)
+
+    async def close(self) -> None:
+        """Drop the connections to the service."""
+        if self.client is not None:
+            await self.client.close()
+
+
+class ServiceProviderInterface(RosInterface):
+    """Offers a service in the container that the peer provides."""
+
+    service: Service | None = None
+
+    async def open(self) -> None:
+        """Advertise the service."""
+        self.service = await self.node.advertise_service_serialized(self.addr, self.cls, self._ask)
+
+    async def _ask(self, payload: bytes) -> bytes:
+        try:
+            return await self.port.call(payload)
+        except CallError as error:
+            raise RosError(f"{self.addr}: {error}") from error
+
+    async def close(self) -> None:
+        """Take the service back."""
+        if self.service is not None:
+            await self.service.close()
+
+
+_KINDS: dict[Role, type[RosInterface]] = {
+    Role.PUBLISHER: PublisherInterface,
+    Role.SUBSCRIBER: SubscriberInterface,
+    Role.SERVICE_CLIENT: ServiceClientInterface,
+    Role.SERVICE_PROVIDER: ServiceProviderInterface,
+}
+
+
+class InterfaceMaker:
+    """Makes a container's interfaces; a :data:`rce.link.InterfaceFactory`.
+
+    Args:
+        node: The environment's own node, which takes up topics and services.
+        types: Knows the messages' and services' types.
+        readiness: What the interfaces wait for.
+    """
+
+    def __init__(self, node: Node, types: TypeRegistry, readiness: Readiness) -> None:
+        self._node = node
+        self._types = types
+        self._readiness = readiness
+
+    def __call__(self, port: Port) -> Interface:
+        """Make the interface for a port.
+
+        Raises:
+            InterfaceError: Its spec cannot be fulfilled; the text says what to do.
+        """
+        spec = port.spec
+        try:
+            kind = InterfaceType.parse(spec.type)
+            if kind.form is not Form.INTERFACE:
+                raise ValueError(f"a container has no {spec.type}; use {kind.role.value}Interface")
+            if not spec.addr or not names.is_graph_name(spec.addr):
+                raise ValueError(f"addr {spec.addr!r} is no ROS name; give the topic or service it stands for")
+            if kind.role.is_service:
+                self._types.service(spec.cls)
+            else:
+                self._types.message(spec.cls)
+        except (ValueError, LookupError, RosError, OSError) as error:
+            raise InterfaceError(f"interface {spec.tag}: {error}") from error
+        return _KINDS[kind.role](port, self._node, self._readiness)

@@ -1,0 +1,212 @@
+"""What a runtime is: the way in which a container's first process is started and all its processes are ended.
+
+Whatever the runtime, a container hangs on a *shim*, a shell in a session of its own that outlives the manager. It
+starts the environment, waits for it, and removes the container's folders after it. After an environment that did not
+end properly it lingers, so that a manager can look at what is left.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import subprocess
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar, NamedTuple
+
+from rce_container.environment import proc
+from rce_container.environment.logs import ENVIRONMENT_LOG, segment_path
+from rce_container.environment.messages import Boot, encode
+from rce_container.exceptions import StartError
+from rce_container.folder import ContainerFolder
+
+SHELL = "/bin/sh"
+
+_SHIM = """
+trap : HUP INT TERM
+folder=$1 run=$2 linger=$3 python=$4 sweeper=$5 mark=$6
+shift 6
+"$@" && linger=0
+exec 0</dev/null 1>&2
+[ "$linger" = 0 ] || sleep "$linger"
+[ -z "$sweeper" ] || "$python" -SE "$sweeper" "$mark"
+rm -rf -- "$run" "$folder" 2>/dev/null || { chmod -R u+rwx -- "$folder"; rm -rf -- "$folder"; }
+"""
+_KILL_PAUSE_S = 0.01
+_KILL_TIMEOUT_S = 10.0
+
+
+class Order(NamedTuple):
+    """One container to start."""
+
+    tag: str
+    boot: Boot
+    """As the environment sees it; :meth:`Runtime.start` puts the paths in."""
+    folder: ContainerFolder
+    packages: tuple[Path, ...]
+    control: int
+    """Descriptor of the listening control socket."""
+    links: int
+    """Descriptor of the listening link socket."""
+
+
+class Handle:
+    """A container's outermost process, started by this manager or by one before.
+
+    Args:
+        process: The shim.
+        mark: What the container's processes carry, where a kill must look for it; else empty.
+        popen: The shim as a child, if it is one.
+    """
+
+    def __init__(
+        self, process: proc.Process, mark: str, popen: subprocess.Popen[bytes] | None = None
+    ) -> None:
+        self.process = process
+        self._mark = mark
+        self._popen = popen
+
+    @property
+    def alive(self) -> bool:
+        """Whether the shim runs."""
+        return proc.alive(self.process.pid, self.process.start)
+
+    async def wait(self) -> None:
+        """Wait until the shim has ended."""
+        with contextlib.suppress(ProcessLookupError):
+            fd = os.pidfd_open(self.process.pid)
+            try:
+                if self.alive:
+                    await _readable(fd)
+            finally:
+                os.close(fd)
+        self._collect()
+
+    async def kill(self) -> None:
+        """Kill all processes of the container, and wait until none is left.
+
+        Raises:
+            StartError: Some process does not die, not even by SIGKILL.
+        """
+        seen: dict[int, proc.Process] = {}
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + _KILL_TIMEOUT_S
+        while True:
+            processes = proc.table()
+            if self.alive:
+                seen.update((found.pid, found) for found in proc.descendants(self.process.pid, processes))
+            if self._mark:
+                seen.update((found.pid, found) for found in proc.marked(self._mark))
+            left = [one for one in seen.values() if proc.alive(one.pid, one.start)]
+            if not left:
+                break
+            if loop.time() > deadline:
+                raise StartError(f"processes that cannot be killed: {sorted(one.pid for one in left)}")
+            for one in left:
+                proc.kill(one)
+            await asyncio.sleep(_KILL_PAUSE_S)
+        self._collect()
+
+    def _collect(self) -> None:
+        """Take the exit code, so that no zombie is left."""
+        if self._popen is not None and not self.alive:
+            self._popen.wait()
+            self._popen = None
+
+    def abandon(self) -> None:
+        """Leave the container to itself: the manager ends and another may adopt it."""
+        if self._popen is not None:
+            self._popen.returncode = 0
+            self._popen = None
+
+
+class Runtime(ABC):
+    """A way to make containers."""
+
+    name: ClassVar[str]
+    isolated: ClassVar[bool]
+    """Whether the environment is process 1 of its own pid namespace."""
+
+    @abstractmethod
+    def probe(self) -> None:
+        """Find out whether the runtime works on this machine. Blocks.
+
+        Raises:
+            RuntimeUnavailableError: It does not; the text says why.
+        """
+
+    @abstractmethod
+    def paths(self, folder: ContainerFolder) -> tuple[str, str]:
+        """Where the container's home and logs are, as seen from inside."""
+
+    @abstractmethod
+    def command(self, order: Order, argv: Sequence[str]) -> tuple[list[str], dict[str, str]]:
+        """The command line, and its environment, by which ``argv`` runs as the container's environment."""
+
+    def start(self, order: Order) -> Handle:
+        """Start a container.
+
+        Raises:
+            StartError: It cannot be started.
+        """
+        home, logs = self.paths(order.folder)
+        boot = encode_boot(order.boot, home, logs)
+        argv, env = self.command(order, [sys.executable, "-P", "-m", "rce_container.environment", boot])
+        folder = order.folder
+        sweeper = "" if self.isolated else proc.__file__
+        shim = [SHELL, "-c", _SHIM, "rce-container-shim", str(folder.path), str(folder.run)]
+        shim += [f"{order.boot.grace:g}", sys.executable, sweeper, folder.mark, *argv]
+        try:
+            with segment_path(folder.logs, ENVIRONMENT_LOG, 0).open("ab") as log:
+                popen = subprocess.Popen(  # noqa: S603
+                    shim, stdin=order.control, stdout=order.links, stderr=log, env=env, start_new_session=True
+                )
+        except OSError as error:
+            raise StartError(f"cannot start {SHELL}: {error}") from error
+        process = proc.read(popen.pid)
+        if process is None:
+            raise StartError(f"{SHELL} ended at once with code {popen.wait()}")
+        return Handle(process, "" if self.isolated else folder.mark, popen)
+
+    def adopt(self, process: proc.Process, mark: str) -> Handle:
+        """Take over a container that an earlier manager started."""
+        return Handle(process, "" if self.isolated else mark)
+
+
+def encode_boot(boot: Boot, home: str, logs: str) -> str:
+    """Write what the environment is told, with its paths."""
+    import msgspec
+
+    return encode(msgspec.structs.replace(boot, home=home, logs=logs)).decode()
+
+
+def clean_environ(home: str) -> dict[str, str]:
+    """The environment variables of a container: nothing of the machine's comes in."""
+    environ = {
+        "PATH": os.pathsep.join((str(Path(sys.executable).parent), "/usr/local/bin", "/usr/bin", "/bin")),
+        "HOME": home,
+        "LANG": "C.UTF-8",
+        "ROS_IP": "127.0.0.1",
+    }
+    root = source_root()
+    if not root.is_relative_to(Path(sys.prefix).resolve()):
+        environ["PYTHONPATH"] = str(root)
+    return environ
+
+
+def source_root() -> Path:
+    """The folder that holds the packages ``rce`` and ``rce_container``."""
+    return Path(__file__).resolve().parents[2]
+
+
+async def _readable(fd: int) -> None:
+    loop = asyncio.get_running_loop()
+    ready = loop.create_future()
+    loop.add_reader(fd, lambda: ready.done() or ready.set_result(None))
+    try:
+        await ready
+    finally:
+        loop.remove_reader(fd)
