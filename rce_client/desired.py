@@ -19,7 +19,7 @@ from rce.protocol.messages import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Iterable
 
     from rce.protocol.messages import Request
 
@@ -89,7 +89,8 @@ class Desired:
                 for item in self._outside(self.interfaces)
             ),
             delete_param=tuple(
-                DeleteParam(container_tag=item.container_tag, name=item.name) for item in self._outside(self.parameters)
+                DeleteParam(container_tag=item.container_tag, name=item.name)
+                for item in self._outside(self.parameters)
             ),
         )
         if components != ConfigureComponents():
@@ -106,7 +107,7 @@ class Desired:
             self.nodes.pop((node.container_tag, node.node_tag), None)
         for removed in request.remove_interfaces:
             self.interfaces.pop((removed.endpoint_tag, removed.interface_tag), None)
-            self._forget_connections(lambda path: path == f"{removed.endpoint_tag}/{removed.interface_tag}")
+            self._forget_connections(f"{removed.endpoint_tag}/{removed.interface_tag}")
         for deleted in request.delete_param:
             self.parameters.pop((deleted.container_tag, deleted.name), None)
         for parameter in request.set_param:
@@ -118,13 +119,16 @@ class Desired:
 
     def _forget_container(self, tag: str) -> None:
         self.containers.pop(tag, None)
-        for items in (self.nodes, self.parameters, self.interfaces):
-            _discard_of(items, tag)
-        self._forget_connections(lambda path: path.startswith(f"{tag}/"))
+        _discard_of(self.nodes, tag)
+        _discard_of(self.parameters, tag)
+        _discard_of(self.interfaces, tag)
+        self._forget_connections(f"{tag}/")
 
-    def _forget_connections(self, names: Callable[[str], bool]) -> None:
-        for pair in [pair for pair in self.connections if any(names(path) for path in pair)]:
-            del self.connections[pair]
+    def _forget_connections(self, place: str) -> None:
+        """Forget the connections of an interface (a path) or of an endpoint (a tag and a slash)."""
+        for pair in list(self.connections):
+            if any(path == place or (place[-1] == "/" and path.startswith(place)) for path in pair):
+                del self.connections[pair]
 
 
 def _discard_of(items: dict[tuple[str, str], Item], endpoint: str) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from http import HTTPStatus
 from typing import TYPE_CHECKING
 from urllib.parse import urlencode, urlsplit
 
@@ -32,7 +33,7 @@ async def locate(
     *,
     version: str = VERSION,
     tls: ssl.SSLContext | None = None,
-    timeout: float = 10.0,  # noqa: ASYNC109 - one deadline for all phases
+    timeout: float = 10.0,
 ) -> str:
     """Ask the master at ``url`` for the WebSocket URL of a robot endpoint.
 
@@ -102,7 +103,7 @@ async def _get(
 def _read_answer(url: str, status: int, body: bytes) -> str:
     """Return the WebSocket URL in the master's answer, or raise what the answer means."""
     text = body.decode(errors="replace").strip()
-    if status != 200:
+    if status != HTTPStatus.OK:
         raise judge_status(status, text or f"{url} answered {status}")
     try:
         found = json.loads(text)["url"]

@@ -5,6 +5,7 @@
     RobotError
     +-- UnreadableError    a data message is not what its interface carries
     +-- MisdirectedError   a data message is for no interface, or for one that takes none
+    +-- BusyError          too much waits already
 """
 
 from __future__ import annotations
@@ -20,3 +21,7 @@ class UnreadableError(RobotError):
 
 class MisdirectedError(RobotError):
     """A data message is for no interface, for one of another class, or for one that only sends."""
+
+
+class BusyError(RobotError):
+    """Too much waits already."""

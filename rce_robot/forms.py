@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 
+from rce.protocol.codec import encode_data
 from rce_robot.exceptions import UnreadableError
 from rce_robot.outbox import Outgoing
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from rce_robot.converters import Converter
     from rce_robot.outbox import Buffer
 
 _json = msgspec.json.Encoder().encode
@@ -30,6 +32,9 @@ def fresh_id() -> str:
 class Form(Protocol):
     """Reads what the robot sends at an interface and writes what it gets there."""
 
+    costly: bool
+    """Whether :meth:`read` and :meth:`show` may take so long that they belong in a thread."""
+
     def read(self, msg: Any, warn: Callable[[str], None]) -> Buffer:
         """Return the serialized message.
 
@@ -41,26 +46,21 @@ class Form(Protocol):
             UnreadableError: It is no such message.
         """
 
-    def write(self, tag: str, cls: str, msg_id: str, payload: Buffer) -> Outgoing:
-        """Return the data message that carries a serialized message to the robot.
+    def show(self, payload: Buffer) -> Any:
+        """Return what stands for a serialized message in ``msg``.
 
         Raises:
             UnreadableError: The payload is no such message.
         """
 
-
-class ConverterLike(Protocol):
-    """What :class:`ConverterForm` needs of a converter (:mod:`rce_robot.converters`)."""
-
-    def decode(self, value: Any, /) -> tuple[bytes, Any]:
-        """Return the serialized message and the fields that were ignored."""
-
-    def encode(self, payload: Buffer, /) -> Any:
-        """Return the message as an object; its values may be binary."""
+    def pack(self, tag: str, cls: str, msg_id: str, msg: Any) -> Outgoing:
+        """Return the data message that carries what :meth:`show` returned."""
 
 
 class ForwarderForm:
     """Serialized messages travel as binary values and are never looked into."""
+
+    costly = False
 
     def read(self, msg: Any, warn: Callable[[str], None]) -> Buffer:  # noqa: ARG002 - nothing is ignored here
         """Return the bytes as they came."""
@@ -68,7 +68,11 @@ class ForwarderForm:
             raise UnreadableError("a Forwarder takes a serialized message as binary value 'msg*'")
         return msg
 
-    def write(self, tag: str, cls: str, msg_id: str, payload: Buffer) -> Outgoing:
+    def show(self, payload: Buffer) -> Buffer:
+        """Return the payload."""
+        return payload
+
+    def pack(self, tag: str, cls: str, msg_id: str, msg: Buffer) -> Outgoing:
         """Put the payload behind its id, uncopied."""
         id_ = fresh_id().encode()
         text = b'{"type":"DM","data":{"iTag":"%b","type":"%b","msgID":%b,"msg*":"%b"}}' % (
@@ -77,4 +81,29 @@ class ForwarderForm:
             _json(msg_id),
             id_,
         )
-        return Outgoing(text, ((id_, payload),))
+        return Outgoing(text, ((id_, msg),))
+
+
+class ConverterForm:
+    """Messages travel as JSON objects; their binary values as binary frames."""
+
+    def __init__(self, converter: Converter) -> None:
+        self._converter = converter
+        self.costly = converter.is_costly
+
+    def read(self, msg: Any, warn: Callable[[str], None]) -> Buffer:
+        """Serialize the object; fields that the message does not have are ignored with a warning."""
+        payload, ignored = self._converter.decode(msg)
+        for field in ignored:
+            warn(f"unknown field {field} was ignored")
+        return payload
+
+    def show(self, payload: Buffer) -> Any:
+        """Make an object of the payload."""
+        return self._converter.encode(payload)
+
+    def pack(self, tag: str, cls: str, msg_id: str, msg: Any) -> Outgoing:
+        """Write the object as JSON."""
+        text, *binaries = encode_data(tag, cls, msg, msg_id)
+        assert isinstance(text, str)
+        return Outgoing(text.encode(), tuple((b"", frame) for frame in binaries if isinstance(frame, bytes)))

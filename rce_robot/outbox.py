@@ -181,8 +181,7 @@ class Outbox:
         return None
 
     def discard(self, tag: str) -> None:
-        """Forget what waits for an interface that is gone."""
-        self._states.pop(tag, None)
+        """Forget the messages of an interface that is gone; that it is gone is still said."""
         flow = self._flows.pop(tag, None)
         if flow is not None and flow.messages:
             self._ring.remove(flow)

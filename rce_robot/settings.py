@@ -21,7 +21,7 @@ class SessionSettings:
     max_message: int = 64 << 20
     """Largest WebSocket message that a robot may send."""
     write_buffer: tuple[int, int] = (128 << 10, 32 << 10)
-    """What waits for a robot stays in its outbox, where it can be overtaken, while so much waits in the socket."""
+    """Limits of what waits in the socket; the rest waits in the outbox, where it can be overtaken."""
     max_requests: int = 256
     """Requests to the master (``CC``, ``DC``, ``CN``, ``CX``) that may wait."""
     max_calls: int = 1024

@@ -40,6 +40,7 @@ _FIN_TEXT = 0x80 | Opcode.TEXT
 _FIN_BINARY = 0x80 | Opcode.BINARY
 _SHORT = struct.Struct("!BB")
 _MEDIUM = struct.Struct("!BBH")
+_TWO_BYTE_LENGTH, _EIGHT_BYTE_LENGTH = 126, 127
 _LONG = struct.Struct("!BBQ")
 _JOIN_BELOW = 16 << 10
 """Below this many bytes a copy costs less than another buffer in the transport's queue."""
@@ -48,10 +49,10 @@ _JOIN_BELOW = 16 << 10
 class Receiver(Protocol):
     """What a :class:`RobotSocket` tells of. All methods are called in the event loop and must not block."""
 
-    def on_text(self, text: Buffer) -> None:
+    def on_text(self, text: bytes) -> None:
         """A text message came; not yet checked to be UTF-8."""
 
-    def on_binary(self, data: Buffer) -> None:
+    def on_binary(self, data: bytes) -> None:
         """A binary message came."""
 
     def on_writable(self) -> None:
@@ -104,7 +105,7 @@ class RobotSocket(ServerConnection):
         self._failed = False
         sock = transport.get_extra_info("socket")
         if sock is not None and hasattr(socket, "TCP_NOTSENT_LOWAT") and sock.family != socket.AF_UNIX:
-            # Without it megabytes of old images fill the kernel's buffer, where no newer message can pass them.
+            # Without it megabytes of old images fill the kernel's buffer, where nothing can pass them.
             with contextlib.suppress(OSError):
                 sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_LOW_WATER)
 
@@ -148,20 +149,20 @@ class RobotSocket(ServerConnection):
         if self.receiver is None:
             self.fail(CloseCode.PROTOCOL_ERROR, "a message came before the handshake was answered")
         elif opcode is Opcode.TEXT:
-            self.receiver.on_text(data)
+            self.receiver.on_text(bytes(data))
         else:
-            self.receiver.on_binary(data)
+            self.receiver.on_binary(bytes(data))
 
 
 def _add_frame(buffers: list[Buffer], first: int, head: bytes, body: Buffer) -> None:
     """Append an unmasked frame (RFC 6455, section 5.2) of the payload ``head`` + ``body``."""
     size = len(head) + len(body)
-    if size < 126:
+    if size < _TWO_BYTE_LENGTH:
         header = _SHORT.pack(first, size)
-    elif size < 65536:
-        header = _MEDIUM.pack(first, 126, size)
+    elif size < 1 << 16:
+        header = _MEDIUM.pack(first, _TWO_BYTE_LENGTH, size)
     else:
-        header = _LONG.pack(first, 127, size)
+        header = _LONG.pack(first, _EIGHT_BYTE_LENGTH, size)
     if size < _JOIN_BELOW:
         buffers.append(b"".join((header, head, body)))
     else:

@@ -1,0 +1,242 @@
+"""Keeps a WebSocket to the engine: dials through the master, sends, receives, and dials again."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import logging
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+from urllib.parse import urlencode, urlsplit, urlunsplit
+
+from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosed
+
+from rce.protocol.limits import Limits
+from rce.protocol.stream import ProtocolStream
+from rce_client.backoff import Backoff, judge
+from rce_client.discovery import VERSION, locate
+from rce_client.exceptions import LostError, RefusedError
+from rce_client.sendqueue import Parcel, QueueLimits, SendQueue
+
+if TYPE_CHECKING:
+    import ssl
+    from collections.abc import Sequence
+
+    from websockets.asyncio.client import ClientConnection
+
+    from rce.protocol.codec import Frame
+    from rce.protocol.stream import Event
+    from rce_client.exceptions import ClientError
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Target:
+    """Whom to connect, and where."""
+
+    url: str
+    """The master, ``http://HOST:9000/`` or ``https://``."""
+    user: str
+    password: str = field(repr=False)
+    robot: str
+    version: str = VERSION
+    tls: ssl.SSLContext | None = None
+    """For ``https`` and ``wss``; the system's settings if None."""
+
+    def query(self) -> str:
+        """Return the query of the WebSocket handshake; the password itself never leaves this machine."""
+        digest = hashlib.sha256(self.password.encode()).hexdigest()
+        return urlencode({"userID": self.user, "robotID": self.robot, "password": digest})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Timing:
+    """Times in seconds, sizes in bytes."""
+
+    locate: float = 10.0
+    """For the master's answer."""
+    open: float = 25.0
+    """For the WebSocket handshake; the endpoint itself may wait some seconds for the master."""
+    ping_interval: float | None = 10.0
+    ping_timeout: float | None = 10.0
+    close: float = 3.0
+    flush: float = 5.0
+    """For what waits to be sent when the connection is closed by the program."""
+    max_message: int = 64 << 20
+    write_buffer: tuple[int, int] = (128 << 10, 32 << 10)
+    """What waits stays in the queue, where it can be overtaken, while so much waits in the socket."""
+    backoff: Backoff = field(default_factory=Backoff)
+
+
+class Listener(Protocol):
+    """What a courier tells of. Called in the event loop; must not block."""
+
+    def on_connecting(self) -> None:
+        """An attempt to connect begins."""
+
+    def on_failure(self, error: ClientError) -> None:
+        """It failed; another one follows unless the error is a :class:`RefusedError`."""
+
+    def on_connected(self) -> None:
+        """The connection is there; what is posted from now on is sent."""
+
+    def on_lost(self, error: LostError) -> None:
+        """The connection ended."""
+
+    def on_event(self, event: Event) -> None:
+        """Something came."""
+
+
+class Courier:
+    """One robot's way to the engine, through any number of connections."""
+
+    def __init__(
+        self,
+        target: Target,
+        listener: Listener,
+        timing: Timing | None = None,
+        limits: QueueLimits | None = None,
+    ) -> None:
+        self._target = target
+        self._listener = listener
+        self._timing = timing or Timing()
+        self._queue = SendQueue(limits or QueueLimits())
+        self._idle = asyncio.Event()
+        self._idle.set()
+        self.connected = False
+        self.dropped = self._queue.dropped
+        """Interface tag to the number of its messages that found no room to wait."""
+
+    async def run(self) -> None:
+        """Connect again and again, until cancelled.
+
+        Raises:
+            RefusedError: The engine does not want this client.
+        """
+        delays = self._timing.backoff.delays()
+        while True:
+            self._listener.on_connecting()
+            try:
+                socket = await self._dial()
+            except Exception as raised:
+                error = judge(raised)
+                self._listener.on_failure(error)
+                if isinstance(error, RefusedError):
+                    raise error from raised
+                await asyncio.sleep(next(delays))
+                continue
+            delays = self._timing.backoff.delays()
+            self._listener.on_lost(await self._use(socket))
+            await asyncio.sleep(next(delays))
+
+    def post_data(self, tag: str, frames: Sequence[Frame]) -> bool:
+        """Send a topic's message when its turn comes; False if there is no connection."""
+        if self.connected:
+            self._idle.clear()
+            self._queue.put_data(tag, Parcel.of(frames))
+        return self.connected
+
+    def post_control(self, frames: Sequence[Frame]) -> bool:
+        """Send a message that must not be lost; False if there is no connection or too much waits."""
+        if not self.connected or self._queue.full:
+            return False
+        self.post_request(frames)
+        return True
+
+    def post_request(self, frames: Sequence[Frame]) -> None:
+        """Send a message even if much waits already. For what the program waits for, or asks once."""
+        self._idle.clear()
+        self._queue.put_control(Parcel.of(frames))
+
+    async def deliver(self, frames: Sequence[Frame]) -> None:
+        """Send a message and wait until it was handed to the network.
+
+        Raises:
+            LostError: There is no connection, or it ended before.
+        """
+        if not self.connected:
+            raise LostError("not connected")
+        parcel = Parcel.of(frames)
+        parcel.sent = asyncio.get_running_loop().create_future()
+        self._idle.clear()
+        self._queue.put_control(parcel)
+        await parcel.sent
+
+    async def flush(self) -> None:
+        """Wait until nothing waits to be sent, at most :attr:`Timing.flush`."""
+        try:
+            async with asyncio.timeout(self._timing.flush):
+                await self._idle.wait()
+        except TimeoutError:
+            _log.warning("the engine takes no messages; what waits to be sent is lost")
+
+    async def _dial(self) -> ClientConnection:
+        target, timing = self._target, self._timing
+        url = await locate(
+            target.url, target.user, version=target.version, tls=target.tls, timeout=timing.locate
+        )
+        parts = urlsplit(url)
+        return await connect(
+            urlunsplit(parts._replace(query=target.query())),
+            ssl=target.tls if parts.scheme == "wss" else None,
+            compression=None,  # costs more time than it saves for all but slow links
+            proxy=None,
+            max_size=timing.max_message,
+            open_timeout=timing.open,
+            ping_interval=timing.ping_interval,
+            ping_timeout=timing.ping_timeout,
+            close_timeout=timing.close,
+            write_limit=timing.write_buffer,
+        )
+
+    async def _use(self, socket: ClientConnection) -> LostError:
+        """Send and receive until the connection ends; return why it did."""
+        self.connected = True
+        error = LostError("the connection was closed")
+        try:
+            async with socket, asyncio.TaskGroup() as tasks:
+                writer = tasks.create_task(self._write(socket))
+                self._listener.on_connected()
+                error = await self._read(socket)
+                writer.cancel()
+        finally:
+            self.connected = False
+            self._queue.clear()
+            self._idle.set()
+        return error
+
+    async def _read(self, socket: ClientConnection) -> LostError:
+        limit = self._timing.max_message
+        stream = ProtocolStream.for_client(Limits(max_text=limit, max_binary=limit))
+        now = asyncio.get_running_loop().time
+        try:
+            while True:
+                frame = await socket.recv()
+                for event in stream.feed(frame, now()):
+                    self._listener.on_event(event)
+                deadline = stream.next_deadline
+                if deadline is not None and deadline <= now():
+                    for event in stream.expire(now()):
+                        self._listener.on_event(event)
+        except ConnectionClosed as closed:
+            reason = closed.rcvd.reason if closed.rcvd is not None else ""
+            return LostError(reason or f"the connection ended: {closed}")
+
+    async def _write(self, socket: ClientConnection) -> None:
+        while True:
+            parcel = self._queue.pop()
+            if parcel is None:
+                self._idle.set()
+                parcel = await self._queue.get()
+            try:
+                for frame in parcel.frames:
+                    await socket.send(frame)
+                if parcel.sent is not None and not parcel.sent.done():
+                    parcel.sent.set_result(None)
+            except ConnectionClosed:
+                return
+            finally:
+                if parcel.sent is not None and not parcel.sent.done():
+                    parcel.sent.set_exception(LostError("the connection ended while the message was sent"))

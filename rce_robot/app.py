@@ -1,0 +1,146 @@
+"""Puts the task set together and runs it until it is told to stop."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import secrets
+import signal
+import socket
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import psutil
+
+from rce.config.folders import run_dir
+from rce.control.channel import TaskSetChannel
+from rce.control.messages import MachineInfo
+from rce.control.model import LinkAddress
+from rce.link import LinkHub
+from rce.ros.packages import PackageIndex
+from rce.ros.types import TypeRegistry
+from rce_robot.factory import FormFactory
+from rce_robot.gate import Gate
+from rce_robot.server import serve_robots
+from rce_robot.settings import RobotSettings
+from rce_robot.taskset import RobotTaskSet
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Sequence
+    from pathlib import Path
+
+    from rce.config.secret import Secret
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class App:
+    """A robot task set that is to be run."""
+
+    master: str
+    """Host of the master."""
+    control_port: int
+    secret: Secret
+    packages: Sequence[Path]
+    settings: RobotSettings
+
+    async def run(self, ready: Callable[[str], None]) -> None:
+        """Run until SIGINT or SIGTERM.
+
+        Args:
+            ready: Called with the WebSocket URL when robots can come.
+
+        Raises:
+            OSError: A port cannot be taken.
+        """
+        stop = asyncio.Event()
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, stop.set)
+        async with self.started(ready):
+            await stop.wait()
+
+    @contextlib.asynccontextmanager
+    async def started(self, ready: Callable[[str], None]) -> AsyncIterator[None]:
+        """Run for as long as the context lasts."""
+        settings = self.settings
+        machine = settings.machine or socket.gethostname()
+        reach = _own_address(self.master, self.control_port) if _is_any(settings.host) else settings.host
+        name = f"robot_{secrets.token_hex(4)}"
+        types = TypeRegistry(PackageIndex([*self.packages, *PackageIndex.from_environ().path]))
+        hub = LinkHub(machine)
+        try:
+            address = await _listen(hub, machine, name, reach, settings)
+            listener = await _bind(settings.host, settings.ws_port)
+            port: int = listener.getsockname()[1]
+            url = settings.public_url or f"ws://{_in_url(reach)}:{port}/"
+            info = MachineInfo(name=machine, cores=os.cpu_count() or 0, memory=psutil.virtual_memory().total)
+            task_set = RobotTaskSet(
+                hub, FormFactory(types), settings, name=name, machine=info, url=url, address=address
+            )
+            control = f"ws://{_in_url(self.master)}:{self.control_port}"
+            channel = TaskSetChannel(control, self.secret, task_set.hello, task_set.handle)
+            task_set.use(channel)
+            gate = Gate(task_set, settings.session, settings.origins)
+            async with asyncio.TaskGroup() as tasks:
+                running = [tasks.create_task(channel.run())]
+                async with serve_robots(gate, settings, listener):
+                    running.append(tasks.create_task(task_set.run()))
+                    running.append(tasks.create_task(_announce(channel, url, ready)))
+                    yield
+                for task in reversed(running):
+                    task.cancel()
+        finally:
+            await hub.close()
+
+
+async def _announce(channel: TaskSetChannel, url: str, ready: Callable[[str], None]) -> None:
+    """Say that robots can come, once the master knows where to send them."""
+    await channel.wait_connected()
+    ready(url)
+
+
+async def _listen(hub: LinkHub, machine: str, name: str, reach: str, settings: RobotSettings) -> LinkAddress:
+    """Accept links on a unix socket and on TCP; return where."""
+    path = run_dir() / f"{name}.sock"
+    await hub.listen_unix(path)
+    port = await hub.listen_tcp(settings.host, settings.link_port)
+    return LinkAddress(machine=machine, unix=str(path), host=reach, port=port)
+
+
+async def _bind(host: str, port: int) -> socket.socket:
+    """Take the WebSocket port, so that its number is known before anything is told to the master."""
+    infos = await asyncio.get_running_loop().getaddrinfo(
+        host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+    )
+    family, _, _, _, address = infos[0]
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(address)
+    except BaseException:
+        listener.close()
+        raise
+    listener.setblocking(False)
+    return listener
+
+
+def _is_any(host: str) -> bool:
+    return host in ("", "0.0.0.0", "::")  # noqa: S104 - compared, not bound
+
+
+def _own_address(master: str, port: int) -> str:
+    """Return the address of this machine on the way to the master; nothing is sent for it."""
+    with contextlib.suppress(OSError):
+        family, _, _, _, address = socket.getaddrinfo(master, port, type=socket.SOCK_DGRAM)[0]
+        with socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.connect(address)
+            return str(probe.getsockname()[0])
+    return "127.0.0.1"
+
+
+def _in_url(host: str) -> str:
+    return f"[{host}]" if ":" in host else host

@@ -1,0 +1,54 @@
+"""Chooses what reads and writes the messages of a robot's interface, by its type and class."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rce.link import InterfaceError
+from rce.protocol.names import Form as FormName
+from rce.protocol.names import InterfaceType, Role
+from rce.ros.types import TypesError
+from rce_robot.converters import Converters
+from rce_robot.forms import ConverterForm, ForwarderForm
+
+if TYPE_CHECKING:
+    from rce.control.model import InterfaceSpec
+    from rce.ros.types import MessageType, TypeRegistry
+    from rce_robot.forms import Form
+
+
+class FormFactory:
+    """Makes the forms of interfaces; converters are shared by all interfaces of a message type."""
+
+    def __init__(self, types: TypeRegistry, converters: Converters | None = None) -> None:
+        self._types = types
+        self._converters = converters or Converters()
+
+    def pair(self, spec: InterfaceSpec, type_: InterfaceType) -> tuple[Form, Form]:
+        """Return the forms from and to the robot.
+
+        Raises:
+            InterfaceError: The interface is none of a robot, or its class is not known.
+        """
+        if type_.form is FormName.INTERFACE:
+            raise InterfaceError(
+                f"{spec.tag}: {type_} is a container's; a robot has Converters and Forwarders"
+            )
+        if type_.form is FormName.FORWARDER:
+            form = ForwarderForm()
+            return form, form
+        inwards, outwards = self._resolve(spec, type_.role)
+        return ConverterForm(self._converters.of(inwards)), ConverterForm(self._converters.of(outwards))
+
+    def _resolve(self, spec: InterfaceSpec, role: Role) -> tuple[MessageType, MessageType]:
+        """Return the message types from and to the robot."""
+        try:
+            if not role.is_service:
+                message = self._types.message(spec.cls)
+                return message, message
+            service = self._types.service(spec.cls)
+        except TypesError as error:
+            raise InterfaceError(f"{spec.tag}: {error}") from error
+        if role is Role.SERVICE_PROVIDER:  # the robot asks
+            return service.request, service.response
+        return service.response, service.request

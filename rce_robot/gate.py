@@ -1,0 +1,94 @@
+"""The door: who may connect, decided while the WebSocket handshake waits for its answer."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Protocol
+from urllib.parse import urlsplit
+
+from websockets.protocol import State
+
+from rce.protocol.exceptions import HandshakeError
+from rce.protocol.http import read_credentials
+from rce.protocol.names import EndpointId
+from rce_robot.session import Session
+from rce_robot.websocket import RobotSocket
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
+
+    from rce.control.model import EndpointSpec
+    from rce.protocol.http import Credentials
+    from rce_robot.namespace import Namespace
+    from rce_robot.settings import SessionSettings
+
+_log = logging.getLogger(__name__)
+
+_FORBIDDEN, _CONFLICT = 403, 409
+
+
+class House(Protocol):
+    """Who lives here, and who knows who may."""
+
+    async def log_in(self, credentials: Credentials) -> EndpointSpec:
+        """Ask the master; raises :class:`HandshakeError` with its answer if the robot may not come in."""
+
+    def find(self, id: EndpointId) -> Namespace | None:  # noqa: A002
+        """Return the robot's namespace if there is one."""
+
+    async def settle(self, spec: EndpointSpec) -> Namespace:
+        """Return the robot's namespace with the spec applied."""
+
+
+class Gate:
+    """Answers handshakes. Used as ``process_request`` of the WebSocket server."""
+
+    def __init__(self, house: House, settings: SessionSettings, origins: Collection[str]) -> None:
+        self._house = house
+        self._settings = settings
+        self._origins = origins
+
+    async def admit(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Let a robot in (None), or say why not."""
+        assert isinstance(connection, RobotSocket)
+        if request.headers.get("Upgrade", "").lower() != "websocket":
+            return None  # the library knows what to say to what is no WebSocket handshake
+        try:
+            self._check_origin(request.headers.get("Origin"))
+            credentials = read_credentials(urlsplit(request.path).query)
+            namespace = await self._claim(credentials)
+        except HandshakeError as error:
+            _log.info("refused %s: %s %s", connection.remote_address, error.status, error.reason)
+            return connection.respond(error.status, f"{error.reason}\n")
+        if namespace.session is not None:
+            return connection.respond(_CONFLICT, f"{_already(namespace.id)}\n")
+        session = Session(connection, namespace, self._settings, namespace.dropped)
+        namespace.session = session
+        connection.receiver = session
+        if connection.protocol.state is not State.CONNECTING:
+            session.on_lost("the robot left during the handshake")
+        return None
+
+    def _check_origin(self, origin: str | None) -> None:
+        """Refuse pages of other sites: a browser would let them in with whatever its user may reach."""
+        if origin is not None and origin not in self._origins and "*" not in self._origins:
+            raise HandshakeError(_FORBIDDEN, f"Origin {origin} may not connect here.")
+
+    async def _claim(self, credentials: Credentials) -> Namespace:
+        """Log in. A former connection of the robot that turns out to be dead makes room for the new one."""
+        try:
+            spec = await self._house.log_in(credentials)
+        except HandshakeError as error:
+            namespace = self._house.find(EndpointId(credentials.user, credentials.robot))
+            former = None if namespace is None else namespace.session
+            if error.status != _CONFLICT or former is None or await former.probe():
+                raise
+            spec = await self._house.log_in(credentials)
+        return await self._house.settle(spec)
+
+
+def _already(robot: EndpointId) -> str:
+    return f"Robot {robot.tag} of user {robot.user} is already connected."

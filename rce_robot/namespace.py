@@ -1,0 +1,221 @@
+"""One robot as the engine knows it, connected or not: its endpoint, its interfaces and its session.
+
+The endpoint outlives connections: while a robot is away its interfaces and their connections stay, until
+the master drops the robot or it comes back.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from typing import TYPE_CHECKING, Any, Protocol
+
+import msgspec
+
+from rce.control.model import EndpointState, EndpointStatus, EndpointUsage
+from rce.link import Endpoint
+from rce.protocol.names import EndpointId, InterfaceType
+from rce_robot.exceptions import MisdirectedError
+from rce_robot.interfaces import RobotInterface, make_interface
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine
+
+    from rce.control.model import EndpointSpec, InterfaceSpec, LinkAddress
+    from rce.link import Interface, LinkHub, Port
+    from rce.protocol.messages import DataMessage, Request
+    from rce_robot.forms import Form
+    from rce_robot.outbox import Overflow, Queued
+    from rce_robot.session import Session
+
+
+class Forms(Protocol):
+    """Makes what reads and writes an interface's messages."""
+
+    def pair(self, spec: InterfaceSpec, type_: InterfaceType) -> tuple[Form, Form]:
+        """Return the forms from and to the robot; raises :class:`rce.link.InterfaceError` for a bad spec."""
+
+
+class Headquarters(Protocol):
+    """What a namespace tells and asks the task set."""
+
+    def changed(self, namespace: Namespace) -> None:
+        """The robot's status changed."""
+
+    def failed(self, namespace: Namespace, text: str) -> None:
+        """Something failed that the robot's user must know."""
+
+    def robot_left(self, namespace: Namespace, reason: str) -> None:
+        """The robot's connection ended."""
+
+    async def ask_master(self, id: EndpointId, request: Request) -> tuple[str, ...]:  # noqa: A002
+        """Have the master carry out a robot's request; return what went wrong."""
+
+
+class Namespace:
+    """A robot. Implements :class:`rce_robot.interfaces.RobotSide` and :class:`rce_robot.session.Owner`.
+
+    Invariants: at most one session; ``_interfaces`` holds exactly what the endpoint has made and not closed.
+    """
+
+    def __init__(
+        self,
+        id: EndpointId,  # noqa: A002
+        hub: LinkHub,
+        forms: Forms,
+        headquarters: Headquarters,
+        address: LinkAddress,
+        *,
+        call_timeout: float,
+    ) -> None:
+        self.id = id
+        self.revision = 0
+        self._address = address
+        self.session: Session | None = None
+        """The session from handshake to end, also while it cannot send (yet, or any more)."""
+        self.dropped: Counter[str] = Counter()
+        self._live: Session | None = None
+        self._forms = forms
+        self._headquarters = headquarters
+        self._call_timeout = call_timeout
+        self._interfaces: dict[str, RobotInterface] = {}
+        self._applying = asyncio.Lock()
+        self._endpoint = Endpoint(id, self._make, hub, on_change=self._changed, on_fault=self._failed)
+
+    async def apply(self, spec: EndpointSpec) -> None:
+        """Make interfaces and connections as desired; an older revision than the applied one is ignored."""
+        async with self._applying:
+            if spec.revision >= self.revision:
+                self.revision = spec.revision
+                await self._endpoint.apply(spec)
+        self._changed()
+
+    async def close(self, reason: str) -> None:
+        """End the connection, if there is one, and give up everything."""
+        if self.session is not None:
+            await self.session.close(reason)
+        async with self._applying:
+            await self._endpoint.close()
+
+    def status(self) -> EndpointStatus:
+        """Return what the master is told."""
+        return EndpointStatus(
+            id=str(self.id),
+            revision=self.revision,
+            state=EndpointState.RUNNING if self.session is not None else EndpointState.ABSENT,
+            interfaces=dict(self._endpoint.interfaces),
+            connections=tuple(self._endpoint.connections),
+            address=self._address,
+        )
+
+    def usage(self) -> EndpointUsage:
+        """Return the counters, with what was dropped on the way to the robot added."""
+        return EndpointUsage(
+            interfaces={
+                tag: msgspec.structs.replace(usage, dropped=usage.dropped + self.dropped[tag])
+                for tag, usage in self._endpoint.usage().items()
+            }
+        )
+
+    def tick(self) -> None:
+        """Do what is to be done every few seconds."""
+        if self._live is not None:
+            self._live.tick()
+
+    # rce_robot.session.Owner
+
+    def take(self, message: DataMessage) -> None:
+        """Give a data message of the robot to its interface.
+
+        Raises:
+            RobotError: It is refused.
+        """
+        interface = self._interfaces.get(message.i_tag)
+        if interface is None:
+            raise MisdirectedError(f"{message.i_tag}: robot {self.id.tag} has no such interface")
+        if message.type != interface.cls:
+            raise MisdirectedError(f"{message.i_tag}: carries {interface.cls}, not {message.type}")
+        interface.take(message)
+
+    async def ask_master(self, request: Request) -> tuple[str, ...]:
+        """Have a request of the robot carried out."""
+        return await self._headquarters.ask_master(self.id, request)
+
+    def joined(self, session: Session) -> None:
+        """Give the robot what it must know at once."""
+        self._live = session
+        for interface in list(self._interfaces.values()):
+            interface.robot_joined()
+
+    def leaving(self, session: Session) -> None:
+        """Fail what waits for the robot."""
+        if self._live is session:
+            self._live = None
+        for interface in list(self._interfaces.values()):
+            interface.robot_left()
+
+    def left(self, session: Session, reason: str) -> None:
+        """Tell the master."""
+        if self.session is session:
+            self.session = None
+            self._changed()
+            self._headquarters.robot_left(self, reason)
+
+    # rce_robot.interfaces.RobotSide
+
+    @property
+    def connected(self) -> bool:
+        """Whether something can be sent to the robot."""
+        return self._live is not None
+
+    def send_data(self, tag: str, message: Queued, overflow: Overflow) -> bool:
+        """Send in the data lane."""
+        return self._live is not None and self._live.send_data(tag, message, overflow)
+
+    def send_urgent(self, message: Queued) -> bool:
+        """Send in the control lane."""
+        return self._live is not None and self._live.send_urgent(message)
+
+    def report(self, text: str) -> None:
+        """Send an ``ER``, if the robot is there."""
+        if self._live is not None:
+            self._live.report(text)
+
+    def show_active(self, tag: str, active: bool) -> None:
+        """Send an ``ST``, if the robot is there."""
+        if self._live is not None:
+            self._live.show_active(tag, active)
+
+    def run(self, work: Coroutine[Any, Any, None]) -> bool:
+        """Run something until the robot leaves."""
+        if self._live is None:
+            work.close()
+            return False
+        return self._live.spawn(work)
+
+    def count_dropped(self, tag: str) -> None:
+        """Count a message that was thrown away before it was queued."""
+        self.dropped[tag] += 1
+
+    def closed(self, interface: RobotInterface) -> None:
+        """Forget an interface that the endpoint closed."""
+        if self._interfaces.get(interface.tag) is interface:
+            del self._interfaces[interface.tag]
+            self.dropped.pop(interface.tag, None)
+            if self._live is not None:
+                self._live.discard(interface.tag)
+
+    # What the endpoint calls
+
+    def _make(self, port: Port) -> Interface:
+        type_ = InterfaceType.parse(port.spec.type)
+        form_in, form_out = self._forms.pair(port.spec, type_)
+        interface = make_interface(type_.role, port, self, form_in, form_out, call_timeout=self._call_timeout)
+        self._interfaces[interface.tag] = interface
+        return interface
+
+    def _changed(self) -> None:
+        self._headquarters.changed(self)
+
+    def _failed(self, text: str) -> None:
+        self._headquarters.failed(self, text)

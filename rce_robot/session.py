@@ -1,0 +1,270 @@
+"""One robot's connection, from handshake to end: what it sends is handled, what it gets is queued.
+
+Data messages are handled right where the network hands them over. What takes time runs in the session's
+task group: requests to the master one after another, service calls side by side.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from typing import TYPE_CHECKING, Any, Protocol
+
+import msgspec
+from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
+
+from rce.protocol.codec import encode
+from rce.protocol.limits import Limits
+from rce.protocol.messages import (
+    ConfigureComponents,
+    ConfigureConnections,
+    DataMessage,
+    ErrorReport,
+    InterfaceStatus,
+    type_of,
+)
+from rce.protocol.stream import Fault, ProtocolStream
+from rce_robot.exceptions import RobotError
+from rce_robot.outbox import Outbox, Outgoing, Overflow
+
+if TYPE_CHECKING:
+    from collections import Counter
+    from collections.abc import Coroutine
+
+    from rce.protocol.messages import Request
+    from rce.protocol.stream import Event
+    from rce_robot.outbox import Queued
+    from rce_robot.settings import SessionSettings
+    from rce_robot.websocket import RobotSocket
+
+_log = logging.getLogger(__name__)
+
+
+class Owner(Protocol):
+    """What a session needs of the robot it belongs to."""
+
+    def take(self, message: DataMessage) -> None:
+        """Handle a data message; raises :class:`RobotError` if it is refused."""
+
+    async def ask_master(self, request: Request) -> tuple[str, ...]:
+        """Have a request carried out; return what went wrong, as texts."""
+
+    def joined(self, session: Session) -> None:
+        """The session can send now."""
+
+    def leaving(self, session: Session) -> None:
+        """The session's connection ended; nothing can be sent any more."""
+
+    def left(self, session: Session, reason: str) -> None:
+        """Everything that the session received was handled. Its last word."""
+
+
+class Session:
+    """A robot that is connected. Implements :class:`rce_robot.websocket.Receiver`.
+
+    Life: made in the handshake; :meth:`run` from its end on; :meth:`on_lost` when the connection ends, with
+    or without a completed handshake; then the requests that wait are carried out, and :attr:`ended` is set.
+    """
+
+    def __init__(
+        self, socket: RobotSocket, owner: Owner, settings: SessionSettings, dropped: Counter[str]
+    ) -> None:
+        self._socket = socket
+        self._owner = owner
+        self._settings = settings
+        self._drain_timeout = settings.drain_timeout
+        limits = Limits(max_text=settings.max_message, max_binary=settings.max_message)
+        self._stream = ProtocolStream.for_engine(limits)
+        self._outbox = Outbox(settings.outbox, dropped)
+        self._requests: asyncio.Queue[Request | None] = asyncio.Queue()
+        self._tasks: asyncio.TaskGroup | None = None
+        self._calls: set[asyncio.Task[None]] = set()
+        self._now = asyncio.get_running_loop().time
+        self._reason = ""
+        self.lost = False
+        """Whether the connection ended."""
+        self.ended = asyncio.Event()
+        """Set when nothing of the session is left."""
+
+    async def run(self) -> None:
+        """Serve the robot until its connection ended and its last requests were carried out."""
+        try:
+            async with asyncio.TaskGroup() as self._tasks:
+                worker = self._tasks.create_task(self._carry_out_requests())
+                if not self.lost:
+                    self._owner.joined(self)
+                await self._socket.wait_closed()
+                for call in self._calls:
+                    call.cancel()
+                await asyncio.wait([worker], timeout=self._drain_timeout)
+                worker.cancel()
+        finally:
+            self._tasks = None
+            self._end()
+
+    async def close(self, reason: str, code: int = CloseCode.POLICY_VIOLATION) -> None:
+        """Close the connection, forget the robot's requests and wait until the session has ended."""
+        self._drain_timeout = 0.0
+        await self._socket.close(code, reason[:100])
+        await self.ended.wait()
+
+    async def probe(self) -> bool:
+        """Tell whether the robot still answers; a connection that does not is ended."""
+        if not self.lost:
+            with contextlib.suppress(TimeoutError, ConnectionClosed):
+                async with asyncio.timeout(self._settings.probe_timeout):
+                    await (await self._socket.ping())
+                    return True
+            self._socket.abort()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(self._settings.probe_timeout):
+                await self.ended.wait()
+        return not self.ended.is_set()
+
+    def tick(self) -> None:
+        """Drop what has been incomplete for too long; to be called every few seconds."""
+        for event in self._stream.expire(self._now()):
+            self._handle(event)
+
+    # To the robot
+
+    def send_data(self, tag: str, message: Queued, overflow: Overflow) -> bool:
+        """Send in the data lane; False if the queue refuses or the connection ended."""
+        if self._socket.writable and not self._outbox:
+            self._write(message)
+            return True
+        return not self.lost and self._outbox.put_data(tag, message, overflow)
+
+    def send_urgent(self, message: Queued) -> bool:
+        """Send in the control lane; False if that is full or the connection ended."""
+        if self._socket.writable and not self._outbox:
+            self._write(message)
+            return True
+        return not self.lost and self._outbox.put_control(message)
+
+    def report(self, text: str) -> None:
+        """Send an ``ER``; one that finds the lane full is dropped, the log has it."""
+        if not self.send_urgent(_outgoing(ErrorReport(text=text))):
+            _log.info("not sent: %s", text)
+
+    def show_active(self, tag: str, active: bool) -> None:
+        """Send an ``ST``."""
+        message = _outgoing(InterfaceStatus(i_tag=tag, status=active))
+        if self._socket.writable and not self._outbox:
+            self._write(message)
+        elif not self.lost:
+            self._outbox.put_state(tag, message)
+
+    def discard(self, tag: str) -> None:
+        """Forget what waits for an interface that is gone."""
+        self._outbox.discard(tag)
+
+    def spawn(self, work: Coroutine[Any, Any, None]) -> bool:
+        """Run something until the connection ends; False if too much runs already."""
+        if self._tasks is None or self.lost or len(self._calls) >= self._settings.max_calls:
+            work.close()
+            return False
+        task = self._tasks.create_task(self._guard(work))
+        self._calls.add(task)
+        task.add_done_callback(self._calls.discard)
+        return True
+
+    # From the robot: rce_robot.websocket.Receiver
+
+    def on_text(self, text: bytes) -> None:
+        """Handle a text frame."""
+        for event in self._stream.feed_text(text, self._now()):
+            if type(event) is Fault and not _is_utf8(text):
+                self._socket.fail(CloseCode.INVALID_DATA, "a text frame is not UTF-8")
+                return
+            self._handle(event)
+
+    def on_binary(self, data: bytes) -> None:
+        """Handle a binary frame."""
+        for event in self._stream.feed_binary(data, self._now()):
+            self._handle(event)
+
+    def on_writable(self) -> None:
+        """Send what waits, as far as the connection takes it."""
+        while self._socket.writable:
+            message = self._outbox.pop()
+            if message is None:
+                return
+            self._write(message)
+
+    def on_lost(self, reason: str) -> None:
+        """Stop sending, and let :meth:`run` come to its end."""
+        self.lost = True
+        self._reason = reason
+        self._owner.leaving(self)
+        self._requests.put_nowait(None)
+        if self._tasks is None:
+            self._end()
+
+    # Own
+
+    def _end(self) -> None:
+        if not self.ended.is_set():
+            self.ended.set()
+            self._owner.left(self, self._reason)
+
+    def _write(self, message: Queued) -> None:
+        rendered = message.render()
+        if rendered is not None:
+            self._socket.write(rendered)
+
+    def _handle(self, event: Event) -> None:
+        match event:
+            case DataMessage():
+                try:
+                    self._owner.take(event)
+                except RobotError as error:
+                    self.report(str(error))
+                except Exception:  # noqa: BLE001 - logged; it must not end anything else
+                    _log.exception("data message at %s", event.i_tag)
+                    self.report(f"{event.i_tag}: internal error; the engine's log tells more")
+            case Fault():
+                self.report(event.text)
+            case ErrorReport() | InterfaceStatus():
+                self.report(f"type: {type_of(event)} is not for clients to send")
+            case _:
+                self._request(event)
+
+    def _request(self, request: Request) -> None:
+        if isinstance(request, (ConfigureComponents, ConfigureConnections)):
+            for fault in request.faults:
+                self.report(fault)
+            request = msgspec.structs.replace(request, faults=())
+        if self._requests.qsize() >= self._settings.max_requests:
+            self.report(f"{type_of(request)}: too many requests wait; this one was dropped")
+        else:
+            self._requests.put_nowait(request)
+
+    async def _guard(self, work: Coroutine[Any, Any, None]) -> None:
+        """Keep a fault of ours in one call from ending the session."""
+        try:
+            await work
+        except Exception:  # noqa: BLE001 - logged; it must not end anything else
+            _log.exception("service call")
+            self.report("internal error in a service call; the engine's log tells more")
+
+    async def _carry_out_requests(self) -> None:
+        """Pass on requests to the master, one at a time and in order."""
+        while (request := await self._requests.get()) is not None:
+            for error in await self._owner.ask_master(request):
+                self.report(error)
+
+
+def _outgoing(message: ErrorReport | InterfaceStatus) -> Outgoing:
+    (text,) = encode(message)
+    return Outgoing(text.encode() if isinstance(text, str) else text)
+
+
+def _is_utf8(text: bytes) -> bool:
+    try:
+        text.decode()
+    except UnicodeDecodeError:
+        return False
+    return True

@@ -1,0 +1,266 @@
+"""The robot task set: robots' namespaces on one side, the master on the other.
+
+It keeps nothing on disk: after a restart the master's ``Sync`` and the robots' return bring everything
+back. While the master is away everything goes on, except that no new robot can log in.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Protocol
+
+import msgspec
+import psutil
+
+from rce.control.exceptions import ControlError
+from rce.control.messages import (
+    CONTROL_VERSION,
+    Drop,
+    Fault,
+    Gone,
+    Hello,
+    Left,
+    MachineInfo,
+    Notify,
+    Put,
+    Status,
+    Sync,
+    TaskSetKind,
+    Usage,
+)
+from rce.control.model import EndpointKind, LinkAddress
+from rce.protocol.exceptions import HandshakeError
+from rce.protocol.messages import type_of
+from rce.protocol.names import EndpointId
+from rce_robot.namespace import Namespace
+
+if TYPE_CHECKING:
+    from rce.control.messages import ClientReply, LoginReply, ToMaster, ToTaskSet
+    from rce.control.model import EndpointSpec
+    from rce.link import LinkHub
+    from rce.protocol.http import Credentials
+    from rce.protocol.messages import Request
+    from rce_robot.namespace import Forms
+    from rce_robot.settings import RobotSettings
+
+_log = logging.getLogger(__name__)
+
+_OK, _UNAVAILABLE = 200, 503
+
+
+class Channel(Protocol):
+    """What is needed of :class:`rce.control.channel.TaskSetChannel`."""
+
+    def send(self, message: ToMaster) -> None:
+        """Send, or drop while the master is away."""
+
+    async def login(self, user: str, robot: str, password: str) -> LoginReply:
+        """Ask whether a robot may come in; raises :class:`ControlError` if the master stays away."""
+
+    async def client_request(self, id: str, type: str, data: object) -> ClientReply:  # noqa: A002
+        """Have a client's request carried out; raises :class:`ControlError` likewise."""
+
+
+class RobotTaskSet:
+    """All robots of one process. Implements what the gate and the namespaces ask for.
+
+    Invariant: every robot has one namespace at most; while an old one is being closed there is no new one.
+
+    Args:
+        hub: Joins the robots' endpoints to others.
+        forms: Makes converters and forwarders.
+        settings: How it is run.
+        name: Names this process to the master.
+        machine: What it runs on.
+        url: Where clients are sent.
+        address: Where links to any of the robots are accepted.
+    """
+
+    def __init__(
+        self,
+        hub: LinkHub,
+        forms: Forms,
+        settings: RobotSettings,
+        *,
+        name: str,
+        machine: MachineInfo,
+        url: str,
+        address: LinkAddress,
+    ) -> None:
+        self._hub = hub
+        self._forms = forms
+        self._settings = settings
+        self._name = name
+        self._machine = machine
+        self._url = url
+        self._address = address
+        self._channel: Channel
+        self._namespaces: dict[EndpointId, Namespace] = {}
+        self._closing: dict[EndpointId, asyncio.Event] = {}
+        self._changed: set[Namespace] = set()
+        self._tasks: asyncio.TaskGroup | None = None
+        self._process = psutil.Process()
+
+    # The master's side
+
+    def use(self, channel: Channel) -> None:
+        """Take the channel, which was made with :meth:`hello` and :meth:`handle`."""
+        self._channel = channel
+
+    def hello(self) -> Hello:
+        """Say who this is and what is there."""
+        return Hello(
+            version=CONTROL_VERSION,
+            kind=TaskSetKind.ROBOT,
+            process=self._name,
+            machine=self._machine,
+            url=self._url,
+            address=self._address,
+            endpoints=tuple(namespace.status() for namespace in self._namespaces.values()),
+        )
+
+    async def handle(self, message: ToTaskSet) -> None:
+        """Do what the master says."""
+        match message:
+            case Put():
+                await self.settle(message.endpoint)
+            case Drop():
+                self._drop(EndpointId.parse(message.id), message.reason or "removed", message.revision)
+            case Sync():
+                await self._sync(message.endpoints)
+            case Notify():
+                self._notify(message)
+            case _:
+                _log.debug("not for a robot task set: %s", type(message).__name__)
+
+    async def run(self) -> None:
+        """Report what is used, until cancelled; then close everything."""
+        try:
+            async with asyncio.TaskGroup() as self._tasks:
+                while True:
+                    await asyncio.sleep(self._settings.usage_interval)
+                    self._report_usage()
+        finally:
+            self._tasks = None
+            for namespace in list(self._namespaces.values()):
+                await namespace.close("the robot endpoint is shutting down")
+            self._namespaces.clear()
+
+    # What the gate asks: rce_robot.gate.House
+
+    async def log_in(self, credentials: Credentials) -> EndpointSpec:
+        """Ask the master whether a robot may come in.
+
+        Raises:
+            HandshakeError: It may not, or the master is away.
+        """
+        try:
+            async with asyncio.timeout(self._settings.login_timeout):
+                reply = await self._channel.login(credentials.user, credentials.robot, credentials.password)
+        except (ControlError, TimeoutError) as error:
+            reason = "The master cannot be reached, so nobody can log in now. Try again."
+            raise HandshakeError(_UNAVAILABLE, reason) from error
+        if reply.endpoint is None:
+            status = reply.status if reply.status != _OK else _UNAVAILABLE
+            raise HandshakeError(status, reply.reason or "Refused by the master.")
+        return reply.endpoint
+
+    def find(self, id: EndpointId) -> Namespace | None:  # noqa: A002
+        """Return the robot's namespace if there is one."""
+        return self._namespaces.get(id)
+
+    async def settle(self, spec: EndpointSpec) -> Namespace:
+        """Return the robot's namespace, made if there is none, with the spec applied."""
+        id_ = EndpointId.parse(spec.id)
+        if spec.kind is not EndpointKind.ROBOT:
+            _log.warning("%s is a %s and lives elsewhere", spec.id, spec.kind.value)
+        while (closing := self._closing.get(id_)) is not None:
+            await closing.wait()
+        namespace = self._namespaces.get(id_)
+        if namespace is None:
+            namespace = self._namespaces[id_] = Namespace(
+                id_, self._hub, self._forms, self, self._address, call_timeout=self._settings.call_timeout
+            )
+        await namespace.apply(spec)
+        return namespace
+
+    # What the namespaces ask: rce_robot.namespace.Headquarters
+
+    def changed(self, namespace: Namespace) -> None:
+        """Report a robot's status, once for all changes of one moment."""
+        if not self._changed:
+            asyncio.get_running_loop().call_soon(self._report_changes)
+        self._changed.add(namespace)
+
+    def failed(self, namespace: Namespace, text: str) -> None:
+        """Report a fault."""
+        self._channel.send(Fault(id=str(namespace.id), text=text, robot=str(namespace.id)))
+
+    def robot_left(self, namespace: Namespace, reason: str) -> None:
+        """Report that a robot's connection ended."""
+        if self._is_current(namespace):
+            self._channel.send(Left(id=str(namespace.id), reason=reason))
+
+    async def ask_master(self, id: EndpointId, request: Request) -> tuple[str, ...]:  # noqa: A002
+        """Have a client's request carried out; return what went wrong."""
+        type_ = type_of(request)
+        try:
+            reply = await self._channel.client_request(str(id), type_, msgspec.to_builtins(request))
+        except ControlError as error:
+            return (f"{type_}: not done, the master cannot be reached: {error}",)
+        return reply.errors
+
+    # Own
+
+    def _is_current(self, namespace: Namespace) -> bool:
+        return self._namespaces.get(namespace.id) is namespace
+
+    def _report_changes(self) -> None:
+        changed, self._changed = self._changed, set()
+        for namespace in changed:
+            if self._is_current(namespace):
+                self._channel.send(Status(status=namespace.status()))
+
+    def _report_usage(self) -> None:
+        times = self._process.cpu_times()
+        for namespace in self._namespaces.values():
+            namespace.tick()
+        self._channel.send(
+            Usage(
+                cpu_s=times.user + times.system,
+                memory=self._process.memory_info().rss,
+                endpoints={str(id_): namespace.usage() for id_, namespace in self._namespaces.items()},
+            )
+        )
+
+    async def _sync(self, specs: tuple[EndpointSpec, ...]) -> None:
+        wanted = {spec.id for spec in specs}
+        for id_ in list(self._namespaces):
+            if str(id_) not in wanted:
+                self._drop(id_, "the master does not know this robot any more", 0)
+        for spec in specs:
+            await self.settle(spec)
+
+    def _drop(self, id_: EndpointId, reason: str, revision: int) -> None:
+        """Start to close a robot's namespace; the master hears when it is gone."""
+        namespace = self._namespaces.pop(id_, None)
+        if namespace is None or self._tasks is None:
+            self._channel.send(Gone(id=str(id_), revision=revision))
+            return
+        self._closing[id_] = asyncio.Event()
+        self._tasks.create_task(self._close(namespace, reason, revision))
+
+    async def _close(self, namespace: Namespace, reason: str, revision: int) -> None:
+        try:
+            await namespace.close(reason)
+        except Exception:  # noqa: BLE001 - logged; it must not end anything else
+            _log.exception("closing robot %s", namespace.id)
+        finally:
+            self._closing.pop(namespace.id).set()
+        self._channel.send(Gone(id=str(namespace.id), revision=revision))
+
+    def _notify(self, message: Notify) -> None:
+        for id_, namespace in self._namespaces.items():
+            if message.id in (str(id_), id_.user):
+                namespace.report(message.text)
