@@ -1,0 +1,296 @@
+"""A robot task set with a master and a container that are made of a few lines, all in one process."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import shutil
+import tempfile
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from rce.config.secret import Secret
+from rce.control.messages import (
+    ClientReply,
+    ClientRequest,
+    Drop,
+    Gone,
+    Hello,
+    Left,
+    Login,
+    LoginReply,
+    Put,
+    Status,
+    Sync,
+    Usage,
+)
+from rce.control.model import (
+    ConnectionSpec,
+    EndpointKind,
+    EndpointSpec,
+    EndpointState,
+    EndpointStatus,
+    InterfaceSpec,
+    LinkAddress,
+    LinkSpec,
+)
+from rce.control.server import ControlServer
+from rce.link import Endpoint, Interface, LinkHub
+from rce.protocol.names import EndpointId, InterfaceType
+from rce_robot.app import App
+from rce_robot.settings import RobotSettings, SessionSettings
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Awaitable, Callable
+
+    from rce.control.messages import ToMaster
+    from rce.control.server import Peer
+    from rce.link import Buffer, Port
+
+SECRET = Secret("secret of the tests")
+PASSWORD = "testUser"
+DIGEST = hashlib.sha256(PASSWORD.encode()).hexdigest()
+EXAMPLES = Path(__file__).parents[2] / "examples"
+MACHINE = "here"
+
+
+class Signal:
+    """Lets a test wait until something that others change is so."""
+
+    def __init__(self) -> None:
+        self._event = asyncio.Event()
+
+    def set(self) -> None:
+        self._event.set()
+
+    async def until(self, condition: Callable[[], Any]) -> Any:
+        async with asyncio.timeout(15):
+            while not (found := condition()):
+                self._event.clear()
+                await self._event.wait()
+            return found
+
+
+class FakeMaster:
+    """Lets user testUser in; one spec per robot, which the test changes."""
+
+    def __init__(self) -> None:
+        self.changed = Signal()
+        self.specs: dict[str, EndpointSpec] = {}
+        self.statuses: dict[str, EndpointStatus] = {}
+        self.inside: set[str] = set()
+        self.left: list[str] = []
+        self.gone: list[str] = []
+        self.requests: list[tuple[str, str, Any]] = []
+        self.usage: Usage | None = None
+        self.answer: Callable[[ClientRequest], Awaitable[tuple[str, ...]]] = self._agree
+        self.peer: Peer | None = None
+        self.url = ""
+
+    async def _agree(self, request: ClientRequest) -> tuple[str, ...]:
+        return ()
+
+    async def on_hello(self, peer: Peer, hello: Hello) -> None:
+        self.peer = peer
+        self.url = hello.url
+        for status in hello.endpoints:
+            self.statuses[status.id] = status
+        peer.send(Sync(endpoints=tuple(self.specs[id_] for id_ in self.specs if id_ in self.inside)))
+        self.changed.set()
+
+    async def on_gone(self, peer: Peer) -> None:
+        self.peer = None
+        self.changed.set()
+
+    async def on_message(self, peer: Peer, message: ToMaster) -> None:
+        match message:
+            case Login():
+                peer.send(self._login(message))
+            case ClientRequest():
+                self.requests.append((message.id, message.type, message.data))
+                peer.send(ClientReply(request=message.request, errors=await self.answer(message)))
+            case Status():
+                self.statuses[message.status.id] = message.status
+            case Left():
+                self.inside.discard(message.id)
+                self.left.append(message.id)
+            case Gone():
+                self.gone.append(message.id)
+            case Usage():
+                self.usage = message
+            case _:
+                raise AssertionError(message)
+        self.changed.set()
+
+    def _login(self, message: Login) -> LoginReply:
+        id_ = f"{message.user}/{message.robot}"
+        if message.user != "testUser" or message.password != DIGEST:
+            return LoginReply(request=message.request, status=401, reason="Wrong user or password.")
+        if id_ in self.inside:
+            return LoginReply(request=message.request, status=409, reason=f"{id_} is already connected.")
+        self.inside.add(id_)
+        return LoginReply(request=message.request, endpoint=self.spec(id_))
+
+    def spec(self, id_: str) -> EndpointSpec:
+        return self.specs.setdefault(id_, EndpointSpec(id=id_, kind=EndpointKind.ROBOT, revision=1))
+
+    def put(self, id_: str, **changes: Any) -> None:
+        spec = self.spec(id_)
+        self.specs[id_] = spec = msgspec.structs.replace(spec, revision=spec.revision + 1, **changes)
+        if self.peer is not None:
+            self.peer.send(Put(endpoint=spec))
+
+    def drop(self, id_: str, reason: str) -> None:
+        assert self.peer is not None
+        self.inside.discard(id_)
+        self.peer.send(Drop(id=id_, revision=self.specs.pop(id_).revision, reason=reason))
+
+    def running(self, id_: str) -> bool:
+        status = self.statuses.get(id_)
+        return status is not None and status.state is EndpointState.RUNNING
+
+
+class End(Interface):
+    """The container's end: notes what comes, answers requests."""
+
+    def __init__(self, port: Port) -> None:
+        super().__init__(port)
+        self.received: asyncio.Queue[bytes] = asyncio.Queue()
+        self.active = Signal()
+        self.is_active = False
+        self.answer: Callable[[bytes], Awaitable[Buffer]] = self._echo
+
+    async def _echo(self, payload: bytes) -> Buffer:
+        return payload
+
+    async def start(self) -> None:
+        pass
+
+    async def close(self) -> None:
+        pass
+
+    def receive(self, payload: bytes, *, latched: bool) -> None:
+        self.received.put_nowait(payload)
+
+    async def serve(self, payload: bytes) -> Buffer:
+        return await self.answer(payload)
+
+    def on_active(self, active: bool) -> None:
+        self.is_active = active
+        self.active.set()
+
+
+class Cloud:
+    """The master, one robot task set, one container."""
+
+    def __init__(self, master: FakeMaster, endpoint: Endpoint, ends: dict[str, End], address: LinkAddress):
+        self.master = master
+        self.ends = ends
+        self.ws_url = ""
+        self._endpoint = endpoint
+        self._address = address
+        self._numbers = iter(range(1, 1000))
+        self._container = EndpointSpec(id="testUser/cloud", kind=EndpointKind.CONTAINER, revision=1)
+
+    async def wire(self, tag: str, type_: str, cls: str, *, robot: str = "testRobot") -> End:
+        """Make an interface of the robot and its complement in the container, joined."""
+        kind = InterfaceType.parse(type_)
+        id_ = f"testUser/{robot}"
+        link = f"link_{robot}"
+        number = next(self._numbers)
+        peer_tag = f"{robot}_{tag}"
+        peer = InterfaceSpec(tag=peer_tag, type=f"{kind.role.complement.value}Interface", cls=cls, addr=f"/{tag}")
+        own = InterfaceSpec(tag=tag, type=type_, cls=cls)
+        self._container = _grown(
+            self._container,
+            peer,
+            LinkSpec(id=link, peer=id_, token="token", dial=False),
+            ConnectionSpec(id=number, link=link, interface=peer_tag, peer_interface=tag),
+        )
+        spec = _grown(
+            self.master.spec(id_),
+            own,
+            LinkSpec(id=link, peer="testUser/cloud", token="token", dial=True, address=self._address),
+            ConnectionSpec(id=number, link=link, interface=tag, peer_interface=peer_tag),
+        )
+        await self._endpoint.apply(self._container)
+        self.master.put(id_, interfaces=spec.interfaces, links=spec.links, connections=spec.connections)
+        return self.ends[peer_tag]
+
+    async def joined(self, tag: str, type_: str, cls: str, *, robot: str = "testRobot") -> End:
+        """Wire, and wait until the connection is established."""
+        end = await self.wire(tag, type_, cls, robot=robot)
+        await end.active.until(lambda: end.is_active)
+        return end
+
+
+def _grown(
+    spec: EndpointSpec, interface: InterfaceSpec, link: LinkSpec, connection: ConnectionSpec
+) -> EndpointSpec:
+    links = {item.id: item for item in (*spec.links, link)}
+    return msgspec.structs.replace(
+        spec,
+        revision=spec.revision + 1,
+        interfaces=(*spec.interfaces, interface),
+        links=tuple(links.values()),
+        connections=(*spec.connections, connection),
+    )
+
+
+@asynccontextmanager
+async def running_cloud(session: SessionSettings | None = None, **settings: Any) -> AsyncIterator[Cloud]:
+    """Run it all on loopback."""
+    master = FakeMaster()
+    folder = Path(tempfile.mkdtemp(dir="/tmp"))
+    ends: dict[str, End] = {}
+
+    def make(port: Port) -> Interface:
+        end = ends[port.spec.tag] = End(port)
+        return end
+
+    faults: list[str] = []
+    async with AsyncExitStack() as stack:
+        stack.callback(shutil.rmtree, folder)
+        hub = LinkHub(MACHINE)
+        stack.push_async_callback(hub.close)
+        await hub.listen_unix(folder / "s")
+        id_ = EndpointId("testUser", "cloud")
+        endpoint = Endpoint(id_, make, hub, on_change=lambda: None, on_fault=faults.append)
+        stack.push_async_callback(endpoint.close)
+        server = ControlServer(
+            SECRET, on_hello=master.on_hello, on_message=master.on_message, on_gone=master.on_gone, port=0
+        )
+        await stack.enter_async_context(server)
+        cloud = Cloud(master, endpoint, ends, LinkAddress(machine=MACHINE, unix=str(folder / "s")))
+        await stack.enter_async_context(running_robots(cloud, server.port, session, **settings))
+        yield cloud
+    assert not faults
+
+
+@asynccontextmanager
+async def running_robots(
+    cloud: Cloud, control_port: int, session: SessionSettings | None = None, **settings: Any
+) -> AsyncIterator[None]:
+    """Run a robot task set for the cloud's master."""
+    ready: asyncio.Queue[str] = asyncio.Queue()
+    given = RobotSettings(
+        host="127.0.0.1",
+        ws_port=0,
+        machine=MACHINE,
+        usage_interval=0.1,
+        session=session or SessionSettings(drain_timeout=1.0),
+    )
+    app = App(
+        master="127.0.0.1",
+        control_port=control_port,
+        secret=SECRET,
+        packages=(EXAMPLES,),
+        settings=replace(given, **settings),
+    )
+    async with app.started(ready.put_nowait):
+        cloud.ws_url = await ready.get()
+        yield
