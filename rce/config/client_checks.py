@@ -1,0 +1,133 @@
+"""What must fit together in a client's config file.
+
+A file may refer to containers and interfaces that it does not make itself: other robots of the same user make
+them. So a reference is only wrong if the file itself says that it cannot work.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from pydantic import ValidationError
+
+from rce.config.exceptions import Fault
+from rce.protocol.names import Form, Role, is_name
+
+if TYPE_CHECKING:
+    from collections.abc import Hashable, Iterable, Iterator, Mapping
+    from typing import Self
+
+    from rce.config.client import Container, Interface, Link, Node, Parameter
+    from rce.config.validation import Strict
+
+
+@dataclass
+class Parts:
+    """The items of a file that are right in themselves, each with its index."""
+
+    robot: str | None
+    complete: bool = True
+    """Whether every interface of the file is among them."""
+    containers: list[tuple[int, Container]] = field(default_factory=list)
+    nodes: list[tuple[int, Node]] = field(default_factory=list)
+    parameters: list[tuple[int, Parameter]] = field(default_factory=list)
+    interfaces: list[tuple[int, Interface]] = field(default_factory=list)
+    connections: list[tuple[int, Link]] = field(default_factory=list)
+
+    @classmethod
+    def salvage(cls, data: Mapping[str, Any], kinds: Mapping[str, type[Strict]]) -> Self:
+        """Take the valid items out of a document of which others may be wrong."""
+        robot = data.get("robotID")
+        parts = cls(robot if isinstance(robot, str) and is_name(robot) else None)
+        for key, kind in kinds.items():
+            items = data.get(key, [])
+            good = getattr(parts, key)
+            for index, item in enumerate(items if isinstance(items, list) else []):
+                try:
+                    good.append((index, kind.model_validate(item)))
+                except ValidationError:
+                    continue  # reported with the whole document
+            if key == "interfaces" and (not isinstance(items, list) or len(good) < len(items)):
+                parts.complete = False
+        return parts
+
+
+def check(parts: Parts) -> list[Fault]:
+    """Find everything that does not fit together."""
+    return [*_check_tags(parts), *_check_interfaces(parts), *_check_connections(parts)]
+
+
+def _check_tags(parts: Parts) -> Iterator[Fault]:
+    for index, container in parts.containers:
+        if container.tag == parts.robot:
+            yield Fault(f"containers[{index}].cTag", f"{container.tag!r} is the robot's own name")
+    yield from _repeated("containers", "cTag", ((i, item.tag) for i, item in parts.containers))
+    yield from _repeated("nodes", "nTag", ((i, (item.container, item.tag)) for i, item in parts.nodes))
+    yield from _repeated(
+        "parameters", "name", ((i, (item.container, item.name)) for i, item in parts.parameters)
+    )
+    yield from _repeated(
+        "interfaces", "iTag", ((i, (item.endpoint, item.tag)) for i, item in parts.interfaces)
+    )
+    yield from _repeated(
+        "connections", "", ((i, frozenset((item.a, item.b))) for i, item in parts.connections)
+    )
+    for index, node in parts.nodes:
+        if node.container == parts.robot:
+            yield Fault(f"nodes[{index}].cTag", f"{node.container!r} is the robot, not a container")
+    for index, parameter in parts.parameters:
+        if parameter.container == parts.robot:
+            yield Fault(f"parameters[{index}].cTag", f"{parameter.container!r} is the robot, not a container")
+
+
+def _repeated(key: str, field_: str, items: Iterable[tuple[int, Hashable]]) -> Iterator[Fault]:
+    first: dict[Hashable, int] = {}
+    for index, identity in items:
+        if identity in first:
+            place = f"{key}[{index}].{field_}" if field_ else f"{key}[{index}]"
+            yield Fault(place, f"is the same as in {key}[{first[identity]}]")
+        first.setdefault(identity, index)
+
+
+def _check_interfaces(parts: Parts) -> Iterator[Fault]:
+    containers = {item.tag for _, item in parts.containers}
+    for index, item in parts.interfaces:
+        place = f"interfaces[{index}]"
+        if item.kind.form is Form.INTERFACE:
+            if not item.addr:
+                yield Fault(f"{place}.addr", f"is missing; a {item.type} needs the ROS name in the container")
+            if item.endpoint == parts.robot:
+                problem = f"a {item.type} belongs in a container; a robot has Converters and Forwarders"
+                yield Fault(f"{place}.iType", problem)
+        elif item.endpoint in containers:
+            yield Fault(f"{place}.iType", f"a {item.type} belongs on a robot; a container has Interfaces")
+
+
+def _check_connections(parts: Parts) -> Iterator[Fault]:
+    interfaces = {item.path: item for _, item in parts.interfaces}
+    ours = {item.tag for _, item in parts.containers} | {parts.robot}
+    providers: dict[str, int] = {}
+    for index, link in parts.connections:
+        place = f"connections[{index}]"
+        for key, path in (("tagA", link.a), ("tagB", link.b)):
+            item = interfaces.get(path)
+            if item is None:
+                if parts.complete and path.partition("/")[0] in ours:
+                    yield Fault(f"{place}.{key}", f"there is no interface {path!r} in this file")
+            elif item.kind.role is Role.SERVICE_PROVIDER:
+                if path in providers:
+                    other = f"connections[{providers[path]}]"
+                    problem = f"{path!r} takes one connection, and that is in {other}"
+                    yield Fault(f"{place}.{key}", problem)
+                providers.setdefault(path, index)
+        if link.a in interfaces and link.b in interfaces:
+            yield from _check_pair(place, interfaces[link.a], interfaces[link.b])
+
+
+def _check_pair(place: str, a: Interface, b: Interface) -> Iterator[Fault]:
+    if a.kind.role is not b.kind.role.complement:
+        needed = a.kind.role.complement.value
+        yield Fault(place, f"{a.path} is a {a.type} and needs a {needed}, but {b.path} is a {b.type}")
+    if a.cls != b.cls:
+        yield Fault(place, f"{a.path} carries {a.cls}, but {b.path} carries {b.cls}")

@@ -1,0 +1,170 @@
+"""The engine's settings: one YAML file for ``rce up`` and for each program.
+
+The shipped ``configs/engine.yaml`` holds every setting with its default and a comment. Times are in seconds,
+sizes in bytes. An empty file, or none, means all defaults.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from enum import Enum
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationError
+
+from rce.config.documents import parse, read_file
+from rce.config.exceptions import ConfigError, Fault
+from rce.config.folders import default_state_dir
+from rce.config.validation import Strict, faults_of
+
+LOOPBACK = "127.0.0.1"
+ANYWHERE = "0.0.0.0"  # noqa: S104 - an engine serves other machines unless in development mode
+
+
+class Runtime(Enum):
+    """How containers are kept apart."""
+
+    AUTO = "auto"
+    """The strongest that this machine can do."""
+    NAMESPACE = "namespace"
+    PROCESS = "process"
+
+
+def _check_host(text: str) -> str:
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        if not text or not text.replace("-", "").replace(".", "").replace("_", "").isalnum():
+            raise ValueError("must be a host name or an IP address") from None
+    return text
+
+
+def _as_path(value: Any) -> Any:
+    if isinstance(value, str) and value:
+        return Path(value).expanduser()
+    if value is None or isinstance(value, Path):
+        return value
+    raise ValueError("must be the path of a file or folder")
+
+
+def _as_runtime(value: Any) -> Any:
+    try:
+        return Runtime(value)
+    except ValueError:
+        raise ValueError(f"must be one of {', '.join(item.value for item in Runtime)}") from None
+
+
+Host = Annotated[str, AfterValidator(_check_host)]
+Port = Annotated[int, Field(ge=0, le=65535)]
+"""A TCP port; 0 takes a free one."""
+Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Folder = Annotated[Path, BeforeValidator(_as_path)]
+
+
+class MasterSettings(Strict):
+    """The Master Task Set."""
+
+    bind: Host = ANYWHERE
+    http_port: Port = 9000
+    """Clients, REST API."""
+    control_port: Port = 8080
+    """Task sets."""
+    robot_grace: Seconds = 60.0
+    """How long a robot that is away keeps its interfaces and connections."""
+    container_grace: Seconds = 30.0
+    """How long a container task set may be away until its containers are placed elsewhere."""
+    token_lifetime: Seconds = 30 * 86400.0
+    """How long an API token is valid."""
+
+
+class RobotSettings(Strict):
+    """The Robot Task Set."""
+
+    count: int = Field(default=1, ge=1, le=64)
+    """How many processes ``rce up`` starts; each further one takes the next ports."""
+    bind: Host = ANYWHERE
+    ws_port: Port = 9010
+    """Robots' WebSockets."""
+    link_port: Port = 10030
+    """Links from other machines."""
+    public_host: Host | None = None
+    """The name by which clients reach this machine; its address towards the master if none."""
+    public_url: str = Field(default="", pattern=r"^(wss?://.+)?$")
+    """The whole URL that clients are sent to, where a proxy stands in front."""
+    origins: tuple[str, ...] = Field(default=(), strict=False)
+    """Origins whose web pages may connect; ``*`` is any."""
+
+
+class ContainerSettings(Strict):
+    """The Container Task Set."""
+
+    bind: Host = ANYWHERE
+    link_port: Port = 10031
+    """Links from other machines."""
+    runtime: Annotated[Runtime, BeforeValidator(_as_runtime)] = Runtime.AUTO
+    package_path: tuple[Folder, ...] = Field(default=(), strict=False)
+    """Folders with ROS packages, first match wins; the shipped examples come last."""
+    grace: Seconds = 30.0
+    """How long containers wait for a manager that was killed until they end themselves."""
+    labels: tuple[str, ...] = Field(default=(), strict=False)
+    """What this machine has; containers ask for it as special features."""
+
+
+class EngineSettings(Strict):
+    """Everything."""
+
+    dev: bool = False
+    """Development mode: loopback only, user testUser with password testUser, a shared secret of its own."""
+    state_dir: Folder = Field(default_factory=default_state_dir)
+    secret_file: Folder | None = None
+    master_host: Host = LOOPBACK
+    """Where robot and container task sets find the master."""
+    master: MasterSettings = MasterSettings()
+    robot: RobotSettings = RobotSettings()
+    container: ContainerSettings = ContainerSettings()
+
+    def for_development(self) -> EngineSettings:
+        """Return the same in development mode: every program binds loopback only."""
+        return self.model_copy(
+            update={
+                "dev": True,
+                "master_host": LOOPBACK,
+                "master": self.master.model_copy(update={"bind": LOOPBACK}),
+                "robot": self.robot.model_copy(update={"bind": LOOPBACK, "public_host": LOOPBACK}),
+                "container": self.container.model_copy(update={"bind": LOOPBACK}),
+            }
+        )
+
+    @property
+    def control_url(self) -> str:
+        """Where task sets dial the master."""
+        host = f"[{self.master_host}]" if ":" in self.master_host else self.master_host
+        return f"ws://{host}:{self.master.control_port}"
+
+
+def load_settings(path: Path | None = None) -> EngineSettings:
+    """Read the engine's settings.
+
+    Args:
+        path: A YAML (or JSON) file; all defaults if None.
+
+    Raises:
+        ConfigError: It cannot be read, or something is wrong in it; every fault is listed.
+    """
+    if path is None:
+        return EngineSettings()
+    data = parse(read_file(path), str(path))
+    if data is None:
+        data = {}
+    if not isinstance(data, dict):
+        raise ConfigError(
+            str(path), [Fault("", "must be a mapping with the keys master, robot, container, ...")]
+        )
+    # A section whose settings are all commented out reads as null.
+    sections = {key: {} if value is None else value for key, value in data.items()}
+    try:
+        settings = EngineSettings.model_validate(sections)
+    except ValidationError as error:
+        raise ConfigError(str(path), faults_of(error, EngineSettings)) from error
+    return settings.for_development() if settings.dev else settings
