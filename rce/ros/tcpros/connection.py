@@ -135,6 +135,8 @@ class Connection(asyncio.BufferedProtocol):
     def get_buffer(self, sizehint: int) -> memoryview:
         """Return where the next bytes go."""
         del sizehint  # the reader knows better
+        if self.reader.is_large_complete:
+            self._take_large()
         return self.reader.buffer()
 
     def buffer_updated(self, nbytes: int) -> None:
@@ -143,12 +145,12 @@ class Connection(asyncio.BufferedProtocol):
         reader.received(nbytes)
         try:
             while not self._closing and (payload := reader.next_frame()) is not None:
-                self.bytes_in += len(payload)
-                self.frames_in += 1
-                self.owner.frame_received(self, payload)
+                self._hand_over(payload)
         except TcprosError as error:
-            _log.warning("%s is closed: %s", self, error)
-            self.abort()
+            self._fail(error)
+        if reader.is_large_complete:
+            # The transport still holds the frame's memory: taken now, it would have to be copied.
+            asyncio.get_running_loop().call_soon(self._take_large)
 
     def pause_writing(self) -> None:
         """Note that the peer takes less than was written."""
@@ -158,3 +160,22 @@ class Connection(asyncio.BufferedProtocol):
         """Tell the owner that there is room again."""
         self.full = False
         self.owner.writable(self)
+
+    # ------------------------------------------------------------------ inside
+
+    def _take_large(self) -> None:
+        """Hand over a frame that was read into memory of its own, unless it was before the next read."""
+        if self.reader.is_large_complete and not self._closing:
+            try:
+                self._hand_over(self.reader.take_large())
+            except TcprosError as error:
+                self._fail(error)
+
+    def _hand_over(self, payload: bytes) -> None:
+        self.bytes_in += len(payload)
+        self.frames_in += 1
+        self.owner.frame_received(self, payload)
+
+    def _fail(self, error: TcprosError) -> None:
+        _log.warning("%s is closed: %s", self, error)
+        self.abort()

@@ -52,6 +52,8 @@ class FrameReader:
 
     Use: read into :meth:`buffer`, tell :meth:`received` how much came, then call :meth:`next_frame` until it
     returns ``None``. All of this must happen before another reader with the same scratch buffer is used.
+    A frame with memory of its own is complete when :attr:`is_large_complete` says so; :meth:`take_large` then
+    returns it, to be called when nobody holds the memory of :meth:`buffer` any longer.
 
     Attributes:
         limit: Longest frame accepted; may be changed between frames.
@@ -68,13 +70,20 @@ class FrameReader:
         self._end = 0
         self._head = b""  # an incomplete frame head between two reads
         self._large: io.BytesIO | None = None  # a frame that is being read into memory of its own
-        self._view: memoryview | None = None
+        self._view = memoryview(b"")  # that memory
         self._have = 0
         self._need = 0
 
+    @property
+    def is_large_complete(self) -> bool:
+        """Whether :meth:`take_large` has a frame to return."""
+        return self._large is not None and self._have == self._need
+
     def buffer(self) -> memoryview:
         """Return where the next bytes shall be read to."""
-        if self._view is not None:
+        if self._large is not None:
+            if self._have == len(self._view):
+                self._extend(min(self._need, 4 * self._have))
             return self._view[self._have :]
         kept = len(self._head)
         if kept:
@@ -83,7 +92,7 @@ class FrameReader:
 
     def received(self, count: int) -> None:
         """Note that ``count`` bytes were read into :meth:`buffer`."""
-        if self._view is not None:
+        if self._large is not None:
             self._have += count
             return
         self._begin = 0
@@ -96,8 +105,8 @@ class FrameReader:
         Raises:
             MalformedFrame: A frame is longer than :attr:`limit`.
         """
-        if self._view is not None:
-            return self._finish_large()
+        if self._large is not None:
+            return None
         body = self._begin + (5 if self.has_lead else 4)
         if body > self._end:
             self._head = bytes(self._scratch[self._begin : self._end])
@@ -114,34 +123,30 @@ class FrameReader:
         self._begin = stop
         return bytes(self._scratch[body:stop])
 
+    def take_large(self) -> bytes:
+        """Return the frame that is complete in memory of its own."""
+        assert self._large is not None
+        self._view.release()
+        payload = self._large.getvalue()  # copies while somebody still holds the memory
+        self._large = None
+        return payload
+
     def _begin_large(self, body: int, length: int) -> None:
         """Give an incomplete frame memory of its own and move there what has come of it."""
         self._need = length
         self._large = io.BytesIO()
         self._have = self._end - body
         self._extend(min(length, max(_FIRST_TRUST, self._have)))
-        assert self._view is not None
         self._view[: self._have] = self._scratch[body : self._end]
         self._begin = self._end
 
     def _extend(self, size: int) -> None:
-        """Make the frame's memory ``size`` bytes long. A peer's word is trusted for 16 MiB, then it must deliver."""
+        """Make the frame's memory ``size`` bytes long.
+
+        A peer's word on a length is trusted for 16 MiB, then it must deliver before it gets more.
+        """
         assert self._large is not None
-        self._view = None
+        self._view.release()
         self._large.seek(size - 1)
         self._large.write(b"\0")
         self._view = self._large.getbuffer()
-
-    def _finish_large(self) -> bytes | None:
-        assert self._view is not None
-        assert self._large is not None
-        if self._have < self._need:
-            if self._have == len(self._view):
-                self._view.release()
-                self._extend(min(self._need, 4 * self._have))
-            return None
-        self._view.release()
-        self._view = None
-        payload = self._large.getvalue()
-        self._large = None
-        return payload
