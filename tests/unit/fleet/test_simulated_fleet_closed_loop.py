@@ -1,0 +1,134 @@
+"""Planner, move clients, navigation and the simulated world together, in simulated time and without ROS."""
+
+from __future__ import annotations
+
+from math import inf
+from typing import Any
+
+import numpy as np
+import pytest
+from rce.fleet.coordination.events import (
+    BlockedChanged,
+    CellBlocked,
+    Event,
+    GoalSet,
+    ObstacleSeen,
+    PoseSeen,
+    ReportSeen,
+    SendCancel,
+    SendCells,
+    Tick,
+)
+from rce.fleet.coordination.planner import FleetPlanner
+from rce.fleet.coordination.snapshot import RobotState
+from rce.fleet.exceptions import OccupiedError
+from rce.fleet.move_client import MoveClient, SendGoal, SendStop
+from rce.fleet.scenario import Scenario, make_scenario, midway_cell
+from rce.fleet.grid import GridMap
+from rce.fleet.simulation.move_base import SimulatedMoveBase
+from rce.fleet.simulation.obstacles import hit_points
+from rce.fleet.simulation.world import World
+
+
+class SimulatedFleet:
+    """Robots in a world, steered by a planner; control at 20 Hz, lidar and poses at 10 Hz."""
+
+    def __init__(self, scenario: Scenario, seed: int) -> None:
+        grid = scenario.grid
+        self.world = World(grid, seed=seed)
+        self.planner = FleetPlanner(grid)
+        self.scenario = scenario
+        self.clients = {robot: MoveClient(grid, robot, 1.0) for robot in scenario.robots}
+        self.bases = {robot: SimulatedMoveBase(grid, 0.22) for robot in scenario.robots}
+        self.points = {robot: np.empty((0, 2)) for robot in scenario.robots}
+        for robot, cell, yaw in zip(scenario.robots, scenario.starts, scenario.headings, strict=True):
+            self.world.add_robot(robot, cell, yaw)
+        for cell in scenario.boxes:
+            self.world.add_box(cell)
+        for cell in scenario.known_boxes:
+            self.plan(CellBlocked(cell))
+
+    def plan(self, event: Event) -> None:
+        for instruction in self.planner.handle(event, self.world.time):
+            match instruction:
+                case SendCells(robot, revision, cells):
+                    self.tell(robot, self.clients[robot].take_cells(revision, list(cells), self.world.time))
+                case SendCancel(robot):
+                    self.tell(robot, self.clients[robot].cancel(self.world.time))
+                case BlockedChanged(cells):
+                    for cell in cells:
+                        self.world.add_box(cell)
+
+    def tell(self, robot: str, instructions: list[Any]) -> None:
+        for instruction in instructions:
+            match instruction:
+                case SendGoal(goal_id, stamp, cell):
+                    x, y = self.planner.books.grid.centre(cell)
+                    self.bases[robot].accept(goal_id, stamp, x, y)
+                case SendStop(stamp):
+                    self.bases[robot].cancel("", stamp)
+
+    def step(self, number: int) -> None:
+        """0.05 s of the world."""
+        self.world.step(0.05)
+        now = self.world.time
+        for robot, base in self.bases.items():
+            body, client = self.world.robots[robot], self.clients[robot]
+            if number % 2 == 0:
+                ranges = self.world.scan(robot)
+                self.points[robot] = hit_points(self.world.spec.lidar, ranges, body.estimate)
+                pose = body.estimate
+                self.plan(PoseSeen(robot, pose.x, pose.y, pose.yaw))
+                self.tell(robot, client.tick(now))
+                self.tell(robot, client.take_goal_states({goal.id: goal.state for goal in base.goals}, now))
+                self.plan(ReportSeen(robot, client.report))
+            body.drive(base.update(now, body.estimate, self.points[robot]))
+            if base.blocked:
+                self.plan(ObstacleSeen(robot, base.blocked))
+            for goal in base.take_ended():
+                self.tell(robot, client.take_result(goal.id, goal.state, now))
+        if number % 4 == 0:
+            self.plan(Tick())
+        self.planner.validate()
+
+    def run(self, limit: float = 120.0) -> float:
+        """Send everybody to the goal and block a cell mid-way; returns the time it took, seconds."""
+        number, sent_at, blocked = 0, inf, False
+        robots = self.scenario.robots
+        while self.world.time < limit:
+            number += 1
+            self.step(number)
+            states = [robot.state for robot in self.planner.snapshot().robots]
+            if sent_at == inf and states.count(RobotState.IDLE) == len(robots):
+                sent_at = self.world.time
+                for robot, goal in zip(robots, self.scenario.goals, strict=True):
+                    self.plan(GoalSet(robot, goal))
+            if self.world.time - sent_at > 3 and not blocked:
+                blocked = True
+                self.block_midway()
+            if blocked and states.count(RobotState.ARRIVED) == len(robots):
+                return self.world.time - sent_at
+        raise AssertionError(f"not there after {limit} s: {self.planner.snapshot()}")
+
+    def block_midway(self) -> None:
+        snapshot = self.planner.snapshot()
+        grid = self.scenario.grid.with_blocked({*self.scenario.grid.blocked, *self.world.boxes})
+        cell = midway_cell(
+            grid,
+            {robot.id: robot.plan for robot in snapshot.robots},
+            {robot.id: robot.goal for robot in snapshot.robots if robot.goal is not None},
+        )
+        if cell is not None:
+            self.plan(CellBlocked(cell))
+
+
+@pytest.mark.parametrize(("robots", "seed"), [(1, 0), (3, 1), (8, 2), (8, 3)])
+def test_nobody_touches_anything_on_the_way_to_the_goals(robots: int, seed: int) -> None:
+    fleet = SimulatedFleet(make_scenario(GridMap(), robots, seed=seed), seed)
+    took=fleet.run()
+    print(took, fleet.world.min_separation)
+    assert fleet.world.collisions.total == 0
+    assert fleet.world.min_separation > 0.1
+    for robot, goal in zip(fleet.scenario.robots, fleet.scenario.goals, strict=True):
+        pose = fleet.world.robots[robot].pose
+        assert fleet.scenario.grid.cell_at(pose.x, pose.y) == goal
