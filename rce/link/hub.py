@@ -117,10 +117,14 @@ class LinkHub:
         for path, inode in self._unix_sockets.items():
             _unlink(path, inode)
         await self._greetings.close()
-        for carrier in list(self._carriers):
+        await asyncio.sleep(0)  # connections that were just being accepted come into view
+        carriers = list(self._carriers)
+        for carrier in carriers:
             carrier.abort(LinkLost("the hub is closed"))
-        for carrier in list(self._carriers):
-            await carrier.wait_closed()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(self.timeouts.flush):
+                for carrier in carriers:
+                    await carrier.wait_closed()
         for server in self._servers:
             await server.wait_closed()
         self._servers.clear()

@@ -82,6 +82,8 @@ class Link:
                 channel.peer_closed()
         elif channel is not None:
             channel.frame_received(frame)
+        elif frame.type < FrameType.DATA:
+            raise ProtocolError(f"{frame.type.name} after the handshake")
 
     def carrier_lost(self, carrier: Carrier, reason: Exception) -> None:
         """Close all channels."""

@@ -202,7 +202,8 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         if self._timer is not None:
             self._timer.cancel()
         self._transport = None
-        self._finish()
+        self._closed.set_result(None)
+        self._on_closed(self)
 
     # Inside
 
@@ -292,15 +293,8 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
                 self._first.set_result(None)
             if self._transport is not None:
                 self._hang_up(flush)
-            else:
-                self._finish()
             if self._handler is not None:
                 self._loop.call_soon(self._handler.carrier_lost, self, reason)
-
-    def _finish(self) -> None:
-        if not self._closed.done():
-            self._closed.set_result(None)
-            self._on_closed(self)
 
     def _hang_up(self, flush: bool) -> None:
         assert self._transport is not None

@@ -44,6 +44,7 @@ class FakeInterface(Interface):
         self.may_start.set()
         self.closed = False
         self.serving = 0
+        self.asked = asyncio.Event()
         self.answer: Callable[[bytes], Awaitable[Buffer]] = self.upper
 
     async def start(self) -> None:
@@ -70,6 +71,7 @@ class FakeInterface(Interface):
 
     async def serve(self, payload: bytes) -> Buffer:
         self.serving += 1
+        self.asked.set()
         try:
             return await self.answer(payload)
         finally:
@@ -195,8 +197,8 @@ class Rig:
         self, way: str, limits: LinkLimits | None = None, **timeouts: float
     ) -> tuple[Party, Party]:
         """Make two parties; the first dials the second in the given way."""
-        one = await self.hub(limits=limits, **timeouts)
-        other = one if way == "local" else await self.hub(limits=limits, **timeouts)
+        one = await self.hub("here", limits, **timeouts)
+        other = one if way == "local" else await self.hub("here", limits, **timeouts)
         dialing, accepting = self.party("a", one), self.party("b", other)
         await self.listen(accepting, way)
         return dialing, accepting

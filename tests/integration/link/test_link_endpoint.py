@@ -1,0 +1,143 @@
+"""What an endpoint makes of its specs."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+import pytest
+from msgspec.structs import replace
+
+from rce.control.model import ConnectionSpec, InterfaceSpec
+
+if TYPE_CHECKING:
+    from .conftest import Rig
+
+TOPIC_OUT = ("SubscriberConverter", "PublisherInterface")
+TOPIC_IN = ("PublisherConverter", "SubscriberInterface")
+
+
+async def test_same_spec_again_changes_nothing(rig: Rig) -> None:
+    a, b = await rig.pair("unix")
+    await rig.join(a, b, [TOPIC_OUT])
+    await a.connected(1)
+    fake = a.fakes["i1"]
+    await a.endpoint.apply(a.spec)
+    await a.endpoint.apply(replace(a.spec, revision=99))
+    assert a.fakes["i1"] is fake
+    assert fake.active == [True]
+    assert a.endpoint.connections == (1,)
+
+
+async def test_changed_interface_is_made_anew(rig: Rig, way: str) -> None:
+    a, b = await rig.pair(way)
+    await rig.join(a, b, [TOPIC_OUT, TOPIC_IN])
+    await a.connected(1, 2)
+    old, kept = b.fakes["i1"], b.fakes["i2"]
+    await b.apply({"i1": "PublisherForwarder", "i2": "SubscriberInterface"})
+    assert old.closed
+    assert old.active == [True, False]
+    assert b.fakes["i2"] is kept
+    assert kept.active == [True]
+    await a.until(lambda: a.fakes["i1"].active == [True, False, True])
+    a.fakes["i1"].port.send(b"to the new one")
+    assert await b.fakes["i1"].received.get() == (b"to the new one", False)
+    assert old.received.empty()
+
+
+async def test_connection_opens_when_both_interfaces_have_started(rig: Rig, way: str) -> None:
+    a, b = await rig.pair(way)
+    await rig.join(a, b, [TOPIC_OUT], addr="/slow")
+    await a.until(lambda: "i1" in a.fakes)
+    await asyncio.sleep(0)
+    a.fakes["i1"].may_start.set()
+    a.fakes["i1"].port.send(b"too early")
+    assert a.endpoint.connections == ()
+    b.fakes["i1"].may_start.set()
+    await a.connected(1)
+    await b.connected(1)
+    a.fakes["i1"].port.send(b"now")
+    assert await b.fakes["i1"].received.get() == (b"now", False)
+
+
+async def test_bad_interfaces_do_not_hurt_others(rig: Rig) -> None:
+    a, b = await rig.pair("unix")
+    await rig.join(a, b, [TOPIC_OUT])
+    good = a.spec.interfaces
+    bad = (
+        InterfaceSpec(tag="b1", type="SubscriberConverter", cls="a/B", addr="/unmakable"),
+        InterfaceSpec(tag="b2", type="SubscriberConverter", cls="a/B", addr="/bad"),
+        InterfaceSpec(tag="b3", type="Nonsense", cls="a/B"),
+    )
+    stray = (
+        ConnectionSpec(id=8, link="L", interface="nothing", peer_interface="x"),
+        ConnectionSpec(id=9, link="nowhere", interface="i1", peer_interface="x"),
+    )
+    spec = replace(a.spec, interfaces=(*bad, *good), connections=(*stray, *a.spec.connections))
+    await a.endpoint.apply(spec)
+    await a.connected(1)
+    await a.until(lambda: len(a.faults) == 5)
+    assert sorted(text.split(":")[0] for text in a.faults) == [
+        "connection 8",
+        "connection 9",
+        "interface b1",
+        "interface b2",
+        "interface b3",
+    ]
+    assert "interface b2: cannot start" in a.faults
+    assert "interface b1: cannot be made" in a.faults
+    await a.endpoint.apply(replace(spec, revision=50))
+    assert len(a.faults) == 5
+    assert a.endpoint.interfaces == {"b2": False, "i1": True}
+
+
+async def test_refused_message_is_a_fault_and_nothing_else(rig: Rig) -> None:
+    a, b = await rig.pair("unix")
+    await rig.join(a, b, [TOPIC_OUT])
+    await a.connected(1)
+    for payload in (b"refuse me", b"refuse me", b"good"):
+        a.fakes["i1"].port.send(payload)
+    assert await b.fakes["i1"].received.get() == (b"good", False)
+    assert b.faults == ["interface i1: refused"]
+
+
+async def test_one_subscriber_reaches_many_peers(rig: Rig) -> None:
+    a, b = await rig.pair("unix")
+    await rig.join(a, b, [TOPIC_OUT, TOPIC_OUT])
+    await a.apply(
+        {"i1": "SubscriberConverter"},
+        connections=[ConnectionSpec(id=n, link="L", interface="i1", peer_interface=f"i{n}") for n in (1, 2)],
+    )
+    await a.connected(1, 2)
+    await b.connected(1, 2)
+    a.fakes["i1"].port.send(b"all")
+    assert await b.fakes["i1"].received.get() == (b"all", False)
+    assert await b.fakes["i2"].received.get() == (b"all", False)
+    await a.apply(connections=[a.spec.connections[1]])
+    assert a.fakes["i1"].active == [True]
+    await b.connected(2)
+    assert b.fakes["i1"].active == [True, False]
+
+
+async def test_close_ends_everything(rig: Rig, way: str) -> None:
+    a, b = await rig.pair(way)
+    await rig.join(a, b, [TOPIC_OUT, TOPIC_IN])
+    await a.connected(1, 2)
+    await a.endpoint.close()
+    assert a.fakes["i1"].closed
+    assert a.fakes["i1"].active == [True, False]
+    await b.connected()
+    assert not b.fakes["i1"].closed
+    with pytest.raises(RuntimeError):
+        await a.endpoint.apply(a.spec)
+    await a.endpoint.close()
+
+
+async def test_starting_interface_can_be_removed(rig: Rig) -> None:
+    a, b = await rig.pair("local")
+    await rig.join(a, b, [TOPIC_OUT], addr="/slow")
+    await asyncio.sleep(0)
+    await a.apply({}, connections=[])
+    assert a.fakes["i1"].closed
+    assert a.endpoint.interfaces == {}
+    assert a.faults == []

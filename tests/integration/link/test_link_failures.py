@@ -1,0 +1,442 @@
+"""Links that break, are refused, or stall: nobody else is hurt, and all comes back."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from typing import TYPE_CHECKING
+
+import pytest
+from msgspec.structs import replace
+
+from rce.control.model import ConnectionSpec, LinkAddress, LinkSpec
+from rce.link import CallTimeout, LinkLimits, LinkLost, LinkRefused, MessageTooLarge, Overloaded, PeerLost
+from rce.link.frames import HEADER, Frame, FrameReader, FrameType, check_answer, encode, encode_hello
+
+if TYPE_CHECKING:
+    from .conftest import Party, Rig
+
+TOPIC_OUT = ("SubscriberConverter", "PublisherInterface")
+TOPIC_IN = ("PublisherConverter", "SubscriberInterface")
+SERVICE_OUT = ("ServiceProviderForwarder", "ServiceClientInterface")
+
+
+def kill_link(party: Party) -> None:
+    """End the party's link as a crash of the network or the peer would."""
+    link = party.endpoint._links["L"]
+    assert link.carrier is not None
+    if link.carrier.kind == "local":
+        link.carrier.close()
+        link.carrier_lost(link.carrier, LinkLost("killed"))
+    else:
+        link.carrier.abort(LinkLost("killed"))  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("side", [0, 1])
+async def test_killed_link_comes_back(rig: Rig, way: str, side: int) -> None:
+    parties = a, b = await rig.pair(way)
+    await rig.join(a, b, [TOPIC_OUT, SERVICE_OUT])
+    await a.connected(1, 2)
+    await b.connected(1, 2)
+    b.fakes["i2"].answer = lambda _: asyncio.Event().wait()  # type: ignore[assignment,return-value]
+    call = asyncio.ensure_future(a.fakes["i2"].port.call(b"never answered"))
+    await b.fakes["i2"].asked.wait()
+    kill_link(parties[side])
+    with pytest.raises(PeerLost):
+        await call
+    await a.until(lambda: a.fakes["i1"].active == [True, False, True])
+    await b.until(lambda: b.fakes["i1"].active == [True, False, True])
+    await a.connected(1, 2)
+    assert b.fakes["i2"].serving == 0
+    a.fakes["i1"].port.send(b"again")
+    assert await b.fakes["i1"].received.get() == (b"again", False)
+
+
+async def test_peer_that_restarts_elsewhere_is_found(rig: Rig) -> None:
+    a, b = await rig.pair("unix")
+    await rig.join(a, b, [TOPIC_OUT])
+    await a.connected(1)
+    spec = b.spec
+    await b.endpoint.close()
+    await a.connected()
+    c = rig.party("b", await rig.hub())
+    await rig.listen(c, "tcp")
+    await c.endpoint.apply(spec)
+    await a.apply(links=[replace(a.spec.links[0], address=c.address)])
+    await a.connected(1)
+    a.fakes["i1"].port.send(b"hi")
+    assert await c.fakes["i1"].received.get() == (b"hi", False)
+
+
+async def test_changed_address_is_dialed_at_once(rig: Rig) -> None:
+    a, b = await rig.pair("unix")
+    await rig.listen(b, "unix")
+    second = b.address
+    await rig.listen(b, "unix")
+    await rig.join(a, b, [TOPIC_OUT])
+    await a.connected(1)
+    await a.apply(links=[replace(a.spec.links[0], address=second)])
+    assert a.endpoint.connections == ()
+    await a.connected(1)
+    assert a.fakes["i1"].active == [True, False, True]
+
+
+async def test_link_waits_for_its_address(rig: Rig) -> None:
+    a, b = await rig.pair("unix")
+    address, b.address = b.address, LinkAddress()
+    await rig.join(a, b, [TOPIC_OUT])
+    await a.apply(links=[replace(a.spec.links[0], address=address)])
+    await a.connected(1)
+
+
+async def test_tcp_is_taken_where_the_unix_socket_is_dead(rig: Rig) -> None:
+    a, b = await rig.pair("tcp")
+    b.address = replace(b.address, machine="here", unix=str(rig.folder / "nobody"))
+    await rig.join(a, b, [TOPIC_OUT])
+    await a.connected(1)
+
+
+async def test_peer_may_come_first_or_last_to_the_same_process(rig: Rig) -> None:
+    hub = await rig.hub()
+    a, b = rig.party("a", hub), rig.party("b", hub)
+    await rig.listen(b, "unix")
+    await rig.join(a, b, [TOPIC_OUT])
+    await a.connected(1)
+    spec = b.spec
+    await b.endpoint.close()
+    await a.connected()
+    c = rig.party("b", hub)
+    await c.endpoint.apply(spec)
+    await a.connected(1)
+    assert a.endpoint._links["L"].carrier is not None
+    assert a.endpoint._links["L"].carrier.kind == "local"
+
+
+async def hello(address: LinkAddress, data: bytes) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    if address.unix:
+        reader, writer = await asyncio.open_unix_connection(address.unix)
+    else:
+        reader, writer = await asyncio.open_connection(address.host, address.port)
+    writer.write(data)
+    return reader, writer
+
+
+async def answer(reader: asyncio.StreamReader) -> Frame:
+    frames = FrameReader(LinkLimits()).feed(await reader.read(100))
+    return frames[0]
+
+
+@pytest.mark.parametrize("way", ["unix", "tcp", "handed-over"])
+async def test_wrong_token_and_unknown_link_are_refused(rig: Rig, way: str) -> None:
+    a, b = await rig.pair(way, unknown_link=0.05)
+    await rig.join(a, b, [TOPIC_OUT])
+    await a.connected(1)
+    for link, token in (("L", "wrong"), ("L", ""), ("M", "secret")):
+        reader, writer = await hello(b.address, encode_hello(link, token))
+        with pytest.raises(LinkRefused, match="unknown link or wrong token"):
+            check_answer(await answer(reader))
+        assert await reader.read() == b""
+        writer.close()
+        await writer.wait_closed()
+    assert a.endpoint.connections == (1,)
+    assert a.fakes["i1"].active == [True]
+
+
+@pytest.mark.parametrize("way", ["local", "unix"])
+async def test_endpoint_with_a_wrong_token_does_not_connect(rig: Rig, way: str) -> None:
+    a, b = await rig.pair(way)
+    await rig.join(a, b, [TOPIC_OUT])
+    await a.connected(1)
+    await a.apply(links=[])
+    await a.apply(links=[LinkSpec(id="L", peer="user/b", token="wrong", dial=True, address=b.address)])
+    with pytest.raises(LinkRefused):
+        await a.hub.connect(a.spec.links[0])
+    assert a.endpoint.connections == ()
+
+
+@pytest.mark.parametrize("way", ["unix", "tcp", "handed-over"])
+async def test_link_may_be_asked_for_before_its_spec_came(
+    rig: Rig, way: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, b = await rig.pair(way, unknown_link=5.0)
+    asked = asyncio.Event()
+    wait = b.hub.wait_registered
+
+    async def note_and_wait(link_id: str, timeout: float | None) -> None:
+        asked.set()
+        await wait(link_id, timeout)
+
+    monkeypatch.setattr(b.hub, "wait_registered", note_and_wait)
+    reader, writer = await hello(b.address, encode_hello("L", "secret"))
+    await asked.wait()
+    await b.apply(links=[LinkSpec(id="L", peer="user/a", token="secret", dial=False)])
+    check_answer(await answer(reader))
+    writer.close()
+    await writer.wait_closed()
+
+
+@pytest.mark.parametrize("way", ["unix", "tcp", "handed-over"])
+@pytest.mark.parametrize(
+    "garbage",
+    [
+        b"GET / HTTP/1.1\r\nHost: x\r\n\r\n",
+        b"\0" * 24,
+        encode(Frame(FrameType.PING)),
+        encode_hello("x" * 5_000, ""),
+    ],
+    ids=["http", "zeros", "ping", "long hello"],
+)
+async def test_garbage_ends_its_own_connection_only(rig: Rig, way: str, garbage: bytes) -> None:
+    a, b = await rig.pair(way)
+    await rig.join(a, b, [TOPIC_OUT])
+    await a.connected(1)
+    reader, writer = await hello(b.address, garbage)
+    try:
+        rest = await reader.read()
+    except ConnectionResetError:
+        rest = b""
+    assert rest == b""
+    writer.close()
+    a.fakes["i1"].port.send(b"unhurt")
+    assert await b.fakes["i1"].received.get() == (b"unhurt", False)
+
+
+async def test_silent_connection_is_dropped(rig: Rig) -> None:
+    _, b = await rig.pair("tcp", handshake=0.05)
+    reader, writer = await hello(b.address, b"")
+    assert await _read_on(reader) == b""
+    writer.close()
+
+
+@pytest.mark.parametrize(
+    "rule_breaker",
+    [
+        HEADER.pack(200, 0, 0, 0, 0, 0, 0),
+        encode(Frame(FrameType.HELLO)),
+        encode(Frame(FrameType.OPEN, 1)) + encode(Frame(FrameType.HELLO, 1)),
+        b"".join(encode(Frame(FrameType.OPEN, n)) for n in range(1, 40)),
+        encode(Frame(FrameType.OPEN, 2)) + 2 * encode(Frame(FrameType.CALL, 2, 7)),
+    ],
+    ids=["unknown type", "second hello", "hello on a channel", "too many channels", "same call twice"],
+)
+async def test_rule_breaking_peer_loses_its_link(rig: Rig, rule_breaker: bytes) -> None:
+    hub = await rig.hub(limits=LinkLimits(max_channels=30))
+    b = rig.party("b", hub)
+    await rig.listen(b, "unix")
+    await b.apply(
+        {"i1": "PublisherInterface", "i2": "ServiceClientInterface"},
+        [LinkSpec(id="L", peer="user/a", token="secret", dial=False)],
+        [ConnectionSpec(id=n, link="L", interface=f"i{n}", peer_interface="x") for n in (1, 2)],
+    )
+    reader, writer = await hello(b.address, encode_hello("L", "secret"))
+    check_answer(await answer(reader))
+    writer.write(rule_breaker)
+    while await _read_on(reader):
+        pass
+    writer.close()
+    await b.connected()
+
+
+async def _read_on(reader: asyncio.StreamReader) -> bytes:
+    try:
+        return await reader.read(1_000)
+    except ConnectionResetError:
+        return b""
+
+
+async def test_call_times_out_and_is_cancelled_at_the_peer(rig: Rig, way: str) -> None:
+    a, b = await rig.pair(way)
+    await rig.join(a, b, [SERVICE_OUT])
+    await a.connected(1)
+    ended = asyncio.Event()
+
+    async def wait(_: bytes) -> bytes:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            ended.set()
+        return b""
+
+    b.fakes["i1"].answer = wait
+    with pytest.raises(CallTimeout, match=r"0\.05 s"):
+        await a.fakes["i1"].port.call(b"", timeout=0.05)
+    await ended.wait()
+    ended.clear()
+    b.fakes["i1"].asked.clear()
+    call = asyncio.ensure_future(a.fakes["i1"].port.call(b""))
+    await b.fakes["i1"].asked.wait()
+    call.cancel()
+    await ended.wait()
+    b.fakes["i1"].answer = b.fakes["i1"].upper
+    assert await a.fakes["i1"].port.call(b"fine") == b"FINE"
+
+
+async def test_overloaded_peer_says_so(rig: Rig, way: str) -> None:
+    a, b = await rig.pair(way, LinkLimits(serving=1, waiting=1, max_calls=4))
+    await rig.join(a, b, [SERVICE_OUT])
+    await a.connected(1)
+    release = asyncio.Event()
+
+    async def wait(payload: bytes) -> bytes:
+        await release.wait()
+        return payload
+
+    b.fakes["i1"].answer = wait
+    port = a.fakes["i1"].port
+    served = [asyncio.ensure_future(port.call(b"%d" % n)) for n in range(2)]
+    await asyncio.sleep(0)
+    with pytest.raises(Overloaded):
+        await port.call(b"one too many at the peer")
+    release.set()
+    assert await asyncio.gather(*served) == [b"0", b"1"]
+    release.clear()
+    results = await asyncio.gather(*(_timed(port.call(b"x", timeout=0.05)) for _ in range(6)))
+    assert results.count("Overloaded") >= 4
+
+
+async def _timed(call: object) -> str:
+    try:
+        await call  # type: ignore[misc]
+    except (CallTimeout, Overloaded) as error:
+        return type(error).__name__
+    return "answered"
+
+
+async def test_too_large_messages(rig: Rig, way: str) -> None:
+    a, b = await rig.pair(way, LinkLimits(max_message=1_000))
+    await rig.join(a, b, [TOPIC_OUT, SERVICE_OUT])
+    await a.connected(1, 2)
+    for _ in range(3):
+        a.fakes["i1"].port.send(bytes(1_001))
+    a.fakes["i1"].port.send(bytes(1_000))
+    assert await b.fakes["i1"].received.get() == (bytes(1_000), False)
+    assert a.faults == ["interface i1: message of 1001 bytes is larger than the limit of 1000 bytes"]
+    assert a.endpoint.usage()["i1"].dropped == 3
+    with pytest.raises(MessageTooLarge):
+        await a.fakes["i2"].port.call(bytes(1_001))
+
+    async def too_much(_: bytes) -> bytes:
+        return bytes(1_001)
+
+    b.fakes["i2"].answer = too_much
+    with pytest.raises(Exception, match="larger than the limit"):
+        await a.fakes["i2"].port.call(b"")
+
+
+class Stalled:
+    """A peer that shakes hands, opens its channels and then reads no more."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        self.sock = sock
+
+    @classmethod
+    async def dial(cls, address: LinkAddress, link: str, channels: list[int]) -> Stalled:
+        loop = asyncio.get_running_loop()
+        sock = socket.socket(socket.AF_UNIX)
+        sock.setblocking(False)
+        await loop.sock_connect(sock, address.unix)
+        await loop.sock_sendall(sock, encode_hello(link, "secret"))
+        await loop.sock_recv(sock, HEADER.size)
+        await loop.sock_sendall(sock, b"".join(encode(Frame(FrameType.OPEN, n)) for n in channels))
+        return cls(sock)
+
+    async def read_frames(self, reader: FrameReader) -> list[Frame]:
+        return reader.feed(await asyncio.get_running_loop().sock_recv(self.sock, 65_536))
+
+
+async def stalled_and_healthy(rig: Rig) -> tuple[Party, Party, Stalled]:
+    """One robot sends i1 and i2 to a stalled peer and i3 to a healthy one."""
+    robot, healthy = await rig.pair("unix", LinkLimits(queue_messages=8, queue_bytes=12_000_000))
+    await rig.listen(robot, "unix")
+    await robot.apply(
+        {f"i{n}": "SubscriberInterface" for n in (1, 2, 3)},
+        [
+            LinkSpec(id="S", peer="user/s", token="secret", dial=False),
+            LinkSpec(id="L", peer="user/b", token="secret", dial=True, address=healthy.address),
+        ],
+        [
+            ConnectionSpec(id=n, link="L" if n == 3 else "S", interface=f"i{n}", peer_interface="x")
+            for n in (1, 2, 3)
+        ],
+    )
+    await healthy.apply(
+        {"i3": "PublisherConverter"},
+        [LinkSpec(id="L", peer="user/a", token="secret", dial=False)],
+        [ConnectionSpec(id=3, link="L", interface="i3", peer_interface="i3")],
+    )
+    stalled = await Stalled.dial(robot.address, "S", [1, 2])
+    await robot.connected(1, 2, 3)
+    return robot, healthy, stalled
+
+
+async def test_stalled_peer_loses_its_own_old_messages_only(rig: Rig) -> None:
+    robot, healthy, stalled = await stalled_and_healthy(rig)
+    image = bytes(5_000_000)
+    for n in range(60):
+        robot.fakes["i1"].port.send(image)
+        robot.fakes["i2"].port.send(b"pose %d" % n)
+        robot.fakes["i3"].port.send(image)
+        assert len((await healthy.fakes["i3"].received.get())[0]) == len(image)
+    usage = robot.endpoint.usage()
+    assert usage["i3"].dropped == 0
+    assert usage["i1"].dropped >= 56
+    assert usage["i2"].dropped >= 50
+    queues = [channel._queue for channel in robot.endpoint._channels.values()]
+    assert sum(queue.waiting_bytes for queue in queues) <= 17_001_000
+    stalled.sock.close()
+    await robot.connected(3)
+    assert sum(channel._queue.waiting_bytes for channel in robot.endpoint._channels.values()) == 0
+
+
+async def test_small_messages_overtake_a_large_one(rig: Rig) -> None:
+    robot, _, stalled = await stalled_and_healthy(rig)
+    robot.fakes["i1"].port.send(bytes(10_000_000))
+    for n in range(5):
+        robot.fakes["i2"].port.send(b"urgent %d" % n)
+    reader = FrameReader(LinkLimits())
+    messages: list[bytes] = []
+    while len(messages) < 5:
+        messages += [bytes(f.payload) for f in await stalled.read_frames(reader) if f.type is FrameType.DATA]
+    assert messages == [b"urgent %d" % n for n in range(5)]
+    assert robot.endpoint._channels[1]._queue.sent < 2_000_000
+    while len(messages) < 6:
+        messages += [bytes(f.payload) for f in await stalled.read_frames(reader) if f.type is FrameType.DATA]
+    stalled.sock.close()
+    assert len(messages[5]) == 10_000_000
+
+
+async def test_dead_machine_is_noticed_on_tcp(rig: Rig) -> None:
+    b = rig.party("b", await rig.hub(heartbeat=0.05, silence=0.2))
+    await rig.listen(b, "tcp")
+    await b.apply(
+        {"i1": "PublisherInterface"},
+        [LinkSpec(id="L", peer="user/a", token="secret", dial=False)],
+        [ConnectionSpec(id=1, link="L", interface="i1", peer_interface="x")],
+    )
+    reader, writer = await hello(b.address, encode_hello("L", "secret") + encode(Frame(FrameType.OPEN, 1)))
+    await b.connected(1)
+    await b.connected()
+    assert encode(Frame(FrameType.PING)) in await _read_on(reader)
+    writer.close()
+
+
+async def test_living_silent_peer_is_kept_on_tcp(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    a, b = await rig.pair("tcp", heartbeat=0.02, silence=0.2)
+    await rig.join(a, b, [TOPIC_OUT])
+    await a.connected(1)
+    carrier = a.endpoint._links["L"].carrier
+    assert carrier is not None
+    pings = 0
+    enough = asyncio.Event()
+    control = carrier.control
+
+    def count(frame: Frame) -> None:
+        nonlocal pings
+        pings += frame.type is FrameType.PING
+        if pings == 15:
+            enough.set()
+        control(frame)
+
+    monkeypatch.setattr(carrier, "control", count)
+    await enough.wait()
+    assert a.fakes["i1"].active == [True]
