@@ -18,6 +18,8 @@ ROS_NAME_PATTERN = r"[~/]?[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*"
 """What a ROS topic, service, parameter or namespace may be called."""
 
 _TYPE_PATTERN = f"({'|'.join(r.value for r in Role)})({'|'.join(f.value for f in Form)})"
+# Grouped, so that it is another text than CLASS_PATTERN and has words of its own in HUMAN_PATTERNS.
+_INTERFACE_PATH_PATTERN = rf"({NAME_PATTERN})/({NAME_PATTERN})"
 _EXECUTABLE_PATTERN = r"(?!/)(?!(.*/)?\.\.(/|\Z))[^\x00-\x1f\x7f]+"
 
 Name = Annotated[str, Meta(pattern=rf"^{NAME_PATTERN}\Z", max_length=MAX_NAME_LENGTH)]
@@ -36,9 +38,7 @@ OptionalNamespace = Annotated[str, Meta(pattern=rf"^(/|{ROS_NAME_PATTERN}/?)?\Z"
 """A ROS namespace or the empty string."""
 Executable = Annotated[str, Meta(pattern=rf"^{_EXECUTABLE_PATTERN}\Z", max_length=255)]
 """A file below a package's folders; never absolute, never above the package."""
-InterfacePath = Annotated[
-    str, Meta(pattern=rf"^{NAME_PATTERN}/{NAME_PATTERN}\Z", max_length=2 * MAX_NAME_LENGTH)
-]
+InterfacePath = Annotated[str, Meta(pattern=rf"^{_INTERFACE_PATH_PATTERN}\Z", max_length=2 * MAX_NAME_LENGTH)]
 """An interface of an endpoint, ``ENDPOINT/INTERFACE``."""
 MessageId = Annotated[str, Meta(max_length=MAX_MESSAGE_ID_LENGTH)]
 """Echoed in the answer to a service request."""
@@ -65,7 +65,7 @@ HUMAN_PATTERNS: dict[str, str] = {
     rf"^({ROS_NAME_PATTERN})?\Z": "must be a ROS name such as /group/topic",
     rf"^(/|{ROS_NAME_PATTERN}/?)?\Z": "must be a ROS namespace such as /Robot1",
     rf"^{_EXECUTABLE_PATTERN}\Z": "must be the name of a file inside the package",
-    rf"^{NAME_PATTERN}/{NAME_PATTERN}\Z": "must have the form ENDPOINT/INTERFACE",
+    rf"^{_INTERFACE_PATH_PATTERN}\Z": "must have the form ENDPOINT/INTERFACE",
     r"^[^\x00]*\Z": "must not hold a NUL character",
 }
 """What to tell a client instead of a regular expression."""
@@ -83,9 +83,9 @@ class ContainerData(_Part, frozen=True, kw_only=True, omit_defaults=True, rename
     size: Annotated[int, Meta(ge=0, le=2**31)] = 1
     cpu: Annotated[float, Meta(ge=0)] = 0.0
     """Cores."""
-    memory: Annotated[int, Meta(ge=0, lt=2**63)] = 0
+    memory: Annotated[int, Meta(ge=0, le=2**62)] = 0
     """Bytes."""
-    bandwidth: Annotated[int, Meta(ge=0, lt=2**63)] = 0
+    bandwidth: Annotated[int, Meta(ge=0, le=2**62)] = 0
     """Bytes per second."""
     special_features: list[Text] | Text = []
     """Labels that the machine must have; a string is a list of its words."""
