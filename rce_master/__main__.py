@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import logging
 import signal
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -20,8 +21,6 @@ from rce_master.state.settings import StateSettings
 from rce_master.store import SqliteStore
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from rce.config.secret import Secret
 
 _DEFAULTS = StateSettings()

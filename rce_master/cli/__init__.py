@@ -1,0 +1,1 @@
+"""Commands that the master plugs into the ``rce`` program."""

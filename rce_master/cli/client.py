@@ -1,0 +1,130 @@
+"""A small client of the master's REST API."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING, Any
+
+import aiohttp
+import msgspec
+import typer
+
+from rce_master.cli.exceptions import ApiError, CliError
+from rce_master.events import Event
+from rce_master.exceptions import MasterError
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Coroutine
+    from types import TracebackType
+    from typing import Self
+
+    from rce_master.cli.credentials import Credentials
+
+REQUEST_S = 30.0
+RETRY_S = 1.0
+_OK = 400
+
+
+class ApiClient:
+    """Talks to a master. Use it as an asynchronous context manager.
+
+    Args:
+        url: Of the master's HTTP server.
+        token: Bearer token; empty before the login.
+    """
+
+    def __init__(self, url: str, token: str = "") -> None:
+        self._base = f"{url.rstrip('/')}/api/v1"
+        self._headers = {"Authorization": f"Bearer {token}"} if token else {}
+
+    @classmethod
+    def of(cls, credentials: Credentials) -> ApiClient:
+        """Make a client for a login."""
+        return cls(credentials.url, credentials.token)
+
+    async def __aenter__(self) -> Self:
+        timeout = aiohttp.ClientTimeout(total=REQUEST_S)
+        self._session = aiohttp.ClientSession(headers=self._headers, timeout=timeout)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._session.close()
+
+    async def call(
+        self,
+        method: str,
+        path: str,
+        body: dict[str, Any] | None = None,
+        query: dict[str, str | int] | None = None,
+    ) -> Any:
+        """Make a request.
+
+        Returns:
+            What came back, or None if nothing did.
+
+        Raises:
+            ApiError: The master refused.
+            CliError: The master could not be reached.
+        """
+        try:
+            async with self._session.request(method, self._base + path, json=body, params=query) as reply:
+                return await _result(reply)
+        except (aiohttp.ClientError, TimeoutError, ValueError) as error:
+            raise CliError(f"cannot use the master at {self._base}: {str(error) or 'no answer'}") from error
+
+    async def events(self, since: int | None = None) -> AsyncIterator[Event]:
+        """Follow events for ever; a stream that breaks is resumed where it broke.
+
+        Raises:
+            ApiError: The master refused.
+            CliError: The master could not be reached at the first attempt.
+        """
+        last = since
+        reached = False
+        while True:
+            try:
+                async for event in self._stream(last):
+                    reached, last = True, event.id
+                    yield event
+                reached = True
+            except (aiohttp.ClientError, TimeoutError) as error:
+                if not reached and last is None:
+                    raise CliError(f"cannot use the master at {self._base}: {error}") from error
+            await asyncio.sleep(RETRY_S)
+
+    async def _stream(self, last: int | None) -> AsyncIterator[Event]:
+        headers = {} if last is None else {"Last-Event-ID": str(last)}
+        timeout = aiohttp.ClientTimeout(total=None, sock_connect=REQUEST_S, sock_read=2 * REQUEST_S)
+        async with self._session.get(f"{self._base}/events", headers=headers, timeout=timeout) as reply:
+            if reply.status >= _OK:
+                await _result(reply)
+            async for line in reply.content:
+                if line.startswith(b"data: "):
+                    yield msgspec.json.decode(line[6:], type=Event)
+
+
+async def _result(reply: aiohttp.ClientResponse) -> Any:
+    text = await reply.text()
+    if reply.status < _OK:
+        return msgspec.json.decode(text) if text else None
+    with contextlib.suppress(msgspec.MsgspecError, KeyError, TypeError):
+        text = msgspec.json.decode(text)["error"]
+    raise ApiError(reply.status, text.strip() or str(reply.reason))
+
+
+def run(work: Coroutine[Any, Any, None]) -> None:
+    """Run a command to its end; print why if it fails.
+
+    Raises:
+        typer.Exit: It failed, with code 1, or was interrupted, with code 130.
+    """
+    try:
+        asyncio.run(work)
+    except (CliError, MasterError) as error:
+        typer.echo(f"rce: {error}", err=True)
+        raise typer.Exit(1) from None
+    except KeyboardInterrupt:
+        raise typer.Exit(130) from None

@@ -1,0 +1,66 @@
+"""``rce login``, ``rce logout`` and ``rce token``."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Annotated
+
+import typer
+
+from rce_master.cli import credentials
+from rce_master.cli.client import ApiClient, run
+from rce_master.cli.exceptions import NotLoggedIn
+
+DEFAULT_URL = "http://127.0.0.1:9000/"
+
+
+def login(
+    url: Annotated[str, typer.Argument(help="The master's address.")] = DEFAULT_URL,
+    user: Annotated[str, typer.Option("--user", "-u", prompt=True, help="User name.")] = "",
+    password_stdin: Annotated[bool, typer.Option(help="Read the password from standard input.")] = False,
+) -> None:
+    """Log in at a master and keep the token for the other commands."""
+    run(_login(url, user, read_password(from_stdin=password_stdin)))
+
+
+async def _login(url: str, user: str, password: str) -> None:
+    async with ApiClient(url) as client:
+        reply = await client.call(
+            "POST", "/login", {"userID": user, "password": password, "label": "rce login"}
+        )
+    file = credentials.save(
+        credentials.Credentials(url=url, user=user, token=reply["token"], expires=reply["expires"])
+    )
+    typer.echo(f"logged in as {user} ({reply['role']}); the token is in {file}")
+
+
+def logout() -> None:
+    """Give the token back and forget it."""
+    run(_logout())
+
+
+async def _logout() -> None:
+    async with ApiClient.of(credentials.load()) as client:
+        await client.call("DELETE", "/login")
+    credentials.forget()
+    typer.echo("logged out")
+
+
+def token() -> None:
+    """Print the token, for use by other programs: curl -H "Authorization: Bearer $(rce token)" ..."""
+    run(_token())
+
+
+async def _token() -> None:
+    found = credentials.load()
+    if found.expires <= time.time():
+        raise NotLoggedIn
+    typer.echo(found.token)
+
+
+def read_password(*, from_stdin: bool, confirm: bool = False) -> str:
+    """Read a password: asked for at a terminal, or the first line of standard input."""
+    if from_stdin:
+        return sys.stdin.readline().rstrip("\n")
+    return str(typer.prompt("Password", hide_input=True, confirmation_prompt=confirm))

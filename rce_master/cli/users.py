@@ -1,0 +1,183 @@
+"""``rce user``: users, by the API of a running master or right in its state folder."""
+
+from __future__ import annotations
+
+import time
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from rce.config.folders import default_state_dir
+from rce_master.auth import Authenticator, client_digest
+from rce_master.cli import credentials
+from rce_master.cli.client import ApiClient, run
+from rce_master.cli.exceptions import NotLoggedIn
+from rce_master.cli.session import read_password
+from rce_master.state import commands
+from rce_master.state.core import State
+from rce_master.state.records import User, UserRole
+from rce_master.store import SqliteStore
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from rce_master.store import Store
+
+app = typer.Typer(no_args_is_help=True, help="Add, list and remove users, change passwords.")
+
+StateDir = Annotated[
+    Path | None,
+    typer.Option(help="Work on this state folder while no master runs on it, instead of over the API."),
+]
+PasswordStdin = Annotated[bool, typer.Option(help="Read the password from standard input.")]
+
+
+@app.command("add")
+def add(
+    name: str,
+    admin: Annotated[bool, typer.Option("--admin", help="May control everything of everybody.")] = False,
+    password_stdin: PasswordStdin = False,
+    state_dir: StateDir = None,
+) -> None:
+    """Add a user."""
+    run(_add(name, admin, read_password(from_stdin=password_stdin, confirm=True), state_dir))
+
+
+async def _add(name: str, admin: bool, password: str, state_dir: Path | None) -> None:
+    async with _directory(state_dir) as users:
+        await users.add(name, "admin" if admin else "user", password)
+    typer.echo(f"added {name}")
+
+
+@app.command("list")
+def list_(state_dir: StateDir = None) -> None:
+    """List all users."""
+    run(_list(state_dir))
+
+
+async def _list(state_dir: Path | None) -> None:
+    async with _directory(state_dir) as users:
+        found = await users.list()
+    table = Table("user", "role", "since", box=None)
+    for user in found:
+        table.add_row(user["name"], user["role"], time.strftime("%Y-%m-%d", time.localtime(user["created"])))
+    Console().print(table)
+
+
+@app.command("passwd")
+def passwd(name: str, password_stdin: PasswordStdin = False, state_dir: StateDir = None) -> None:
+    """Change a user's password."""
+    run(_passwd(name, read_password(from_stdin=password_stdin, confirm=True), state_dir))
+
+
+async def _passwd(name: str, password: str, state_dir: Path | None) -> None:
+    async with _directory(state_dir) as users:
+        await users.set_password(name, password)
+    typer.echo(f"changed the password of {name}")
+
+
+@app.command("remove")
+def remove(name: str, state_dir: StateDir = None) -> None:
+    """Remove a user with all robots and containers."""
+    run(_remove(name, state_dir))
+
+
+async def _remove(name: str, state_dir: Path | None) -> None:
+    async with _directory(state_dir) as users:
+        await users.remove(name)
+    typer.echo(f"removed {name}")
+
+
+class _Directory(Protocol):
+    async def add(self, name: str, role: str, password: str) -> None: ...
+    async def list(self) -> list[dict[str, Any]]: ...
+    async def set_password(self, name: str, password: str) -> None: ...
+    async def remove(self, name: str) -> None: ...
+
+
+class _ApiDirectory:
+    """Users over the API of a running master."""
+
+    def __init__(self, client: ApiClient) -> None:
+        self._client = client
+
+    async def add(self, name: str, role: str, password: str) -> None:
+        await self._client.call("POST", "/users", {"name": name, "role": role, "password": password})
+
+    async def list(self) -> list[dict[str, Any]]:
+        return list((await self._client.call("GET", "/users"))["users"])
+
+    async def set_password(self, name: str, password: str) -> None:
+        await self._client.call("PUT", f"/users/{name}/password", {"password": password})
+
+    async def remove(self, name: str) -> None:
+        await self._client.call("DELETE", f"/users/{name}")
+
+
+class _StoreDirectory:
+    """Users right in the store, which is locked meanwhile."""
+
+    def __init__(self, state: State, store: Store) -> None:
+        self._state = state
+        self._store = store
+        self._authenticator = Authenticator(state.tables)
+
+    async def add(self, name: str, role: str, password: str) -> None:
+        hashed = await self._authenticator.hash(client_digest(password))
+        user = User(name=name, role=UserRole(role), password=hashed, created=time.time())
+        await self._do(commands.AddUser(user=user))
+
+    async def list(self) -> list[dict[str, Any]]:
+        return [
+            {"name": user.name, "role": user.role.value, "created": user.created}
+            for user in self._state.tables.users
+        ]
+
+    async def set_password(self, name: str, password: str) -> None:
+        hashed = await self._authenticator.hash(client_digest(password))
+        await self._do(commands.SetPassword(name=name, password=hashed))
+
+    async def remove(self, name: str) -> None:
+        await self._do(commands.RemoveUser(name=name))
+
+    def close(self) -> None:
+        self._authenticator.close()
+
+    async def _do(self, command: commands.Command) -> None:
+        await self._store.save(self._state.apply(command, time.monotonic()).rows())
+
+
+@asynccontextmanager
+async def _directory(state_dir: Path | None) -> AsyncIterator[_Directory]:
+    """Choose: the folder that was named, else the master where one is logged in, else the default folder."""
+    if state_dir is None:
+        try:
+            login = credentials.load()
+        except NotLoggedIn:
+            state_dir = default_state_dir()
+        else:
+            async with ApiClient.of(login) as client:
+                yield _ApiDirectory(client)
+            return
+    async with _open_store(state_dir) as directory:
+        yield directory
+
+
+@asynccontextmanager
+async def _open_store(state_dir: Path) -> AsyncIterator[_StoreDirectory]:
+    # Of `rce up`'s state folder, the master's part is a folder in it.
+    inner = state_dir / "master"
+    folder = inner if inner.is_dir() or state_dir == default_state_dir() else state_dir
+    store = await SqliteStore.open(folder)
+    try:
+        directory = _StoreDirectory(State.load(await store.load(), time.monotonic()), store)
+        try:
+            yield directory
+        finally:
+            directory.close()
+    finally:
+        await store.close()

@@ -1,0 +1,216 @@
+"""Random histories: invariants hold, refusals change nothing, and the store always tells the same."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+
+from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, TaskSetKind
+from rce.control.model import (
+    EndpointState,
+    EndpointStatus,
+    InterfaceSpec,
+    LinkAddress,
+    NodeSpec,
+    Resources,
+)
+from rce_master.exceptions import Refused
+from rce_master.state import commands
+from rce_master.state.core import State
+from rce_master.state.records import User, UserRole
+from rce_master.state.settings import StateSettings
+
+USERS = st.sampled_from(["ann", "bob"])
+TAGS = st.sampled_from(["a", "b", "c", "d"])
+INTERFACES = st.sampled_from(["i", "j"])
+PATHS = st.builds("{}/{}".format, TAGS, INTERFACES)
+ROBOT_SETS = st.sampled_from(["r1", "r2"])
+CONTAINER_SETS = st.sampled_from(["c1", "c2"])
+ADDRESSES = st.builds(LinkAddress, unix=st.sampled_from(["", "/x", "/y"]))
+TYPES = st.builds(
+    "{}{}".format,
+    st.sampled_from(["Publisher", "Subscriber", "ServiceClient", "ServiceProvider"]),
+    st.sampled_from(["Interface", "Converter"]),
+)
+STATUSES = st.builds(
+    EndpointStatus,
+    id=st.builds("{}/{}".format, USERS, TAGS),
+    revision=st.integers(0, 300),
+    state=st.sampled_from(EndpointState),
+    incarnation=st.sampled_from(["1", "2"]),
+    address=ADDRESSES,
+)
+LIMITS = StateSettings(
+    robot_grace=3, container_grace=2, placement_patience=1, max_containers=3, max_connections=6
+)
+
+
+class Histories(RuleBasedStateMachine):
+    """Everything that can happen, in any order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.state = State(LIMITS)
+        self.now = 0.0
+        self.stored: dict[str, dict[str, bytes]] = {}
+        self.numbers: set[int] = set()
+        self.revisions: dict[str, int] = {}
+        for name in ("ann", "bob"):
+            self.do(commands.AddUser(user=User(name=name, role=UserRole.ADMIN, password="", created=0.0)))
+
+    def do(self, command: commands.Command) -> None:
+        before = self.image(persistent_only=False)
+        known = self.connection_ids()
+        try:
+            changes = self.state.apply(command, self.now)
+        except Refused:
+            assert self.image(persistent_only=False) == before
+            return
+        for row in changes.rows():
+            table = self.stored.setdefault(row.table, {})
+            if row.body is None:
+                table.pop(row.key, None)
+            else:
+                table[row.key] = row.body
+        new = self.connection_ids() - known
+        assert not new & self.numbers, "a connection id was used again"
+        self.numbers |= new
+        for id_ in changes.touched:
+            revision = self.state.spec(id_).revision
+            assert revision > self.revisions.get(id_, 0)
+            self.revisions[id_] = revision
+        for drop in changes.withdrawals:
+            assert drop.revision > self.revisions.get(drop.id, 0) or drop.id in changes.touched
+
+    def connection_ids(self) -> set[int]:
+        return {id_ for link in self.state.tables.links for id_ in link.connections}
+
+    def image(self, *, persistent_only: bool) -> dict[str, dict[str, bytes]]:
+        return {
+            table.name: {table.key(r): table.encode(r) for r in table}
+            for table in self.state.tables.all
+            if table.persistent or not persistent_only
+        }
+
+    @invariant()
+    def holds(self) -> None:
+        self.state.validate()
+        for endpoint in self.state.tables.endpoints:
+            assert self.state.spec(endpoint.id).id == endpoint.id
+
+    @invariant()
+    def is_stored(self) -> None:
+        assert {k: v for k, v in self.image(persistent_only=True).items() if v} == {
+            k: v for k, v in self.stored.items() if v
+        }
+
+    @rule()
+    def restart(self) -> None:
+        specs = {e.id: self.state.spec(e.id) for e in self.state.tables.endpoints}
+        self.state = State.load(self.stored, self.now, LIMITS)
+        assert {e.id: self.state.spec(e.id) for e in self.state.tables.endpoints} == specs
+
+    @rule(seconds=st.floats(0, 4))
+    def tick(self, seconds: float) -> None:
+        self.now += seconds
+        self.do(commands.Tick())
+
+    @rule(process=ROBOT_SETS, address=ADDRESSES, endpoints=st.lists(STATUSES, max_size=3))
+    def robot_set_arrives(self, process: str, address: LinkAddress, endpoints: list[EndpointStatus]) -> None:
+        self.arrive(TaskSetKind.ROBOT, process, address, endpoints)
+
+    @rule(process=CONTAINER_SETS, endpoints=st.lists(STATUSES, max_size=3))
+    def container_set_arrives(self, process: str, endpoints: list[EndpointStatus]) -> None:
+        self.arrive(TaskSetKind.CONTAINER, process, LinkAddress(), endpoints)
+
+    def arrive(
+        self, kind: TaskSetKind, process: str, address: LinkAddress, endpoints: list[EndpointStatus]
+    ) -> None:
+        hello = Hello(
+            version=CONTROL_VERSION,
+            kind=kind,
+            process=process,
+            machine=MachineInfo(name="m"),
+            address=address,
+            endpoints=tuple(endpoints),
+        )
+        self.do(commands.TaskSetArrived(hello=hello))
+
+    @rule(process=ROBOT_SETS | CONTAINER_SETS)
+    def task_set_leaves(self, process: str) -> None:
+        self.do(commands.TaskSetLeft(process=process))
+
+    @rule(process=ROBOT_SETS | CONTAINER_SETS, status=STATUSES)
+    def status(self, process: str, status: EndpointStatus) -> None:
+        self.do(commands.StatusReported(process=process, status=status))
+
+    @rule(process=ROBOT_SETS | CONTAINER_SETS, user=USERS, tag=TAGS)
+    def gone(self, process: str, user: str, tag: str) -> None:
+        self.do(commands.EndpointGone(process=process, id=f"{user}/{tag}"))
+
+    @rule(process=ROBOT_SETS, user=USERS, tag=TAGS)
+    def login(self, process: str, user: str, tag: str) -> None:
+        self.do(commands.RobotLogin(process=process, id=f"{user}/{tag}"))
+
+    @rule(process=ROBOT_SETS, user=USERS, tag=TAGS)
+    def robot_leaves(self, process: str, user: str, tag: str) -> None:
+        self.do(commands.RobotLeft(process=process, id=f"{user}/{tag}"))
+
+    @rule(user=USERS, tag=TAGS, size=st.sampled_from([1, 2]))
+    def create(self, user: str, tag: str, size: int) -> None:
+        self.do(commands.CreateContainer(user=user, tag=tag, resources=Resources(size=size)))
+
+    @rule(user=USERS, tag=TAGS)
+    def destroy(self, user: str, tag: str) -> None:
+        self.do(commands.DestroyContainer(user=user, tag=tag))
+
+    @rule(user=USERS, tag=TAGS, exe=st.sampled_from(["x", "y"]), remove=st.booleans())
+    def node(self, user: str, tag: str, exe: str, remove: bool) -> None:
+        if remove:
+            self.do(commands.RemoveNode(user=user, container=tag, tag="n"))
+        else:
+            node = NodeSpec(tag="n", pkg="p", exe=exe)
+            self.do(commands.AddNode(user=user, container=tag, node=node))
+
+    @rule(user=USERS, tag=TAGS, value=st.sampled_from([1, True, "x", [1.5]]), remove=st.booleans())
+    def parameter(self, user: str, tag: str, value: int, remove: bool) -> None:
+        if remove:
+            self.do(commands.DeleteParameter(user=user, container=tag, name="p"))
+        else:
+            self.do(commands.SetParameter(user=user, container=tag, name="p", value=value))
+
+    @rule(user=USERS, tag=TAGS, interface=INTERFACES, type_=TYPES)
+    def add_interface(self, user: str, tag: str, interface: str, type_: str) -> None:
+        spec = InterfaceSpec(tag=interface, type=type_, cls="p/T", addr="/x")
+        self.do(commands.AddInterface(user=user, endpoint=tag, interface=spec))
+
+    @rule(user=USERS, tag=TAGS, interface=INTERFACES)
+    def remove_interface(self, user: str, tag: str, interface: str) -> None:
+        self.do(commands.RemoveInterface(user=user, endpoint=tag, tag=interface))
+
+    @rule(user=USERS, a=PATHS, b=PATHS)
+    def connect(self, user: str, a: str, b: str) -> None:
+        self.do(commands.Connect(user=user, tag_a=a, tag_b=b))
+
+    @rule(user=USERS, a=PATHS, b=PATHS)
+    def disconnect(self, user: str, a: str, b: str) -> None:
+        self.do(commands.Disconnect(user=user, tag_a=a, tag_b=b))
+
+    @rule()
+    def wire(self) -> None:
+        """A whole scene at once, which single random steps would seldom reach."""
+        self.arrive(TaskSetKind.ROBOT, "r1", LinkAddress(unix="/r"), [])
+        self.arrive(TaskSetKind.CONTAINER, "c1", LinkAddress(), [])
+        self.do(commands.RobotLogin(process="r1", id="ann/a"))
+        self.create("ann", "b", 1)
+        self.add_interface("ann", "a", "i", "SubscriberConverter")
+        self.add_interface("ann", "b", "i", "PublisherInterface")
+        self.connect("ann", "a/i", "b/i")
+
+
+Histories.TestCase.settings = settings(
+    max_examples=60, stateful_step_count=40, deadline=None, suppress_health_check=list(HealthCheck)
+)
+TestHistories = pytest.mark.timeout(120)(Histories.TestCase)

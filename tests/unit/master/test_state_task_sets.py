@@ -1,0 +1,331 @@
+"""Robots, containers and task sets over time: placement, absence, adoption, restarts."""
+
+from __future__ import annotations
+
+import pytest
+from support.master_world import World
+
+from rce.control.model import (
+    EndpointState,
+    EndpointStatus,
+    LinkAddress,
+    NodeState,
+    NodeStatus,
+)
+from rce_master.exceptions import Conflict, InvalidTransition, NotFound
+from rce_master.state import commands
+from rce_master.state.core import State
+from rce_master.state.lifecycle import (
+    ContainerEvent,
+    ContainerPhase,
+    RobotEvent,
+    RobotSession,
+    next_phase,
+    next_session,
+)
+
+
+def status(
+    tag: str, state: EndpointState = EndpointState.RUNNING, revision: int = 1, **fields: object
+) -> EndpointStatus:
+    return EndpointStatus(id=f"anna/{tag}", revision=revision, state=state, **fields)  # type: ignore[arg-type]
+
+
+def kinds(changes: object) -> list[str]:
+    return [h.kind for h in changes.happenings]  # type: ignore[attr-defined]
+
+
+def test_lifecycles_refuse_what_cannot_happen() -> None:
+    with pytest.raises(InvalidTransition, match="login is impossible while connected"):
+        next_session(RobotSession.CONNECTED, RobotEvent.LOGIN)
+    with pytest.raises(InvalidTransition, match="running is impossible while requested"):
+        next_phase(ContainerPhase.REQUESTED, ContainerEvent.RUNNING)
+    for phase in ContainerPhase:
+        if phase.is_placed:
+            assert {next_phase(phase, event) for event in ContainerEvent} == set(ContainerPhase)
+
+
+# Placement
+
+
+def test_a_container_waits_for_a_machine_and_its_user_is_told_once(world: World) -> None:
+    world.container()
+    assert world.phase() == "requested"
+    assert world.tick(9).notices == []
+    (notice,) = world.tick(1).notices
+    assert notice.to == "anna"
+    assert "no container task set is connected" in notice.text
+    assert world.tick(60).notices == []
+    changes = world.container_set()
+    assert world.phase() == "placed"
+    assert "anna/c" in changes.touched
+
+
+def test_containers_spread_over_machines(world: World) -> None:
+    world.container_set("c1")
+    world.container_set("c2")
+    for tag in "abcd":
+        world.container(tag)
+    tables = world.state.tables
+    assert [tables.endpoints[f"anna/{tag}"].task_set for tag in "abcd"] == ["c1", "c2", "c1", "c2"]
+
+
+def test_features_and_memory_are_respected(world: World) -> None:
+    world.container_set("c1", memory=100)
+    world.container("gpu", special_features=("gpu",))
+    world.container("big", memory=80)
+    world.container("bigger", memory=30)
+    assert [world.phase(tag) for tag in ("gpu", "big", "bigger")] == ["requested", "placed", "requested"]
+    texts = [notice.text for notice in world.tick(10).notices]
+    assert any("none offers gpu" in text for text in texts)
+    assert any("none has room" in text for text in texts)
+    world.container_set("c2", labels=("gpu",))
+    assert [world.phase(tag) for tag in ("gpu", "bigger")] == ["placed", "placed"]
+
+
+def test_a_container_made_again_waits_until_its_former_self_is_gone(world: World) -> None:
+    world.wired()
+    world.run()
+    (drop,) = world.do(commands.DestroyContainer(user="anna", tag="c")).withdrawals
+    assert world.container().touched == {"anna/c": None}
+    assert world.phase() == "requested"
+    world.do(commands.EndpointGone(process="c1", id="anna/c"))
+    assert world.phase() == "placed"
+    assert world.spec("c").revision > drop.revision
+
+
+def test_a_container_that_its_task_set_ended_is_placed_anew(world: World) -> None:
+    world.wired()
+    world.run()
+    changes = world.do(commands.EndpointGone(process="c1", id="anna/c"))
+    assert world.phase() == "placed"
+    assert {"anna/c", "anna/rob"} <= set(changes.touched)
+    assert world.spec("rob").links[0].address == LinkAddress()
+
+
+# What is reported
+
+
+def test_a_containers_address_goes_to_who_dials_it(world: World) -> None:
+    world.wired()
+    assert world.spec("rob").links[0].address == LinkAddress()
+    changes = world.run(incarnation="1")
+    assert set(changes.touched) == {"anna/rob"}
+    assert world.spec("rob").links[0].address.unix == "/run/c"
+    assert set(world.run(incarnation="1").touched) == set()
+    changes = world.report("c1", status("c", EndpointState.STARTING, incarnation="2"))
+    assert set(changes.touched) == {"anna/rob"}
+    assert world.spec("rob").links[0].address == LinkAddress()
+    assert kinds(changes) == ["container_starting"]
+
+
+def test_what_happens_to_nodes_becomes_events(world: World) -> None:
+    world.wired()
+    world.node("c", "n")
+    up = world.run(nodes=(NodeStatus(tag="n", state=NodeState.RUNNING, pid=1),))
+    assert kinds(up) == ["container_running", "node_running"]
+    down = world.run(nodes=(NodeStatus(tag="n", state=NodeState.FAILED, exit_code=-9),))
+    assert [(h.kind, h.subject, h.text) for h in down.happenings] == [
+        ("node_failed", "anna/c/n", "ended by signal 9")
+    ]
+    assert kinds(world.run(nodes=(NodeStatus(tag="n", state=NodeState.FAILED, exit_code=-9),))) == []
+
+
+def test_a_restart_that_was_not_seen_is_an_event(world: World) -> None:
+    world.wired()
+    world.run(incarnation="1")
+    assert kinds(world.run(incarnation="2")) == ["container_restarted"]
+
+
+def test_reports_of_what_is_not_placed_there_are_ignored(world: World) -> None:
+    world.wired()
+    world.container_set("c2")
+    changes = world.report("c2", status("c", EndpointState.FAILED))
+    assert world.phase() == "placed"
+    assert changes.rows() == []
+
+
+def test_faults_reach_the_user(world: World) -> None:
+    world.wired()
+    (notice,) = world.do(commands.FaultReported(id="anna/c", text="no such package")).notices
+    assert (notice.to, notice.text) == ("anna", "no such package")
+    fault = commands.FaultReported(id="anna/c", text="bad", robot="anna/rob")
+    assert world.do(fault).notices[0].to == "anna/rob"
+    with pytest.raises(NotFound):
+        world.do(commands.FaultReported(id="zoe/c", text="x"))
+
+
+# Robots
+
+
+def test_a_robot_is_kept_for_its_grace_time_and_finds_everything_again(world: World) -> None:
+    world.wired()
+    before = world.spec("rob")
+    world.do(commands.RobotLeft(process="r1", id="anna/rob"))
+    assert world.session() == "absent"
+    world.tick(59)
+    changes = world.login()
+    assert world.spec("rob") == before
+    assert changes.answered == "anna/rob"
+    assert world.session() == "connected"
+    world.do(commands.RobotLeft(process="r1", id="anna/rob"))
+    changes = world.tick(60)
+    assert kinds(changes) == ["robot_gone"]
+    assert [(w.process, w.id) for w in changes.withdrawals] == [("r1", "anna/rob")]
+    assert world.spec("c").connections == ()
+    assert world.phase() == "placed"
+
+
+def test_a_robot_connects_once(world: World) -> None:
+    world.wired()
+    world.robot_set("r2")
+    with pytest.raises(Conflict, match="connected already"):
+        world.login(process="r2")
+    with pytest.raises(Conflict, match="no connected robot task set"):
+        world.login("other", process="c1")
+
+
+def test_a_robot_moves_to_another_task_set(world: World) -> None:
+    world.wired()
+    world.login("abel")
+    world.interface("abel/in", "PublisherConverter")
+    world.connect("abel/in", "rob/out")
+    world.robot_set("r2", port=2)
+    world.do(commands.RobotLeft(process="r1", id="anna/rob"))
+    changes = world.login(process="r2")
+    assert [(w.process, w.id) for w in changes.withdrawals] == [("r1", "anna/rob")]
+    assert "anna/abel" in changes.touched
+    (link,) = world.spec("abel").links
+    assert (link.dial, link.address.port) == (True, 2)
+
+
+def test_robots_of_a_killed_task_set_come_back_at_another(world: World) -> None:
+    world.wired()
+    before = world.spec("rob")
+    world.leave("r1")
+    assert world.session() == "absent"
+    world.robot_set("r2")
+    changes = world.login(process="r2")
+    assert changes.withdrawals == []
+    assert world.spec("rob").connections == before.connections
+    world.tick(60)
+    assert "r1" not in world.state.tables.task_sets
+    assert world.session() == "connected"
+
+
+def test_a_channel_that_dropped_for_a_while_changes_nothing(world: World) -> None:
+    world.wired()
+    world.run()
+    before = world.spec("rob"), world.spec("c")
+    world.leave("r1")
+    world.leave("c1")
+    world.tick(29)
+    world.robot_set(endpoints=(status("rob", revision=before[0].revision),))
+    world.container_set(
+        endpoints=(status("c", revision=before[1].revision, address=LinkAddress(machine="m", unix="/run/c")),)
+    )
+    assert (world.spec("rob"), world.spec("c")) == before
+    assert (world.session(), world.phase()) == ("connected", "running")
+
+
+def test_a_robot_that_its_task_set_lost_meanwhile_is_absent(world: World) -> None:
+    world.wired()
+    world.leave("r1")
+    world.robot_set()
+    assert world.session() == "absent"
+    world.login()
+    world.report("r1", status("rob", EndpointState.ABSENT))
+    assert world.session() == "absent"
+    world.report("r1", status("rob"))
+    assert world.session() == "connected"
+
+
+# Container task sets that go
+
+
+def test_containers_of_a_machine_that_stays_away_move(world: World) -> None:
+    world.wired()
+    world.run()
+    world.container_set("c2")
+    world.leave("c1")
+    assert world.tick(29).happenings == []
+    assert world.phase() == "running"
+    changes = world.tick(1)
+    assert world.state.tables.endpoints["anna/c"].task_set == "c2"
+    assert world.phase() == "placed"
+    assert kinds(changes) == ["container_lost", "task_set_gone"]
+    assert "was lost with its machine" in changes.notices[0].text
+    world.container_set("c1", endpoints=(status("c"),))
+    assert world.state.tables.endpoints["anna/c"].task_set == "c2"
+
+
+def test_a_lost_container_is_bound_again_if_its_machine_comes_back_first(world: World) -> None:
+    world.wired()
+    world.run()
+    before = world.spec("c")
+    world.leave("c1")
+    world.tick(30)
+    assert world.phase() == "lost"
+    world.container_set(
+        endpoints=(status("c", revision=before.revision, address=LinkAddress(machine="m", unix="/run/c")),)
+    )
+    assert world.phase() == "running"
+    assert world.spec("c").connections == before.connections
+    assert world.spec("rob").links[0].address.unix == "/run/c"
+
+
+def test_a_machine_that_lost_its_containers_makes_them_again(world: World) -> None:
+    world.wired()
+    world.run()
+    world.leave("c1")
+    world.container_set()
+    assert world.phase() == "placed"
+    assert world.spec("rob").links[0].address == LinkAddress()
+
+
+# A restarted master
+
+
+def restarted(world: World) -> World:
+    snapshot: dict[str, dict[str, bytes]] = {
+        table.name: {table.key(r): table.encode(r) for r in table}
+        for table in world.state.tables.all
+        if table.persistent
+    }
+    new = World.__new__(World)
+    new.now = world.now + 1
+    new.state = State.load(snapshot, new.now)
+    new.state.validate()
+    return new
+
+
+def test_a_restarted_master_desires_the_same(world: World) -> None:
+    world.wired()
+    world.run()
+    before = world.spec("rob"), world.spec("c")
+    new = restarted(world)
+    assert (new.spec("rob"), new.spec("c")) == before
+    assert (new.session(), new.phase()) == ("absent", "placed")
+    address = LinkAddress(machine="m", unix="/run/c")
+    robots = new.robot_set(endpoints=(status("rob", revision=before[0].revision),))
+    containers = new.container_set(endpoints=(status("c", revision=before[1].revision, address=address),))
+    assert (new.spec("rob"), new.spec("c")) == before
+    assert (robots.arrived, containers.arrived) == ("r1", "c1")
+    assert (new.session(), new.phase()) == ("connected", "running")
+
+
+def test_revisions_go_on_above_what_was_applied(world: World) -> None:
+    world.wired()
+    world.leave("c1")
+    world.container_set(endpoints=(status("c", revision=5000),))
+    assert world.spec("c").revision > 5000
+    world.node("c", "n")
+    assert world.spec("c").revision > 5001
+
+
+def test_robots_that_do_not_come_back_after_a_restart_expire(world: World) -> None:
+    world.wired()
+    new = restarted(world)
+    new.tick(60)
+    assert new.state.tables.robots() == []
+    assert new.phase() == "lost"
