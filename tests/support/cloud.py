@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
 
     from rce.control.messages import ToMaster
-    from rce.control.server import Peer
+    from rce.control.peer import Peer
     from rce.link import Buffer, Port
 
 SECRET = Secret("secret of the tests")
@@ -90,6 +90,8 @@ class FakeMaster:
         self.answer: Callable[[ClientRequest], Awaitable[tuple[str, ...]]] = self._agree
         self.peer: Peer | None = None
         self.url = ""
+        self.silent = False
+        """Whether it answers nothing, like a master that hangs."""
 
     async def _agree(self, request: ClientRequest) -> tuple[str, ...]:
         return ()
@@ -107,6 +109,8 @@ class FakeMaster:
         self.changed.set()
 
     async def on_message(self, peer: Peer, message: ToMaster) -> None:
+        if self.silent:
+            return
         match message:
             case Login():
                 peer.send(self._login(message))
@@ -187,7 +191,9 @@ class End(Interface):
 class Cloud:
     """The master, one robot task set, one container."""
 
-    def __init__(self, master: FakeMaster, endpoint: Endpoint, ends: dict[str, End], address: LinkAddress):
+    def __init__(
+        self, master: FakeMaster, endpoint: Endpoint, ends: dict[str, End], address: LinkAddress
+    ) -> None:
         self.master = master
         self.ends = ends
         self.ws_url = ""
@@ -203,7 +209,9 @@ class Cloud:
         link = f"link_{robot}"
         number = next(self._numbers)
         peer_tag = f"{robot}_{tag}"
-        peer = InterfaceSpec(tag=peer_tag, type=f"{kind.role.complement.value}Interface", cls=cls, addr=f"/{tag}")
+        peer = InterfaceSpec(
+            tag=peer_tag, type=f"{kind.role.complement.value}Interface", cls=cls, addr=f"/{tag}"
+        )
         own = InterfaceSpec(tag=tag, type=type_, cls=cls)
         self._container = _grown(
             self._container,

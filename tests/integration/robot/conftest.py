@@ -68,3 +68,18 @@ async def cloud() -> AsyncIterator[Cloud]:
 async def robot(cloud: Cloud) -> AsyncIterator[Robot]:
     async with dial(cloud) as socket:
         yield Robot(socket)
+
+
+@pytest.fixture(name="dial")
+def _dial() -> Any:
+    return dial
+
+
+@pytest.fixture
+def robot_of() -> Any:
+    return Robot
+
+
+@pytest.fixture
+def connect_to() -> Any:
+    return lambda url: connect(url, proxy=None)

@@ -6,6 +6,10 @@ import asyncio
 import struct
 from typing import TYPE_CHECKING
 
+import pytest
+
+from rce.link import PeerFault
+
 if TYPE_CHECKING:
     from tests.integration.robot.conftest import Robot
     from tests.support.cloud import Cloud
@@ -101,12 +105,8 @@ async def test_the_robots_failure_reaches_the_caller(cloud: Cloud, robot: Robot)
         call = asyncio.create_task(end.port.call(ros_string("x")))
         request = await robot.get("DM")
         await robot.say("serve", ECHO, answer, request["msgID"])
-        try:
+        with pytest.raises(PeerFault, match=expected):
             await call
-        except Exception as error:
-            assert expected in str(error)
-        else:
-            raise AssertionError("the call did not fail")
 
 
 async def test_a_robot_that_leaves_fails_its_callers(cloud: Cloud, robot: Robot) -> None:
@@ -115,12 +115,8 @@ async def test_a_robot_that_leaves_fails_its_callers(cloud: Cloud, robot: Robot)
     await robot.get("DM")
     await robot.socket.close()
     for waiting in (call, asyncio.create_task(end.port.call(ros_string("y")))):
-        try:
+        with pytest.raises(PeerFault, match="robot"):
             await waiting
-        except Exception as error:
-            assert "robot" in str(error)
-        else:
-            raise AssertionError("the call did not fail")
 
 
 async def test_unknown_fields_are_told_once(cloud: Cloud, robot: Robot) -> None:

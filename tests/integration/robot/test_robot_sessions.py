@@ -1,0 +1,265 @@
+"""A robot's connection from handshake to end, and what the master hears of it."""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from rce.control.model import EndpointState
+from rce_robot.outbox import OutboxLimits
+from rce_robot.settings import SessionSettings
+from tests.support.cloud import DIGEST, running_cloud
+
+if TYPE_CHECKING:
+    from rce.control.messages import ClientRequest
+    from tests.support.cloud import Cloud
+
+STRING = "std_msgs/String"
+ROBOT = "testUser/testRobot"
+
+
+def ros_string(text: str) -> bytes:
+    data = text.encode()
+    return struct.pack("<I", len(data)) + data
+
+
+async def refused(attempt: Any) -> tuple[int, str]:
+    with pytest.raises(InvalidStatus) as caught:
+        async with attempt:
+            pass
+    body = caught.value.response.body
+    return caught.value.response.status_code, bytes(body or b"").decode()
+
+
+# The handshake
+
+
+@pytest.mark.parametrize(
+    ("query", "word"),
+    [
+        ("", "userID"),
+        (f"userID=testUser&password={DIGEST}", "robotID"),
+        (f"userID=testUser&userID=x&robotID=r&password={DIGEST}", "userID"),
+        (f"userID=testUser&robotID=1r&password={DIGEST}", "robotID"),
+    ],
+)
+async def test_bad_query(cloud: Cloud, query: str, word: str, connect_to: Any) -> None:
+    status, reason = await refused(connect_to(f"{cloud.ws_url}?{query}"))
+    assert status == 400
+    assert word in reason
+
+
+async def test_wrong_password(cloud: Cloud, dial: Any) -> None:
+    status, reason = await refused(dial(cloud, password="0" * 64))
+    assert status == 401
+    assert "Wrong" in reason
+    assert cloud.master.inside == set()
+
+
+async def test_second_connection_of_a_robot(cloud: Cloud, dial: Any) -> None:
+    async with dial(cloud):
+        status, reason = await refused(dial(cloud))
+        assert status == 409
+        assert "already connected" in reason
+        async with dial(cloud, robot="other"):
+            pass
+    await cloud.master.changed.until(lambda: ROBOT in cloud.master.left)
+    async with dial(cloud):
+        pass
+
+
+async def test_pages_of_other_sites_are_refused(dial: Any) -> None:
+    async with running_cloud(origins=("https://fleet.example",)) as cloud:
+        status, reason = await refused(dial(cloud, origin="https://evil.example"))
+        assert status == 403
+        assert "evil" in reason
+        async with dial(cloud, origin="https://fleet.example"):
+            pass
+
+
+async def test_no_login_while_the_master_is_away(dial: Any) -> None:
+    async with running_cloud(login_timeout=0.05) as cloud:
+        cloud.master.silent = True
+        status, reason = await refused(dial(cloud))
+        assert status == 503
+        assert "master" in reason
+
+
+async def test_a_dead_connection_makes_room_for_the_robots_new_one(dial: Any) -> None:
+    settings = SessionSettings(probe_timeout=0.2, drain_timeout=1.0)
+    async with running_cloud(settings) as cloud, dial(cloud) as dead:
+        dead.transport.pause_reading()  # like a Wi-Fi that is gone: no pong will come
+        async with dial(cloud) as alive:
+            await cloud.master.changed.until(lambda: ROBOT in cloud.master.inside)
+            await (await alive.ping())
+        dead.transport.resume_reading()
+        with pytest.raises(ConnectionClosed):
+            await dead.recv()
+
+
+# What the master hears
+
+
+async def test_the_master_hears_of_coming_and_going(cloud: Cloud, dial: Any) -> None:
+    assert cloud.master.url == cloud.ws_url
+    async with dial(cloud):
+        await cloud.master.changed.until(lambda: cloud.master.running(ROBOT))
+        end = await cloud.joined("say", "SubscriberConverter", STRING)
+        await cloud.master.changed.until(lambda: cloud.master.statuses[ROBOT].interfaces == {"say": True})
+        assert cloud.master.statuses[ROBOT].connections == (1,)
+        assert cloud.master.statuses[ROBOT].revision == cloud.master.specs[ROBOT].revision
+    await cloud.master.changed.until(lambda: ROBOT in cloud.master.left)
+    assert cloud.master.statuses[ROBOT].state is EndpointState.ABSENT
+    assert end.is_active  # a robot that is away keeps its connections
+
+
+async def test_usage_is_reported(cloud: Cloud, robot: Any) -> None:
+    end = await cloud.joined("say", "SubscriberConverter", STRING)
+    await robot.say("say", STRING, {"data": "x"})
+    await end.received.get()
+
+    def counted() -> bool:
+        usage = cloud.master.usage
+        found = usage.endpoints[ROBOT].interfaces.get("say") if usage and ROBOT in usage.endpoints else None
+        return found is not None and found.messages_out == 1 and found.bytes_out >= 5
+
+    await cloud.master.changed.until(counted)
+    assert cloud.master.usage is not None
+    assert cloud.master.usage.memory > 0
+
+
+async def test_requests_go_to_the_master_in_order_and_errors_come_back(cloud: Cloud, robot: Any) -> None:
+    async def refuse(request: ClientRequest) -> tuple[str, ...]:
+        return ("no room", "no luck") if request.type == "CC" else ()
+
+    cloud.master.answer = refuse
+    await robot.send("CC", {"containerTag": "c1", "containerData": {"memory": 5}})
+    await robot.send("DC", {"containerTag": "c1"})
+    await robot.send(
+        "CN", {"removeNodes": [{"containerTag": "c1", "nodeTag": "n"}, {"containerTag": "bad tag"}]}
+    )
+    errors = [await robot.get("ER") for _ in range(3)]
+    assert sorted(errors)[-2:] == ["no luck", "no room"]
+    assert any("removeNodes[1].containerTag" in error for error in errors)
+    await cloud.master.changed.until(lambda: len(cloud.master.requests) == 3)
+    assert [type_ for _, type_, _ in cloud.master.requests] == ["CC", "DC", "CN"]
+    assert cloud.master.requests[0] == (ROBOT, "CC", {"containerTag": "c1", "containerData": {"memory": 5}})
+    assert cloud.master.requests[2][2] == {"removeNodes": [{"containerTag": "c1", "nodeTag": "n"}]}
+
+
+async def test_a_leaving_robots_last_requests_are_carried_out(cloud: Cloud, robot: Any) -> None:
+    for number in range(20):
+        await robot.send("DC", {"containerTag": f"c{number}"})
+    await robot.socket.close()
+    await cloud.master.changed.until(lambda: ROBOT in cloud.master.left)
+    assert len(cloud.master.requests) == 20
+
+
+async def test_everything_goes_on_while_the_master_is_away(cloud: Cloud, robot: Any) -> None:
+    end = await cloud.joined("say", "SubscriberConverter", STRING)
+    assert cloud.master.peer is not None
+    cloud.master.peer.abort()
+    await robot.say("say", STRING, {"data": "x"})
+    assert await end.received.get() == ros_string("x")
+    await cloud.master.changed.until(lambda: cloud.master.peer is None)
+    await cloud.master.changed.until(lambda: cloud.master.peer is not None)
+    assert cloud.master.running(ROBOT)
+    await robot.say("say", STRING, {"data": "y"})
+    assert await end.received.get() == ros_string("y")
+
+
+# Coming back
+
+
+async def test_a_robot_that_comes_back_finds_its_interfaces(cloud: Cloud, dial: Any, robot_of: Any) -> None:
+    async with dial(cloud):
+        say = await cloud.joined("say", "SubscriberConverter", STRING)
+        hear = await cloud.joined("hear", "PublisherConverter", STRING)
+    await cloud.master.changed.until(lambda: ROBOT in cloud.master.left)
+    hear.port.send(ros_string("lost"))
+    hear.port.send(ros_string("map"), latched=True)
+    async with dial(cloud) as socket:
+        robot = robot_of(socket)
+        active = [await robot.get("ST"), await robot.get("ST")]
+        assert sorted((status["iTag"], status["status"]) for status in active) == [
+            ("hear", True),
+            ("say", True),
+        ]
+        assert (await robot.get("DM"))["msg"] == {"data": "map"}
+        await robot.say("say", STRING, {"data": "back"})
+        assert await say.received.get() == ros_string("back")
+
+
+async def test_status_follows_the_connection(cloud: Cloud, robot: Any) -> None:
+    await cloud.joined("say", "SubscriberConverter", STRING)
+    assert (await robot.get("ST"))["status"] is True
+    cloud.master.put(ROBOT, connections=())
+    assert await robot.get("ST") == {"topic": "iu", "iTag": "say", "status": False}
+
+
+async def test_a_dropped_robot_is_told_why_and_is_gone(cloud: Cloud, robot: Any) -> None:
+    await cloud.joined("say", "SubscriberConverter", STRING)
+    await robot.get("ST")
+    cloud.master.drop(ROBOT, "user was removed")
+    with pytest.raises(ConnectionClosed) as caught:
+        await robot.get("nothing")
+    assert caught.value.rcvd is not None
+    assert caught.value.rcvd.reason == "user was removed"
+    await cloud.master.changed.until(lambda: ROBOT in cloud.master.gone)
+
+
+# Abuse
+
+
+async def test_too_large_a_message_ends_the_connection(dial: Any) -> None:
+    async with (
+        running_cloud(SessionSettings(max_message=1000, drain_timeout=1.0)) as cloud,
+        dial(cloud) as socket,
+    ):
+        await socket.send("x" * 1001)
+        with pytest.raises(ConnectionClosed) as caught:
+            await socket.recv()
+        assert caught.value.rcvd is not None
+        assert caught.value.rcvd.code == 1009
+
+
+async def test_text_that_is_not_utf8_ends_the_connection(cloud: Cloud, robot: Any) -> None:
+    await robot.socket.send(b'{"type": "\xff"}', text=True)
+    with pytest.raises(ConnectionClosed) as caught:
+        await robot.socket.recv()
+    assert caught.value.rcvd is not None
+    assert caught.value.rcvd.code == 1007
+
+
+async def test_a_robot_that_stops_reading_harms_itself_only(dial: Any, robot_of: Any) -> None:
+    settings = SessionSettings(
+        outbox=OutboxLimits(queue_bytes=2 << 20, total_bytes=4 << 20), ping_interval=None, drain_timeout=1.0
+    )
+    async with (
+        running_cloud(settings) as cloud,
+        dial(cloud, robot="stalled") as stalled,
+        dial(cloud, robot="healthy") as socket,
+    ):
+        slow = await cloud.joined("image", "PublisherForwarder", STRING, robot="stalled")
+        fast = await cloud.joined("image", "PublisherForwarder", STRING, robot="healthy")
+        healthy = robot_of(socket)
+        await healthy.get("ST")
+        stalled.transport.pause_reading()
+        payload = bytes(1 << 20)
+        for number in range(40):
+            slow.port.send(payload)
+            fast.port.send(struct.pack("<I", number))
+            await healthy.get("DM")
+            assert (await healthy.binary())[32:] == struct.pack("<I", number)
+
+        def dropped() -> bool:
+            usage = cloud.master.usage
+            found = usage.endpoints["testUser/stalled"].interfaces["image"] if usage else None
+            return found is not None and found.dropped > 10
+
+        await cloud.master.changed.until(dropped)
+        stalled.transport.resume_reading()
+        await robot_of(stalled).get("DM")
