@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from http import HTTPStatus
 from typing import Any
 
 import aiohttp
@@ -20,7 +21,7 @@ class EngineWatch:
         master: URL of the master.
         user: User ID.
         password: The user's password.
-        on_state: Called with the engine's state whenever it changed; with ``{"error": text}`` if it cannot be read.
+        on_state: Called with the engine's state whenever it changed; ``{"error": text}`` if out of reach.
     """
 
     def __init__(
@@ -39,7 +40,7 @@ class EngineWatch:
                 try:
                     state = await self._read(session)
                 except aiohttp.ClientResponseError as error:
-                    if error.status == 401:
+                    if error.status == HTTPStatus.UNAUTHORIZED:
                         self._token = ""
                     state = {"error": f"the master says {error.status}: {error.message}"}
                 except (aiohttp.ClientError, TimeoutError) as error:

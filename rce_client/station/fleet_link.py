@@ -23,7 +23,7 @@ class FleetError(Exception):
     """The fleet does not do what was asked."""
 
 
-class PlannerAway(FleetError):
+class PlannerAwayError(FleetError):
     """The planner cannot be reached at this moment."""
 
 
@@ -48,7 +48,7 @@ class FleetLink:
         if not config.containers:
             raise ValueError("containers: the fleet's configuration names no container for the planner")
         self._config = config
-        self._container = config.containers[0].cTag
+        self._container = config.containers[0].tag
         self._view = view
         self._on_change = on_change
         self._on_event = on_event
@@ -58,9 +58,9 @@ class FleetLink:
         self._block_cell: ServiceClient[dict[str, Any]] | None = None
         self._connection = Connection(
             config.url,
-            config.userID,
+            config.user,
             config.password.get_secret_value(),
-            config.robotID,
+            config.robot,
             on_error=lambda text: on_event(text, "bad"),
             on_state=self._on_state,
         )
@@ -69,7 +69,8 @@ class FleetLink:
         """Make the planner's container, wire it, and keep taking what comes until cancelled."""
         async with self._connection as connection:
             try:
-                await connection.configure(self._config)
+                for request in self._config.setup():
+                    await connection.request(request)
                 await self._wire(connection)
                 await ready()
                 while True:
@@ -95,13 +96,13 @@ class FleetLink:
 
     async def _ask(self, service: ServiceClient[dict[str, Any]] | None, request: dict[str, Any]) -> str:
         if service is None:
-            raise PlannerAway("the planner's container is not ready yet")
+            raise PlannerAwayError("the planner's container is not ready yet")
         try:
-            answer = await service.call(request, timeout=CALL_TIMEOUT_S)
+            answer = await service(request, timeout=CALL_TIMEOUT_S)
         except CallError as error:
-            raise PlannerAway(f"the planner did not answer: {error}") from error
+            raise PlannerAwayError(f"the planner did not answer: {error}") from error
         except ClientError as error:
-            raise PlannerAway(f"the engine cannot be reached: {error}") from error
+            raise PlannerAwayError(f"the engine cannot be reached: {error}") from error
         if not answer["ok"]:
             raise FleetError(answer["message"])
         return str(answer["message"])

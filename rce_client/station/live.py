@@ -1,7 +1,7 @@
 """Sends what changes to every open page, each at its own pace.
 
-A message has a *topic*; a page that is slow gets only the newest message of each topic (events, which must not
-be lost, are kept in a short queue). So a page that stops reading costs a few messages of memory and nobody else.
+A message has a *topic*; a page that is slow gets only the newest message of each topic (events, which must
+not be lost, are kept in a short queue). So a page that stops reading costs some memory and nobody else.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from rce_client.station.api import (
     Problem,
     RobotModel,
 )
-from rce_client.station.fleet_link import FleetError, FleetLink, PlannerAway
+from rce_client.station.fleet_link import FleetError, FleetLink, PlannerAwayError
 from rce_client.station.live import Broadcast, Page
 from rce_client.station.view import FleetView
 
@@ -211,7 +211,7 @@ async def _problems(request: web.Request, handler: Handler) -> web.StreamRespons
     except ValidationError as error:
         faults = [f"{'.'.join(map(str, fault['loc'])) or 'body'}: {fault['msg']}" for fault in error.errors()]
         return _problem(400, "; ".join(faults))
-    except PlannerAway as error:
+    except PlannerAwayError as error:
         return _problem(503, str(error))
     except FleetError as error:
         return _problem(409, str(error))

@@ -1,0 +1,37 @@
+"""``rce core``: a ROS master and parameter server for everybody, without a ROS installation."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from typing import Annotated
+
+import typer
+import uvloop
+
+from rce.ros.core import Core
+from rce.ros.core.server import DEFAULT_PORT
+
+
+def core(
+    port: Annotated[int, typer.Option(help="Port to listen on; 0 takes a free one.")] = DEFAULT_PORT,
+    bind: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for all.")] = "127.0.0.1",
+    advertised: Annotated[
+        str, typer.Option(help="Host name that nodes are told; default: the bound address.")
+    ] = "",
+) -> None:
+    """Run a ROS core: what roscore is, for nodes of any kind."""
+    try:
+        uvloop.run(_serve(bind, port, advertised or None))
+    except OSError as error:
+        raise typer.BadParameter(f"cannot listen on {bind}:{port}: {error.strerror or error}") from error
+
+
+async def _serve(bind: str, port: int, advertised: str | None) -> None:
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop.set)
+    async with Core(bind, port, advertised=advertised) as running:
+        typer.echo(f"rce core ready: ROS_MASTER_URI={running.uri}")
+        await stop.wait()
