@@ -1,0 +1,281 @@
+#!/usr/bin/env python3
+"""Steers a fleet: gives every robot cells of the map to drive on, so that no two ever claim the same one.
+
+A robot is whatever publishes ``/NAME/amcl_pose`` and has a move client. The work is done by
+:mod:`rce.fleet.coordination`; this node carries messages to it and from it. README.md lists topics and parameters.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rce.fleet.angles import yaw_of
+from rce.fleet.coordination.events import (
+    BlockedChanged,
+    CellBlocked,
+    CellFreed,
+    Event,
+    GoalSet,
+    ObstacleSeen,
+    PoseSeen,
+    Reply,
+    ReportSeen,
+    RobotRemoved,
+    SendCancel,
+    SendCells,
+    StateChanged,
+    Tick,
+)
+from rce.fleet.coordination.planner import FleetPlanner
+from rce.fleet.coordination.settings import FleetSettings
+from rce.fleet.grid import GridMap
+from rce.fleet.move_client import ClientReport, ClientState
+from rce.fleet.movingai import read_map
+from rce.fleet.occupancy import occupancy
+from rce.fleet.revisions import numbered_array
+from rce.ros.node import Node
+from rce.ros.node.master import MasterClient
+from rce.ros.types import Time
+from rce.ros.xmlrpc import RpcClient
+
+if TYPE_CHECKING:
+    from rce.ros.node import Publisher
+    from rce.ros.types import Message
+
+TICK = 0.1
+"""Seconds between two looks at the clock; the state is published at most as often."""
+LOOK_AROUND = 0.5
+"""Seconds between two looks for new robots."""
+ROBOT_TOPIC = re.compile(r"/([A-Za-z][A-Za-z0-9_]*)/amcl_pose")
+MAP_FRAME = "map"
+
+
+class PlannerNode:
+    """The planner in a ROS graph.
+
+    Args:
+        node: Running node.
+        planner: The planner.
+    """
+
+    def __init__(self, node: Node, planner: FleetPlanner) -> None:
+        self._node = node
+        self._planner = planner
+        self._cells: dict[str, Publisher] = {}
+        self._cancels: dict[str, Publisher] = {}
+        self._state_changed = True
+        self._state: Publisher
+        self._blocked: Publisher
+        self._map: Publisher
+
+    async def run(self, blocked: list[int]) -> None:
+        """Steer until the node is told to stop.
+
+        Args:
+            blocked: Cells that are blocked from the beginning, and can be freed.
+        """
+        node = self._node
+        self._state = await node.advertise("/fleet/state", "fleet/FleetState", latch=True)
+        self._blocked = await node.advertise("/fleet/blockedCells", "std_msgs/Int32MultiArray", latch=True)
+        self._map = await node.advertise("/map", "nav_msgs/OccupancyGrid", latch=True)
+        self._publish_blocked(())
+        for cell in blocked:
+            self._handle(CellBlocked(cell))
+        await node.advertise_service("/fleet/set_goal", "fleet/SetGoal", self._set_goal)
+        await node.advertise_service("/fleet/block_cell", "fleet/BlockCell", self._block_cell)
+        await node.advertise_service("/fleet/remove_robot", "fleet/RemoveRobot", self._remove_robot)
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._look_around())
+            tasks.create_task(self._keep_time())
+
+    # -- what comes in ------------------------------------------------------------------------------
+
+    async def _look_around(self) -> None:
+        """Take in every robot whose pose is published."""
+        async with RpcClient() as rpc:
+            master = MasterClient(self._node.master_uri, self._node.name, self._node.uri, rpc)
+            while True:
+                for topic, _ in await master.call("getPublishedTopics", ""):
+                    found = ROBOT_TOPIC.fullmatch(topic)
+                    if found is not None and found[1] not in self._cells:
+                        await self._join(found[1])
+                if not await self._node.sleep(LOOK_AROUND):
+                    return
+
+    async def _join(self, robot: str) -> None:
+        node = self._node
+        self._cells[robot] = await node.advertise(f"/{robot}/goalNodesList", "std_msgs/Int32MultiArray")
+        self._cancels[robot] = await node.advertise(f"/{robot}/cancelGoal", "std_msgs/Bool")
+        await node.subscribe(
+            f"/{robot}/moveClient/status",
+            "fleet/MoveStatus",
+            lambda message: self._handle(ReportSeen(robot, _report(message))),
+        )
+        await node.subscribe(
+            f"/{robot}/blockedCells",
+            "std_msgs/Int32MultiArray",
+            lambda message: self._handle(ObstacleSeen(robot, tuple(message.data))),
+        )
+        await node.subscribe(
+            f"/{robot}/amcl_pose",
+            "geometry_msgs/PoseWithCovarianceStamped",
+            lambda message: self._handle(_pose(robot, message)),
+        )
+        node.log.info("%s is here", robot)
+
+    async def _keep_time(self) -> None:
+        while await self._node.sleep(TICK):
+            self._handle(Tick())
+            if self._state_changed:
+                self._state_changed = False
+                self._publish_state()
+
+    def _set_goal(self, request: Message) -> dict[str, Any]:
+        return self._ask(GoalSet(request.robot, None if request.cell < 0 else request.cell))
+
+    def _block_cell(self, request: Message) -> dict[str, Any]:
+        return self._ask(CellBlocked(request.cell) if request.blocked else CellFreed(request.cell))
+
+    def _remove_robot(self, request: Message) -> dict[str, Any]:
+        return self._ask(RobotRemoved(request.robot))
+
+    # -- what goes out ------------------------------------------------------------------------------
+
+    def _ask(self, event: Event) -> dict[str, Any]:
+        reply = self._handle(event)
+        assert reply is not None, "every request is answered"
+        self._node.log.info("%s", reply.message)
+        return {"ok": reply.ok, "message": reply.message}
+
+    def _handle(self, event: Event) -> Reply | None:
+        """Give an event to the planner and do what it says."""
+        reply = None
+        for instruction in self._planner.handle(event, time.monotonic()):
+            match instruction:
+                case SendCells(robot, revision, cells):
+                    self._cells[robot].publish(numbered_array(cells, revision))
+                case SendCancel(robot):
+                    self._cancels[robot].publish(data=True)
+                case BlockedChanged(cells):
+                    self._publish_blocked(cells)
+                case StateChanged():
+                    self._state_changed = True
+                case Reply():
+                    reply = instruction
+        return reply
+
+    def _publish_blocked(self, cells: tuple[int, ...]) -> None:
+        self._blocked.publish(data=list(cells))
+        picture = occupancy(self._planner.books.grid, cells)
+        x, y = picture.origin
+        stamp = Time.now()
+        self._map.publish(
+            header={"stamp": stamp, "frame_id": MAP_FRAME},
+            info={
+                "map_load_time": stamp,
+                "resolution": picture.resolution,
+                "width": picture.width,
+                "height": picture.height,
+                "origin": {"position": {"x": x, "y": y}, "orientation": {"w": 1.0}},
+            },
+            data=picture.data.tolist(),
+        )
+
+    def _publish_state(self) -> None:
+        grid, snapshot = self._planner.books.grid, self._planner.snapshot()
+        walls = sorted(grid.blocked)
+        self._state.publish(
+            rows=grid.rows,
+            columns=grid.columns,
+            cell_size=grid.cell_size,
+            origin_x=grid.origin[0],
+            origin_y=grid.origin[1],
+            blocked=sorted({*walls, *snapshot.blocked}),
+            pending=list(snapshot.pending),
+            walls=walls,
+            robots=[
+                {
+                    "id": robot.id,
+                    "state": robot.state.value,
+                    "reason": robot.reason,
+                    "cell": _or_none(robot.cell),
+                    "goal": _or_none(robot.goal),
+                    "plan": list(robot.plan),
+                    "granted": list(robot.granted),
+                    "replans": robot.replans,
+                }
+                for robot in snapshot.robots
+            ],
+        )
+
+
+def _or_none(cell: int | None) -> int:
+    """A cell as messages say it: -1 for none."""
+    return -1 if cell is None else cell
+
+
+def _pose(robot: str, message: Message) -> PoseSeen:
+    pose = message.pose.pose
+    turn = pose.orientation
+    return PoseSeen(robot, pose.position.x, pose.position.y, yaw_of(turn.x, turn.y, turn.z, turn.w))
+
+
+def _report(message: Message) -> ClientReport:
+    return ClientReport(
+        revision=message.revision,
+        state=ClientState(message.state),
+        cells=tuple(message.cells),
+        reached=None if message.reached < 0 else message.reached,
+        target=None if message.target < 0 else message.target,
+    )
+
+
+async def read_parameters(node: Node) -> dict[str, Any]:
+    """The parameters of the namespace ``/fleet``, and over them the node's private ones."""
+    values: dict[str, Any] = {}
+    for namespace in ("/fleet", "~"):
+        found = await node.get_param(namespace, {})
+        if isinstance(found, Mapping):
+            values.update(found)
+    return values
+
+
+def make_grid(values: Mapping[str, Any]) -> GridMap:
+    """The map that parameters describe.
+
+    Raises:
+        ValueError: They describe none.
+        MapError: The map file cannot be read.
+        OSError: The map file cannot be opened.
+    """
+    size = float(values.get("cell_size", 1.0))
+    if values.get("map"):
+        return read_map(Path(values["map"]), cell_size=size)
+    return GridMap(
+        rows=int(values.get("rows", 8)),
+        columns=int(values.get("columns", 8)),
+        cell_size=size,
+        origin=(float(values.get("origin_x", 0.0)), float(values.get("origin_y", 0.0))),
+        blocked=frozenset(int(cell) for cell in values.get("walls", [])),
+    )
+
+
+async def main() -> None:
+    """Steer a fleet until the node is told to stop."""
+    async with Node("fleet_planner") as node:
+        values = await read_parameters(node)
+        settings = FleetSettings(
+            robot_radius=float(values.get("robot_radius", FleetSettings.robot_radius)),
+            seed=int(values.get("seed", 0)),
+        )
+        planner = FleetPlanner(make_grid(values), settings)
+        await PlannerNode(node, planner).run([int(cell) for cell in values.get("blocked", [])])
+
+
+if __name__ == "__main__":
+    asyncio.run(main())
