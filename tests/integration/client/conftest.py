@@ -1,0 +1,109 @@
+"""A cloud that makes what the client asks for, and the HTTP door in front of it."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import json
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from rce_client.backoff import Backoff
+from rce_client.connection import Connection
+from rce_client.courier import Timing
+from rce_robot.websocket import RobotSocket
+from tests.support.cloud import PASSWORD, Cloud, running_cloud
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from rce.control.messages import ClientRequest
+
+TIMING = Timing(backoff=Backoff(first=0.01, cap=0.05), ping_interval=None, close=1.0)
+
+
+class Door:
+    """The master's HTTP side: answers every request with ``status`` and ``body``."""
+
+    def __init__(self) -> None:
+        self.status = 200
+        self.body = ""
+        self.targets: list[str] = []
+        self.url = ""
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        head = await reader.readuntil(b"\r\n\r\n")
+        self.targets.append(head.split()[1].decode())
+        body = self.body.encode()
+        writer.write(f"HTTP/1.1 {self.status} X\r\nContent-Length: {len(body)}\r\n\r\n".encode() + body)
+        await writer.drain()
+        writer.close()
+        await writer.wait_closed()
+
+
+@asynccontextmanager
+async def open_door(ssl: Any = None) -> AsyncIterator[Door]:
+    door = Door()
+    server = await asyncio.start_server(door.serve, "127.0.0.1", 0, ssl=ssl)
+    async with server:
+        door.url = f"http{'s' if ssl else ''}://127.0.0.1:{server.sockets[0].getsockname()[1]}/"
+        yield door
+
+
+class Engine:
+    """A cloud whose master wires every interface that a robot asks for."""
+
+    def __init__(self, cloud: Cloud, door: Door) -> None:
+        self.cloud = cloud
+        self.master = cloud.master
+        self.door = door
+        self.master.answer = self._answer
+        self.refuse: dict[str, str] = {}
+        door.body = json.dumps({"url": cloud.ws_url})
+
+    async def _answer(self, request: ClientRequest) -> tuple[str, ...]:
+        robot = request.id.partition("/")[2]
+        errors = []
+        for item in request.data.get("addInterfaces", ()):
+            tag = item["interfaceTag"]
+            if tag in self.refuse:
+                errors.append(self.refuse[tag])
+            elif item["endpointTag"] == robot and f"{robot}_{tag}" not in self.cloud.ends:
+                await self.cloud.wire(tag, item["interfaceType"], item["className"], robot=robot)
+        return tuple(errors)
+
+    def end(self, tag: str) -> Any:
+        return self.cloud.ends[f"testRobot_{tag}"]
+
+    async def kick(self) -> None:
+        """Break the robot's connection, and wait until the master noticed."""
+        before = len(self.master.left)
+        for socket in _server_sockets():
+            socket.abort()
+        await self.master.changed.until(lambda: len(self.master.left) > before)
+
+    def connection(self, **options: Any) -> Connection:
+        return Connection(self.door.url, "testUser", PASSWORD, "testRobot", timing=TIMING, **options)
+
+
+def _server_sockets() -> list[RobotSocket]:
+    return [item for item in gc.get_objects() if type(item) is RobotSocket]
+
+
+@pytest.fixture
+async def door() -> AsyncIterator[Door]:
+    async with open_door() as opened:
+        yield opened
+
+
+@pytest.fixture
+async def engine(door: Door) -> AsyncIterator[Engine]:
+    async with running_cloud() as cloud:
+        yield Engine(cloud, door)
+
+
+@pytest.fixture(name="open_door")
+def _open_door() -> Any:
+    return open_door

@@ -1,0 +1,299 @@
+"""A program's connection to the engine, over real sockets."""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from rce_client.connection import Connection, State
+from rce_client.exceptions import (
+    CallError,
+    CallTimeoutError,
+    InterfaceError,
+    NotConnectedError,
+    RefusedError,
+)
+
+if TYPE_CHECKING:
+    from tests.integration.client.conftest import Door, Engine
+
+STRING = "std_msgs/String"
+ECHO = "Test/StringEcho"
+ROBOT = "testUser/testRobot"
+
+
+def ros_string(text: str) -> bytes:
+    data = text.encode()
+    return struct.pack("<I", len(data)) + data
+
+
+# Messages
+
+
+async def test_publisher_and_subscriber(engine: Engine) -> None:
+    async with engine.connection() as conn:
+        publisher = await conn.publisher("say", STRING)
+        subscriber = await conn.subscriber("hear", STRING)
+        await publisher.wait_active(10)
+        await subscriber.wait_active(10)
+        assert publisher.publish({"data": "up"})
+        assert await engine.end("say").received.get() == ros_string("up")
+        for text in ("one", "two"):
+            engine.end("hear").port.send(ros_string(text))
+        received = []
+        async for message in subscriber:
+            received.append(message["data"])
+            if len(received) == 2:
+                break
+        assert received == ["one", "two"]
+
+
+async def test_raw_publisher_and_subscriber(engine: Engine) -> None:
+    got: asyncio.Queue[bytes] = asyncio.Queue()
+    async with engine.connection() as conn:
+        publisher = await conn.publisher("say", STRING, raw=True)
+        await conn.subscriber("hear", STRING, got.put_nowait, raw=True)
+        await conn.wait_active("say", 10)
+        await conn.wait_active("hear", 10)
+        publisher.publish(b"serialized")
+        assert await engine.end("say").received.get() == b"serialized"
+        engine.end("hear").port.send(bytes(2_000_000))
+        assert bytes(await got.get()) == bytes(2_000_000)
+
+
+async def test_async_callback_and_one_that_fails(engine: Engine) -> None:
+    got: asyncio.Queue[str] = asyncio.Queue()
+
+    async def callback(message: dict[str, Any]) -> None:
+        await got.put(message["data"])
+        if message["data"] == "bad":
+            raise ValueError("bad message")
+
+    async with engine.connection() as conn:
+        subscriber = await conn.subscriber("hear", STRING, callback)
+        await subscriber.wait_active(10)
+        for text in ("bad", "good"):
+            engine.end("hear").port.send(ros_string(text))
+        assert [await got.get(), await got.get()] == ["bad", "good"]
+
+
+async def test_service_client(engine: Engine) -> None:
+    async def answer(payload: bytes) -> bytes:
+        if payload == ros_string("fail"):
+            raise ValueError("no such thing")
+        if payload == ros_string("hang"):
+            await asyncio.Event().wait()
+        return payload
+
+    async with engine.connection() as conn:
+        client = await conn.service_client("ask", ECHO)
+        await client.wait_active(10)
+        engine.end("ask").answer = answer
+        answers = await asyncio.gather(*(client({"data": str(number)}) for number in range(20)))
+        assert [item["data"] for item in answers] == [str(number) for number in range(20)]
+        with pytest.raises(CallError, match="no such thing"):
+            await client({"data": "fail"})
+        with pytest.raises(CallTimeoutError, match=r"0\.05"):
+            await client({"data": "hang"}, timeout=0.05)
+        assert not conn.errors
+
+
+async def test_service_provider(engine: Engine) -> None:
+    async def handler(request: dict[str, Any]) -> dict[str, Any]:
+        if request["data"] == "fail":
+            raise ValueError("robot says no")
+        return {"data": request["data"].upper()}
+
+    async with engine.connection() as conn:
+        provider = await conn.service_provider("serve", ECHO, handler)
+        await provider.wait_active(10)
+        port = engine.end("serve").port
+        calls = [port.call(ros_string(text)) for text in ("a", "b")]
+        assert await asyncio.gather(*calls) == [ros_string("A"), ros_string("B")]
+        with pytest.raises(Exception, match="robot says no"):
+            await port.call(ros_string("fail"))
+
+
+async def test_an_interface_can_be_closed_and_made_again(engine: Engine) -> None:
+    async with engine.connection() as conn:
+        publisher = await conn.publisher("say", STRING)
+        with pytest.raises(InterfaceError):
+            await conn.publisher("say", STRING)
+        await publisher.close()
+        await conn.publisher("say", STRING)
+        await conn.wait_active("say", 10)
+
+
+# Requests and errors
+
+
+async def test_requests_reach_the_master(engine: Engine) -> None:
+    async with engine.connection() as conn:
+        await conn.create_container("c1", cpu=0.5, memory=1000)
+        await conn.set_parameter("c1", "speed", 1.5)
+        await conn.add_interface("c1", "in", "PublisherInterface", STRING, addr="/in")
+        await conn.add_node("c1", "n1", "Test", "stringEcho.py", args="a b", namespace="ns")
+        await conn.connect("c1/in", "testRobot/say")
+        await conn.disconnect("c1/in", "testRobot/say")
+        await conn.remove_node("c1", "n1")
+        await conn.remove_interface("c1", "in")
+        await conn.delete_parameter("c1", "speed")
+        await conn.destroy_container("c1")
+        await engine.master.changed.until(lambda: len(engine.master.requests) == 10)
+    types = [type_ for _, type_, _ in engine.master.requests]
+    assert types == ["CC", "CN", "CN", "CN", "CX", "CX", "CN", "CN", "CN", "DC"]
+    node = {"containerTag": "c1", "nodeTag": "n1", "pkg": "Test", "exe": "stringEcho.py"}
+    assert engine.master.requests[3][2] == {"addNodes": [{**node, "args": "a b", "namespace": "ns"}]}
+
+
+async def test_everything_made_can_be_removed_at_once(engine: Engine) -> None:
+    async with engine.connection() as conn:
+        await conn.create_container("c1")
+        await conn.add_interface("testRobot", "say", "SubscriberConverter", STRING)
+        await conn.connect("c1/in", "testRobot/say")
+        await conn.remove_all()
+    await engine.master.changed.until(lambda: len(engine.master.requests) == 6)
+    assert [type_ for _, type_, _ in engine.master.requests[3:]] == ["CX", "CN", "DC"]
+
+
+async def test_errors_reach_the_program(engine: Engine) -> None:
+    errors: asyncio.Queue[str] = asyncio.Queue()
+    engine.refuse["say"] = "interface say: no such class"
+    async with engine.connection(on_error=errors.put_nowait) as conn:
+        await conn.publisher("say", STRING)
+        assert await errors.get() == "interface say: no such class"
+        with pytest.raises(TimeoutError, match="no such class"):
+            await conn.wait_active("say", 0.01)
+
+
+# Coming in
+
+
+async def test_the_password_itself_is_not_sent(engine: Engine) -> None:
+    async with engine.connection():
+        pass
+    assert engine.door.targets == ["/?userID=testUser&version=20130902"]
+
+
+@pytest.mark.parametrize("status", [400, 401, 410, 501])
+async def test_a_refusal_for_good_is_raised(door: Door, status: int) -> None:
+    door.status, door.body = status, "go away"
+    with pytest.raises(RefusedError, match="go away") as caught:
+        async with Connection(door.url, "testUser", "x", "testRobot"):
+            pass
+    assert caught.value.status == status
+
+
+async def test_a_wrong_password_is_raised(engine: Engine) -> None:
+    with pytest.raises(RefusedError, match="Wrong user or password") as caught:
+        async with Connection(engine.door.url, "testUser", "wrong", "testRobot"):
+            pass
+    assert caught.value.status == 401
+
+
+async def test_waits_for_an_engine_that_is_not_there_yet(engine: Engine) -> None:
+    engine.door.status = 503
+    states: list[tuple[State, str]] = []
+
+    def watch(state: State, words: str) -> None:
+        states.append((state, words))
+        if len(states) == 4:
+            engine.door.status = 200
+
+    async with engine.connection(on_state=watch):
+        pass
+    assert any("503" in words for _, words in states)
+    assert [state for state, _ in states if state is not State.CONNECTING] == [State.CONNECTED, State.CLOSED]
+
+
+async def test_a_time_limit_ends_the_waiting(door: Door) -> None:
+    door.status = 503
+    with pytest.raises(TimeoutError):
+        async with asyncio.timeout(0.2), Connection(door.url, "testUser", "x", "testRobot"):
+            pass
+
+
+async def test_what_the_program_raises_is_raised_as_it_is(engine: Engine) -> None:
+    with pytest.raises(KeyError):
+        async with engine.connection():
+            raise KeyError("mine")
+
+
+# Losing it
+
+
+async def test_comes_back_and_restores(engine: Engine) -> None:
+    states: list[State] = []
+    changed = asyncio.Event()
+
+    def watch(state: State, words: str) -> None:
+        states.append(state)
+        changed.set()
+
+    async with engine.connection(on_state=watch) as conn:
+        await conn.create_container("c1")
+        publisher = await conn.publisher("say", STRING)
+        client = await conn.service_client("ask", ECHO)
+        await client.wait_active(10)
+        await publisher.wait_active(10)
+        asked = asyncio.Event()
+
+        async def hang(payload: bytes) -> bytes:
+            asked.set()
+            await asyncio.Event().wait()
+            return payload
+
+        engine.end("ask").answer = hang
+        call = asyncio.create_task(client({"data": "x"}))
+        await asked.wait()
+        engine.master.requests.clear()
+        await engine.kick()
+        with pytest.raises(CallError, match="connection broke"):
+            await call
+        assert not conn.active["say"]
+        while State.RESTORED not in states:
+            changed.clear()
+            await changed.wait()
+        await publisher.wait_active(10)
+        publisher.publish({"data": "again"})
+        assert await engine.end("say").received.get() == ros_string("again")
+    assert [type_ for _, type_, _ in engine.master.requests] == ["CC", "CN"]
+    interfaces = engine.master.requests[1][2]["addInterfaces"]
+    assert [item["interfaceTag"] for item in interfaces] == ["say", "ask"]
+    assert states.index(State.LOST) < states.index(State.RESTORED)
+
+
+async def test_what_is_removed_while_away_is_removed_on_return(engine: Engine) -> None:
+    async with engine.connection() as conn:
+        await conn.create_container("c1")
+        await conn.create_container("c2")
+        await engine.master.changed.until(lambda: len(engine.master.requests) == 2)
+        engine.door.status = 503
+        await engine.kick()
+        await conn.destroy_container("c1")
+        publisher = await conn.publisher("say", STRING)
+        assert not publisher.publish({"data": "into the void"})
+        client = await conn.service_client("ask", ECHO)
+        with pytest.raises(NotConnectedError):
+            await client({"data": "x"})
+        engine.master.requests.clear()
+        engine.door.status = 200
+        await publisher.wait_active(10)
+    made = [(type_, data.get("containerTag")) for _, type_, data in engine.master.requests]
+    assert made[0] == ("DC", "c1")
+    assert ("CC", "c2") in made
+    assert ("CC", "c1") not in made
+
+
+async def test_a_refusal_on_the_way_back_closes_the_connection(engine: Engine) -> None:
+    async with engine.connection() as conn:
+        subscriber = await conn.subscriber("hear", STRING)
+        engine.door.status, engine.door.body = 410, "too old"
+        await engine.kick()
+        assert [message async for message in subscriber] == []
+        with pytest.raises(RefusedError):
+            await conn.create_container("c1")
+        assert conn.state is State.CLOSED
