@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from rce.ros.errors import NodeClosed
 from rce.ros.node.queue import DropOldest
 from rce.ros.tasks import TaskScope
+from rce.ros.tcpros.framing import LARGE
 
 if TYPE_CHECKING:
     from rce.ros.types import Message, MessageType
@@ -119,21 +120,26 @@ def serialized_sink(callback: SerializedCallback, queue_size: int, topic: str, t
     return sink
 
 
+def decode(kind: MessageType, payload: bytes) -> Message:
+    """Read a message. Fields cut out of a view are copied once, out of bytes twice."""
+    return kind.deserialize(memoryview(payload) if len(payload) >= LARGE else payload)
+
+
 def decoding(kind: MessageType, callback: MessageCallback) -> SerializedCallback:
     """Turn a callback that takes messages into one that takes their bytes."""
     if inspect.iscoroutinefunction(callback):
 
         async def decode_and_wait(payload: bytes, latched: bool) -> None:
             del latched
-            await callback(kind.deserialize(payload))
+            await callback(decode(kind, payload))
 
         return decode_and_wait
 
-    def decode(payload: bytes, latched: bool) -> None:
+    def decode_and_call(payload: bytes, latched: bool) -> None:
         del latched
-        callback(kind.deserialize(payload))
+        callback(decode(kind, payload))
 
-    return decode
+    return decode_and_call
 
 
 class Subscriber:
@@ -185,7 +191,7 @@ class Subscriber:
             payload, _ = await self.sink.take()
         except EOFError:
             raise StopAsyncIteration from None
-        return self._kind.deserialize(payload)
+        return decode(self._kind, payload)
 
     async def close(self) -> None:
         """Stop taking messages; the last subscriber of a topic unregisters it."""

@@ -15,6 +15,9 @@ from rce.ros.tcpros.header import MAX_HEADER
 
 _log = logging.getLogger(__name__)
 
+LARGE_MESSAGE = 2**20
+"""From this length on, a message's memory is worth keeping (see :mod:`rce.ros.tcpros.allocator`)."""
+
 WRITE_HIGH = 2**16
 """More bytes than this waiting to be sent, and the connection says that it is full."""
 
@@ -84,9 +87,12 @@ class Connection(asyncio.BufferedProtocol):
     def write(self, chunks: Chunks) -> None:
         """Send a frame; ignored when the connection is gone."""
         transport = self._transport
-        if transport is not None and not self._closing:
-            for chunk in chunks:
-                transport.write(chunk)
+        if transport is None or self._closing:
+            return
+        for chunk in chunks:
+            transport.write(chunk)
+        if len(chunks) > 1:
+            self._learn_size(len(chunks[-1]))
 
     def close(self) -> None:
         """Close once what was written is out."""
@@ -166,8 +172,10 @@ class Connection(asyncio.BufferedProtocol):
     def _take_large(self) -> None:
         """Hand over a frame that was read into memory of its own, unless it was before the next read."""
         if self.reader.is_large_complete and not self._closing:
+            payload = self.reader.take_large()
+            self._learn_size(len(payload))
             try:
-                self._hand_over(self.reader.take_large())
+                self._hand_over(payload)
             except TcprosError as error:
                 self._fail(error)
 
@@ -175,6 +183,13 @@ class Connection(asyncio.BufferedProtocol):
         self.bytes_in += len(payload)
         self.frames_in += 1
         self.owner.frame_received(self, payload)
+
+    @staticmethod
+    def _learn_size(size: int) -> None:
+        if size >= LARGE_MESSAGE:
+            from rce.ros.tcpros.allocator import keep_large_blocks
+
+            keep_large_blocks()
 
     def _fail(self, error: TcprosError) -> None:
         _log.warning("%s is closed: %s", self, error)

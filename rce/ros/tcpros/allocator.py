@@ -1,0 +1,32 @@
+"""Keeps the memory of large messages in the process instead of giving it back after each.
+
+glibc returns freed blocks at the heap's end to the kernel and maps really large ones anew each time. A process that
+passes on 10 MB messages then spends most of its time in page faults: five of six milliseconds per message and copy.
+Imported and used only by processes that see such messages.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+from functools import cache
+
+_log = logging.getLogger(__name__)
+
+_LARGEST_KEPT = 32 * 2**20
+_MOST_KEPT = 128 * 2**20
+
+_M_TRIM_THRESHOLD = -1
+_M_MMAP_THRESHOLD = -3
+
+
+@cache
+def keep_large_blocks() -> None:
+    """Let the allocator keep up to 128 MiB of freed memory. Without effect where it is not glibc's."""
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError):
+        return
+    mallopt(_M_MMAP_THRESHOLD, _LARGEST_KEPT)
+    mallopt(_M_TRIM_THRESHOLD, _MOST_KEPT)
+    _log.debug("the memory of large messages is kept")
