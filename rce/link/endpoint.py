@@ -141,23 +141,24 @@ class Endpoint:
         return [carrier for link in links if (carrier := link.detach()) is not None]
 
     async def _close_slots(self, slots: list[InterfaceSlot]) -> None:
-        """Close interfaces, all at the same time."""
+        """Close interfaces, all at the same time; they are closed also if nobody waits for it any more."""
         for slot in slots:
             del self._slots[slot.spec.tag]
         if slots:
             self._changed()
-            async with asyncio.TaskGroup() as group:
-                for slot in slots:
-                    group.create_task(self._close_slot(slot))
+            name = f"{self.id} closes an interface"
+            await asyncio.wait([self._tasks.spawn(self._close_slot(slot), name) for slot in slots])
 
     async def _close_slot(self, slot: InterfaceSlot) -> None:
         start = self._starts.pop(slot, None)
-        if start is not None:
-            start.cancel()
-            await asyncio.wait([start])
         try:
             async with asyncio.timeout(self._hub.timeouts.close):
+                if start is not None:
+                    start.cancel()
+                    await asyncio.wait([start])
                 await slot.close()
+        except TimeoutError:
+            slot.fail(TimeoutError("takes too long to close"))
         except Exception as error:
             log.debug("endpoint %s: interface %s did not close well", self.id, slot.spec.tag, exc_info=True)
             slot.fail(error)

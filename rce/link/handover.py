@@ -134,7 +134,7 @@ class HandoverReceiver:
     async def _take(self, descriptor: int, received: bytes) -> None:
         try:
             await self._adopt(socket.socket(fileno=descriptor), received)
-        except OSError as error:
+        except (OSError, ValueError) as error:
             log.info("a handed-over connection is of no use: %s", error)
 
 

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import errno
 import hmac
 import logging
 import socket
-import stat
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,8 +16,11 @@ from rce.link.frames import Frame, FrameType, check_answer, encode, encode_hello
 from rce.link.settings import LinkLimits, LinkTimeouts
 from rce.link.socket_carrier import SocketCarrier
 from rce.link.tasks import TaskScope
+from rce.link.unix import bind_private, unlink_own
 
 if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
     from rce.control.model import LinkAddress, LinkSpec
     from rce.link.frames import Hello
     from rce.link.link import Link
@@ -33,18 +34,31 @@ _MAX_GREETINGS = 1024
 class LinkHub:
     """Listens for links, dials them, and joins endpoints of the same process without a socket.
 
-    Attributes:
+    Args:
         machine: Name of the machine; a peer whose address has the same name is reached by its unix socket.
         timeouts: Of all links.
         limits: Of all links; both ends of a link need the same.
+        dial: Connects a stream socket to a peer's address, or raises :class:`OSError`; for a process that
+            cannot do that itself, because it has no network for example.
+
+    Attributes:
+        machine: As given.
+        timeouts: As given.
+        limits: As given.
     """
 
     def __init__(
-        self, machine: str, timeouts: LinkTimeouts | None = None, limits: LinkLimits | None = None
+        self,
+        machine: str,
+        timeouts: LinkTimeouts | None = None,
+        limits: LinkLimits | None = None,
+        *,
+        dial: Callable[[LinkAddress], Awaitable[socket.socket]] | None = None,
     ) -> None:
         self.machine = machine
         self.timeouts = timeouts or LinkTimeouts()
         self.limits = limits or LinkLimits()
+        self._dial = dial
         self._accepting: dict[str, Link] = {}
         self._waiters: dict[str, set[asyncio.Future[None]]] = {}
         self._carriers: set[SocketCarrier] = set()
@@ -68,14 +82,23 @@ class LinkHub:
         Raises:
             OSError: The path is too long (107 bytes at most), is no socket, or another process listens there.
         """
-        sock, inode = _bind_unix(path)
+        sock, inode = bind_private(path)
+        await self.listen_socket(sock)
+        self._unix_sockets[path] = inode
+
+    async def listen_socket(self, sock: socket.socket) -> None:
+        """Accept links on a bound unix socket, which belongs to the hub from now on, also if this raises.
+
+        Raises:
+            OSError: The socket cannot be used.
+        """
         try:
+            sock.setblocking(False)
             server = await self.loop.create_unix_server(self._accept, sock=sock, backlog=512)
         except BaseException:
             sock.close()
             raise
         self._servers.append(server)
-        self._unix_sockets[path] = inode
 
     async def listen_tcp(self, host: str, port: int) -> int:
         """Accept links on TCP.
@@ -115,7 +138,7 @@ class LinkHub:
         for server in self._servers:
             server.close()
         for path, inode in self._unix_sockets.items():
-            _unlink(path, inode)
+            unlink_own(path, inode)
         await self._greetings.close()
         await asyncio.sleep(0)  # connections that were just being accepted come into view
         carriers = list(self._carriers)
@@ -163,6 +186,8 @@ class LinkHub:
         if spec.id in self._accepting:
             return True
         address = spec.address
+        if self._dial is not None:
+            return bool(address.unix or address.port)
         if self._is_near(address):
             return Path(address.unix) not in self._unix_sockets
         return bool(address.port)
@@ -181,6 +206,8 @@ class LinkHub:
             local.attach(theirs)
             return ours
         address = spec.address
+        if self._dial is not None:
+            return await self._introduce(await self._carry(await self._dial(address)), spec)
         if self._is_near(address):
             try:
                 return await self._dial_unix(spec)
@@ -203,6 +230,16 @@ class LinkHub:
         async with asyncio.timeout(self.timeouts.connect):
             _, carrier = await self.loop.create_connection(self._new_carrier, address.host, address.port)
         return await self._introduce(carrier, spec)
+
+    async def _carry(self, sock: socket.socket) -> SocketCarrier:
+        """Make a carrier of a connected socket."""
+        try:
+            sock.setblocking(False)
+            _, carrier = await self.loop.connect_accepted_socket(self._new_carrier, sock)
+        except BaseException:
+            sock.close()
+            raise
+        return carrier
 
     async def _introduce(self, carrier: SocketCarrier, spec: LinkSpec) -> Carrier:
         """Shake hands as the dialing end."""
@@ -266,48 +303,3 @@ class LinkHub:
 def _check_token(link: Link, token: str) -> None:
     if not hmac.compare_digest(link.spec.token.encode(), token.encode()):
         raise LinkRefused(f"wrong token for link {link.spec.id!r}")
-
-
-def _bind_unix(path: Path) -> tuple[socket.socket, int]:
-    """Bind a unix socket that only this user may use; return it and the inode of its file."""
-    _remove_stale_socket(path)
-    sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    try:
-        sock.setblocking(False)
-        sock.bind(str(path))
-        path.chmod(stat.S_IRUSR | stat.S_IWUSR)  # before it listens: nobody can connect earlier
-    except BaseException:
-        sock.close()
-        raise
-    return sock, path.stat().st_ino
-
-
-def _unlink(path: Path, inode: int) -> None:
-    """Remove a socket file unless another process has put its own there."""
-    with contextlib.suppress(FileNotFoundError):
-        if path.stat().st_ino == inode:
-            path.unlink()
-
-
-def _remove_stale_socket(path: Path) -> None:
-    """Remove the socket file of a process that is gone.
-
-    Raises:
-        OSError: The path is no socket, or somebody listens there.
-    """
-    try:
-        mode = path.stat().st_mode
-    except FileNotFoundError:
-        return
-    if not stat.S_ISSOCK(mode):
-        raise FileExistsError(errno.EEXIST, "exists and is no socket", str(path))
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        probe.setblocking(False)
-        try:
-            probe.connect(str(path))
-        except ConnectionRefusedError:
-            path.unlink()
-            return
-        except BlockingIOError:
-            pass
-    raise OSError(errno.EADDRINUSE, "another process listens here", str(path))

@@ -42,6 +42,8 @@ class FakeInterface(Interface):
         self.active: list[bool] = []
         self.may_start = asyncio.Event()
         self.may_start.set()
+        self.may_close = asyncio.Event()
+        self.may_close.set()
         self.closed = False
         self.serving = 0
         self.asked = asyncio.Event()
@@ -57,6 +59,7 @@ class FakeInterface(Interface):
     async def close(self) -> None:
         assert not self.closed
         self.closed = True
+        await self.may_close.wait()
 
     def receive(self, payload: bytes, *, latched: bool) -> None:
         assert type(payload) is bytes

@@ -141,3 +141,30 @@ async def test_starting_interface_can_be_removed(rig: Rig) -> None:
     assert a.fakes["i1"].closed
     assert a.endpoint.interfaces == {}
     assert a.faults == []
+
+
+async def test_interface_that_does_not_close_is_given_up(rig: Rig) -> None:
+    a, b = await rig.pair("local", close=0.05)
+    await rig.join(a, b, [TOPIC_OUT])
+    await a.connected(1)
+    a.fakes["i1"].may_close.clear()
+    await a.apply({}, connections=[])
+    assert a.endpoint.interfaces == {}
+    assert a.faults == ["interface i1: takes too long to close"]
+
+
+async def test_interfaces_are_closed_though_nobody_waits(rig: Rig) -> None:
+    a, b = await rig.pair("local")
+    await rig.join(a, b, [TOPIC_OUT])
+    await a.connected(1)
+    fake = a.fakes["i1"]
+    fake.may_close.clear()
+    applying = asyncio.ensure_future(a.apply({}, connections=[]))
+    while not fake.closed:
+        await asyncio.sleep(0)
+    applying.cancel()
+    await asyncio.wait([applying])
+    fake.may_close.set()
+    await a.endpoint.apply(a.spec)
+    assert a.endpoint.interfaces == {}
+    assert a.faults == []

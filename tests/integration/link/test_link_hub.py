@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 import pytest
 import uvloop
 
-from rce.link import LinkHub
+from rce.control.model import LinkAddress
+from rce.link import LinkHub, LinkTimeouts
 from rce.link.frames import Frame, FrameType, encode, encode_hello
 from rce.link.handover import Doorman, HandoverReceiver, HandoverSender
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
     from .conftest import Rig
 
+TIMEOUTS = LinkTimeouts(redial_first=0.005)
 TOPIC_OUT = ("SubscriberConverter", "PublisherInterface")
 TOPIC_IN = ("PublisherConverter", "SubscriberInterface")
 SERVICE_OUT = ("ServiceProviderForwarder", "ServiceClientInterface")
@@ -93,6 +95,32 @@ async def test_bad_socket_is_not_adopted(rig: Rig) -> None:
     one, other = socket.socketpair()
     other.close()
     await hub.adopt(one, encode_hello("L", "x"))
+
+
+async def test_sockets_may_be_made_elsewhere(rig: Rig) -> None:
+    path = rig.path()
+    listening = socket.socket(socket.AF_UNIX)
+    listening.bind(str(path))
+    accepting = await rig.hub()
+    await accepting.listen_socket(listening)
+    asked: list[LinkAddress] = []
+
+    async def dial(address: LinkAddress) -> socket.socket:
+        asked.append(address)
+        if len(asked) == 1:
+            raise ConnectionError("not yet")
+        sock = socket.socket(socket.AF_UNIX)
+        sock.connect(address.unix)
+        return sock
+
+    dialing = LinkHub("elsewhere", TIMEOUTS, dial=dial)
+    rig.stack.push_async_callback(dialing.close)
+    a, b = rig.party("a", dialing), rig.party("b", accepting)
+    b.address = LinkAddress(machine="here", unix=str(path))
+    await rig.join(a, b, [TOPIC_OUT])
+    await a.connected(1)
+    assert asked == [b.address] * 2
+    path.unlink()
 
 
 async def test_many_connections_are_handed_over_in_a_burst() -> None:

@@ -1,0 +1,57 @@
+"""Unix sockets in the file system: private, and cleaned up."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import socket
+import stat
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def bind_private(path: Path) -> tuple[socket.socket, int]:
+    """Bind a unix socket that only this user may use; return it and the inode of its file."""
+    _remove_stale_socket(path)
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        sock.setblocking(False)
+        sock.bind(str(path))
+        path.chmod(stat.S_IRUSR | stat.S_IWUSR)  # before it listens: nobody can connect earlier
+    except BaseException:
+        sock.close()
+        raise
+    return sock, path.stat().st_ino
+
+
+def unlink_own(path: Path, inode: int) -> None:
+    """Remove a socket file unless another process has put its own there."""
+    with contextlib.suppress(FileNotFoundError):
+        if path.stat().st_ino == inode:
+            path.unlink()
+
+
+def _remove_stale_socket(path: Path) -> None:
+    """Remove the socket file of a process that is gone.
+
+    Raises:
+        OSError: The path is no socket, or somebody listens there.
+    """
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        return
+    if not stat.S_ISSOCK(mode):
+        raise FileExistsError(errno.EEXIST, "exists and is no socket", str(path))
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(str(path))
+        except ConnectionRefusedError:
+            path.unlink()
+            return
+        except BlockingIOError:
+            pass
+    raise OSError(errno.EADDRINUSE, "another process listens here", str(path))
