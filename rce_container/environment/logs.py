@@ -162,5 +162,3 @@ class Pump:
             self._resume.cancel()
         self._loop.remove_reader(self._pipe)
         os.close(self._pipe)
-
-

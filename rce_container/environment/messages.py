@@ -41,7 +41,7 @@ class Boot(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Seconds that a node has to end after SIGTERM, before it gets SIGKILL."""
 
 
-class _Message(Struct, frozen=True, kw_only=True, omit_defaults=True, tag_field="t"):
+class _Message(Struct, kw_only=True, omit_defaults=True, tag_field="t"):
     """Base of all messages."""
 
 

@@ -28,7 +28,16 @@ LOGS = "/var/log/rce"
 TMP_BYTES = 256 << 20
 
 _SYSTEM = ("/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32")
-_ETC = ("ld.so.cache", "ld.so.conf", "ld.so.conf.d", "alternatives", "localtime", "timezone", "python3", "ros")
+_ETC = (
+    "ld.so.cache",
+    "ld.so.conf",
+    "ld.so.conf.d",
+    "alternatives",
+    "localtime",
+    "timezone",
+    "python3",
+    "ros",
+)
 _PROBE_TIMEOUT_S = 20.0
 _MAX_HOSTNAME = 63
 
@@ -55,7 +64,9 @@ class NamespaceRuntime(Runtime):
         with tempfile.TemporaryDirectory() as scratch:
             folder = ContainerFolder(Path(scratch), Path(scratch) / "run", "0" * 12)
             folder.make()
-            boot = Boot(id="probe/probe", mark=folder.mark, machine="", home="", logs="", ros_port=0, isolated=True)
+            boot = Boot(
+                id="probe/probe", mark=folder.mark, machine="", home="", logs="", ros_port=0, isolated=True
+            )
             order = Order("probe", boot, folder, (), 0, 0)
             argv, env = self.command(order, [sys.executable, "-c", "import rce_container.environment"])
             found = _run(argv, env)
@@ -150,7 +161,13 @@ def _write_etc(etc: Path, tag: str) -> None:
 def _run(argv: Sequence[str], env: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
     try:
         return subprocess.run(  # noqa: S603
-            argv, env=env, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_PROBE_TIMEOUT_S, check=False
+            argv,
+            env=env,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=_PROBE_TIMEOUT_S,
+            check=False,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise RuntimeUnavailableError(NamespaceRuntime.name, str(error)) from error

@@ -1,0 +1,92 @@
+"""The program ``rce-container``: the container task set."""
+
+from __future__ import annotations
+
+import logging
+import socket
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+import uvloop
+
+from rce.config.exceptions import RunDirError, SecretError
+from rce.config.secret import load_secret
+from rce_container.app import AUTO, RUNTIMES, App, package_path
+from rce_container.exceptions import ContainerError
+from rce_container.settings import ContainerSettings
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+_LOOPBACK = "127.0.0.1"
+
+
+RuntimeName = Enum("RuntimeName", {name: name for name in (AUTO, *RUNTIMES)})  # type: ignore[misc]
+
+
+@app.command()
+def container(  # noqa: PLR0917 - the options of the program
+    master: Annotated[str, typer.Argument(metavar="MASTER_IP", help="Host or address of the master.")],
+    control_port: Annotated[int, typer.Option(help="The master's port for task sets.")] = 8080,
+    link_port: Annotated[
+        int | None,
+        typer.Option(help="Port for data links; 0 takes a free one [default: 10030, or a free one]"),
+    ] = None,
+    bind: Annotated[str, typer.Option(help="Address to accept links on [default: all]")] = "",
+    state_dir: Annotated[
+        Path | None, typer.Option(help="Folder for name, logs and homes of the containers.")
+    ] = None,
+    runtime: Annotated[RuntimeName, typer.Option(help="How containers are made.")] = RuntimeName(AUTO),
+    grace: Annotated[
+        float,
+        typer.Option(help="Seconds after which containers without this program end themselves.", min=0.1),
+    ] = 30.0,
+    package_path_: Annotated[
+        list[Path] | None,
+        typer.Option("--package-path", help="Folder with packages of nodes; may be repeated."),
+    ] = None,
+    name: Annotated[str, typer.Option(help="Name of this task set [default: made up once, then kept]")] = "",
+    machine: Annotated[str, typer.Option(help="Name of this machine [default: its host name]")] = "",
+    secret_file: Annotated[Path | None, typer.Option(help="File with the engine's shared secret.")] = None,
+    dev: Annotated[bool, typer.Option("--dev", help="Loopback only, with the development secret.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log more.")] = False,
+) -> None:
+    """Run a container task set: makes the containers of the master at MASTER_IP on this machine."""
+    logging.basicConfig(
+        level=logging.DEBUG if verbose else logging.INFO,
+        format="%(asctime)s %(levelname)s %(name)s: %(message)s",
+    )
+    logging.getLogger("websockets").setLevel(logging.WARNING)
+    settings = ContainerSettings(
+        machine=machine or socket.gethostname(), packages=package_path(package_path_ or ()), grace=grace
+    )
+    try:
+        program = App(
+            master=master,
+            control_port=control_port,
+            secret=load_secret(secret_file, dev=dev),
+            settings=settings,
+            runtime=runtime.value,
+            link_port=link_port,
+            host=bind or (_LOOPBACK if dev else ""),
+            name=name,
+            state_dir=state_dir,
+        )
+        uvloop.run(program.run(_announce))
+    except (SecretError, RunDirError, ContainerError, OSError) as error:
+        typer.echo(f"rce-container: {error}", err=True)
+        raise typer.Exit(1) from error
+
+
+def _announce(name: str, runtime: str) -> None:
+    print(f"rce-container ready: {name} runtime={runtime}", flush=True)  # noqa: T201 - what other programs wait for
+
+
+def main() -> None:
+    """Run the program."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

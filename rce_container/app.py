@@ -1,0 +1,189 @@
+"""Puts the container task set together and runs it until it is told to stop."""
+
+from __future__ import annotations
+
+import asyncio
+import compileall
+import contextlib
+import errno
+import logging
+import os
+import signal
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+from rce.config.exceptions import ShippedFileError
+from rce.config.folders import default_state_dir, run_dir
+from rce.config.resources import examples_dir
+from rce.config.secret import Secret
+from rce.control.channel import TaskSetChannel
+from rce.control.messages import MachineInfo
+from rce.link.handover import Doorman
+from rce.ros.packages import PackageIndex
+from rce_container.dial import own_address
+from rce_container.exceptions import RuntimeUnavailableError
+from rce_container.folder import StateFolder
+from rce_container.manager import Manager
+from rce_container.runtimes.base import Runtime, source_root
+from rce_container.runtimes.namespace import NamespaceRuntime
+from rce_container.runtimes.process import ProcessRuntime
+from rce_container.settings import ContainerSettings
+
+log = logging.getLogger(__name__)
+
+LINK_PORT = 10030
+AUTO = "auto"
+RUNTIMES = (NamespaceRuntime.name, ProcessRuntime.name)
+
+_ALL = ("", "0.0.0.0", "::")  # noqa: S104 - compared, not bound
+_NOT_ISOLATED = "containers are NOT isolated: nodes may do all that this user may"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class App:
+    """A container task set that is to be run."""
+
+    master: str
+    """Host of the master."""
+    control_port: int
+    secret: Secret
+    settings: ContainerSettings
+    runtime: str = AUTO
+    link_port: int | None = None
+    """None takes 10030 if it is free, else any."""
+    host: str = ""
+    """Address to accept links on; empty for all."""
+    name: str = ""
+    state_dir: Path | None = None
+
+    async def run(self, ready: Callable[[str, str], None]) -> None:
+        """Run until SIGINT or SIGTERM; a second one ends the containers without waiting for their nodes.
+
+        Args:
+            ready: Called with the task set's name and its runtime when it listens.
+
+        Raises:
+            ContainerError: The state directory or the runtime cannot be used.
+            OSError: The link port cannot be taken.
+        """
+        runtimes: dict[str, Runtime] = {one.name: one for one in (NamespaceRuntime(), ProcessRuntime())}
+        runtime, detail = await asyncio.to_thread(choose_runtime, self.runtime, runtimes)
+        await asyncio.to_thread(_compile_engine)
+        state_dir = self.state_dir or default_state_dir() / "container"
+        with StateFolder(state_dir, run_dir()) as state:
+            name = state.name(self.name)
+            doorman = Doorman()
+            async with contextlib.AsyncExitStack() as stack:
+                stack.push_async_callback(doorman.close)
+                port = await _listen(doorman, self.host, self.link_port)
+                reach = own_address(self.master, self.control_port) if self.host in _ALL else self.host
+                manager = Manager(
+                    name=name,
+                    info=_machine(self.settings.machine, runtime.name, detail),
+                    settings=self.settings,
+                    runtimes=runtimes,
+                    runtime=runtime,
+                    state=state,
+                    doorman=doorman,
+                    links=(reach, port),
+                )
+                await self._manage(manager, lambda: ready(name, runtime.name))
+
+    async def _manage(self, manager: Manager, ready: Callable[[], None]) -> None:
+        url = f"ws://{_in_url(self.master)}:{self.control_port}"
+        channel = TaskSetChannel(url, self.secret, manager.hello, manager.handle)
+        manager.send = channel.send
+        async with asyncio.TaskGroup() as tasks:
+            dialing: list[asyncio.Task[None]] = []
+
+            def go() -> None:
+                dialing.append(tasks.create_task(channel.run(), name="control channel"))
+                ready()
+
+            await manager.run(go, _quit_by_signal(manager))
+            for task in dialing:
+                task.cancel()
+
+
+def choose_runtime(wish: str, runtimes: dict[str, Runtime]) -> tuple[Runtime, str]:
+    """Find the runtime to use. Blocks.
+
+    Args:
+        wish: A runtime's name, or ``auto``: namespaces if they work here, else plain processes.
+        runtimes: All there are.
+
+    Returns:
+        The runtime and what users should know of it; empty if all is well.
+
+    Raises:
+        RuntimeUnavailableError: The runtime that was asked for does not work here.
+    """
+    detail = ""
+    if wish in (AUTO, NamespaceRuntime.name):
+        namespace = runtimes[NamespaceRuntime.name]
+        try:
+            namespace.probe()
+        except RuntimeUnavailableError as error:
+            if wish != AUTO:
+                raise
+            detail = f"{error}; "
+        else:
+            return namespace, ""
+    elif wish not in runtimes:
+        raise RuntimeUnavailableError(
+            wish, f"there is no such runtime; use one of {', '.join((AUTO, *runtimes))}"
+        )
+    detail += _NOT_ISOLATED
+    log.warning("%s", detail)
+    return runtimes[ProcessRuntime.name], detail
+
+
+def package_path(given: Sequence[Path]) -> tuple[Path, ...]:
+    """All folders with packages: what was given, what the environment variables name, the shipped examples."""
+    paths = [*given, *PackageIndex.from_environ().path]
+    with contextlib.suppress(ShippedFileError):
+        paths.append(examples_dir())
+    return tuple(dict.fromkeys(path.absolute() for path in paths))
+
+
+async def _listen(doorman: Doorman, host: str, port: int | None) -> int:
+    if port is not None:
+        return await doorman.listen(host, port)
+    try:
+        return await doorman.listen(host, LINK_PORT)
+    except OSError as error:
+        if error.errno != errno.EADDRINUSE:
+            raise
+        log.info("port %d is taken; links are accepted on another one", LINK_PORT)
+        return await doorman.listen(host, 0)
+
+
+def _quit_by_signal(manager: Manager) -> asyncio.Event:
+    quit_ = asyncio.Event()
+
+    def stop() -> None:
+        if quit_.is_set():
+            manager.kill_all()
+        quit_.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop)
+    return quit_
+
+
+def _machine(name: str, runtime: str, detail: str) -> MachineInfo:
+    memory = psutil.virtual_memory().total
+    return MachineInfo(name=name, cores=os.cpu_count() or 0, memory=memory, runtime=runtime, detail=detail)
+
+
+def _compile_engine() -> None:
+    """Compile what containers import: they see it read-only, and could never keep the result."""
+    for package in ("rce", "rce_container"):
+        compileall.compile_dir(source_root() / package, quiet=2)
+
+
+def _in_url(host: str) -> str:
+    return f"[{host}]" if ":" in host else host

@@ -1,0 +1,446 @@
+"""What a manager decides: events in, instructions out. Pure: no I/O, no clock, no task.
+
+A container lives several lives, each with a *mark* of its own (reported as its incarnation). Events of a life that is
+over are ignored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Union
+
+import msgspec
+
+from rce.control.messages import Fault, Gone, Status, ToMaster
+from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress
+from rce_container.life import Happening, Phase, after
+
+BACKOFF_S = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
+"""Pauses before a container that ended is made again: the first, second, ... time."""
+STABLE_S = 30.0
+"""A container that ran for so long starts at the first pause again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Put:
+    """The master desires a container like this."""
+
+    spec: EndpointSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Drop:
+    """The master does not desire a container any more."""
+
+    id: str
+    revision: int
+
+
+@dataclass(frozen=True, slots=True)
+class Sync:
+    """The master desires exactly these."""
+
+    specs: tuple[EndpointSpec, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Adopted:
+    """A container was found that an earlier manager had started; its environment has reported."""
+
+    mark: str
+    status: EndpointStatus
+    address: LinkAddress
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """The processes of a new life were started."""
+
+    id: str
+    mark: str
+    address: LinkAddress
+
+
+@dataclass(frozen=True, slots=True)
+class Reported:
+    """An environment reported."""
+
+    id: str
+    mark: str
+    status: EndpointStatus
+
+
+@dataclass(frozen=True, slots=True)
+class Faulted:
+    """An environment has a fault to tell the user of."""
+
+    id: str
+    mark: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """An environment is gone, or could not be started (``mark`` is empty then)."""
+
+    id: str
+    mark: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Removed:
+    """Nothing is left of a life."""
+
+    id: str
+    mark: str
+
+
+@dataclass(frozen=True, slots=True)
+class Due:
+    """The pause that :class:`Wait` asked for is over."""
+
+    id: str
+    ticket: int
+
+
+@dataclass(frozen=True, slots=True)
+class Quit:
+    """The manager is to end, with all its containers."""
+
+
+Event = Union[Put, Drop, Sync, Adopted, Made, Reported, Faulted, Lost, Removed, Due, Quit]
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Start a new life; answered by :class:`Made` or :class:`Lost`."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True)
+class Apply:
+    """Give a specification to an environment."""
+
+    id: str
+    mark: str
+    spec: EndpointSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """End a life, nodes first; answered by :class:`Removed` in the end."""
+
+    id: str
+    mark: str
+
+
+@dataclass(frozen=True, slots=True)
+class Wait:
+    """Answer by :class:`Due` after ``delay`` seconds."""
+
+    id: str
+    ticket: int
+    delay: float
+
+
+@dataclass(frozen=True, slots=True)
+class Tell:
+    """Send a message to the master."""
+
+    message: ToMaster
+
+
+Instruction = Union[Start, Apply, Stop, Wait, Tell]
+
+
+@dataclass(slots=True)
+class Container:
+    """What is known of one container."""
+
+    id: str
+    phase: Phase
+    desired: EndpointSpec | None = None
+    """None also for an adopted one of which the master has not spoken yet."""
+    drop_revision: int = 0
+    mark: str = ""
+    address: LinkAddress = field(default_factory=LinkAddress)
+    reported: EndpointStatus | None = None
+    failures: int = 0
+    """How often it ended since it was stable last."""
+    running_since: float | None = None
+    ticket: int = 0
+    detail: str = ""
+    told: str = ""
+    """The last failure that the user was told of."""
+
+    @property
+    def status(self) -> EndpointStatus:
+        """What the master is told."""
+        base = self.reported
+        if base is None or self.phase not in (Phase.RUNNING, Phase.STOPPING):
+            base = EndpointStatus(id=self.id, revision=0, state=_STATES[self.phase])
+        state = EndpointState.STOPPING if self.phase is Phase.STOPPING else base.state
+        return msgspec.structs.replace(
+            base,
+            id=self.id,
+            revision=max(0, base.revision),
+            state=state,
+            incarnation=self.mark,
+            address=self.address,
+            detail=self.detail,
+        )
+
+
+_STATES = {
+    Phase.STARTING: EndpointState.STARTING,
+    Phase.RUNNING: EndpointState.RUNNING,
+    Phase.STOPPING: EndpointState.STOPPING,
+    Phase.CLEANING: EndpointState.FAILED,
+    Phase.WAITING: EndpointState.FAILED,
+    Phase.GONE: EndpointState.STOPPING,
+}
+
+
+class ManagerCore:
+    """All containers of one manager.
+
+    Invariants: a container has a mark exactly while something of a life may be there; a container that is gone is
+    forgotten.
+    """
+
+    def __init__(self) -> None:
+        self.containers: dict[str, Container] = {}
+        self._quitting = False
+        self._out: list[Instruction] = []
+        self._now = 0.0
+
+    def handle(self, event: Event, now: float) -> list[Instruction]:
+        """Take in what happened; return what is to be done about it.
+
+        Args:
+            event: What happened.
+            now: Seconds on a clock that never goes back.
+        """
+        self._now = now
+        self._out = []
+        match event:
+            case Put(spec=spec):
+                self._put(spec)
+            case Drop(id=id_, revision=revision):
+                self._drop(id_, revision)
+            case Sync(specs=specs):
+                self._sync(specs)
+            case Adopted():
+                self._adopt(event)
+            case Due(id=id_, ticket=ticket):
+                self._due(id_, ticket)
+            case Quit():
+                self._quit()
+            case Lost(id=id_, mark="", reason=reason):
+                self._not_started(id_, reason)
+            case Made() | Reported() | Faulted() | Lost() | Removed():
+                self._life(event)
+        return self._out
+
+    @property
+    def statuses(self) -> tuple[EndpointStatus, ...]:
+        """What there is, for the master."""
+        return tuple(container.status for container in self.containers.values())
+
+    def validate(self) -> None:
+        """Check the invariants; for tests."""
+        for id_, container in self.containers.items():
+            assert container.id == id_
+            assert container.phase is not Phase.GONE, f"{id_} is gone and not forgotten"
+            if container.phase is Phase.WAITING:
+                assert not container.mark, f"{id_} waits although something of it is there"
+            if container.phase in (Phase.RUNNING, Phase.CLEANING):
+                assert container.mark, f"{id_} is {container.phase.value} without a life"
+
+    # The master's wishes
+
+    def _put(self, spec: EndpointSpec) -> None:
+        if self._quitting:
+            return
+        container = self.containers.get(spec.id)
+        if container is None:
+            container = self.containers[spec.id] = Container(spec.id, Phase.GONE)
+        elif container.desired is not None and spec.revision < container.desired.revision:
+            return
+        container.desired = spec
+        was = container.phase
+        container.phase = after(was, Happening.DESIRE)
+        if was is Phase.GONE:
+            self._start(container)
+        elif container.phase in (Phase.STARTING, Phase.RUNNING) and container.mark:
+            self._out.append(Apply(spec.id, container.mark, spec))
+
+    def _drop(self, id_: str, revision: int) -> None:
+        container = self.containers.get(id_)
+        if container is None:
+            self._out.append(Tell(Gone(id=id_, revision=revision)))
+            return
+        container.desired = None
+        container.drop_revision = revision
+        self._release(container)
+
+    def _sync(self, specs: Iterable[EndpointSpec]) -> None:
+        desired = {spec.id: spec for spec in specs}
+        for id_, container in list(self.containers.items()):
+            if id_ not in desired:
+                known = container.desired or container.reported
+                self._drop(id_, known.revision if known else 0)
+        for spec in desired.values():
+            self._put(spec)
+
+    def _quit(self) -> None:
+        self._quitting = True
+        for container in list(self.containers.values()):
+            container.desired = None
+            self._release(container)
+
+    def _release(self, container: Container) -> None:
+        was = container.phase
+        container.phase = after(was, Happening.RELEASE)
+        if container.phase is Phase.GONE:
+            self._forget(container)
+        elif was in (Phase.STARTING, Phase.RUNNING):
+            if container.mark:
+                self._out.append(Stop(container.id, container.mark))
+            self._tell(container)
+
+    # What happens to containers
+
+    def _adopt(self, event: Adopted) -> None:
+        id_ = event.status.id
+        assert id_ not in self.containers, "containers are adopted before anything else happens"
+        container = self.containers[id_] = Container(
+            id_, Phase.RUNNING, mark=event.mark, address=event.address
+        )
+        container.reported = event.status
+        container.running_since = self._now
+
+    def _life(self, event: Made | Reported | Faulted | Lost | Removed) -> None:
+        container = self.containers.get(event.id)
+        if container is None:
+            return
+        if isinstance(event, Made):
+            self._made(container, event)
+            return
+        if event.mark != container.mark:
+            return
+        match event:
+            case Reported(status=status):
+                self._report(container, status)
+            case Faulted(text=text):
+                self._fault(container, text)
+            case Lost(reason=reason):
+                self._lost(container, reason)
+            case Removed():
+                self._removed(container)
+
+    def _made(self, container: Container, event: Made) -> None:
+        container.mark = event.mark
+        container.address = event.address
+        if container.phase is not Phase.STARTING or container.desired is None:
+            self._out.append(Stop(container.id, event.mark))
+            return
+        self._out.append(Apply(container.id, event.mark, container.desired))
+        self._tell(container)
+
+    def _report(self, container: Container, status: EndpointStatus) -> None:
+        was = container.phase
+        container.phase = after(was, Happening.REPORT)
+        container.reported = status
+        if was is Phase.STARTING:
+            container.running_since = self._now
+            container.detail = ""
+        if container.phase in (Phase.RUNNING, Phase.STOPPING):
+            self._tell(container)
+
+    def _lost(self, container: Container, reason: str) -> None:
+        was = container.phase
+        if was is Phase.CLEANING:
+            return
+        container.phase = after(was, Happening.LOSS)
+        if container.phase is not Phase.CLEANING:
+            return
+        if container.running_since is not None and self._now - container.running_since >= STABLE_S:
+            container.failures = 0
+        container.running_since = None
+        self._failed(container, f"ended unexpectedly ({reason})")
+
+    def _removed(self, container: Container) -> None:
+        if container.phase not in (Phase.STOPPING, Phase.CLEANING):
+            self._lost(container, "its processes ended")
+        container.phase = after(container.phase, Happening.REMOVED)
+        container.mark = ""
+        container.address = LinkAddress()
+        container.reported = None
+        if container.phase is Phase.GONE:
+            self._revive_or_forget(container)
+        elif container.desired is None:  # adopted, and the master has not spoken of it yet
+            del self.containers[container.id]
+        else:
+            self._pause(container)
+
+    def _not_started(self, id_: str, reason: str) -> None:
+        container = self.containers.get(id_)
+        if container is None:
+            return
+        if container.phase is Phase.STOPPING:
+            container.phase = Phase.GONE
+            self._revive_or_forget(container)
+            return
+        container.phase = Phase.WAITING
+        self._failed(container, f"cannot be started: {reason}")
+        self._pause(container)
+
+    def _due(self, id_: str, ticket: int) -> None:
+        container = self.containers.get(id_)
+        if container is None or container.phase is not Phase.WAITING or container.ticket != ticket:
+            return
+        container.phase = after(container.phase, Happening.DUE)
+        self._start(container)
+
+    # What is done about it
+
+    def _start(self, container: Container) -> None:
+        self._out.append(Start(container.id))
+
+    def _pause(self, container: Container) -> None:
+        delay = BACKOFF_S[min(container.failures, len(BACKOFF_S)) - 1]
+        container.ticket += 1
+        self._out.append(Wait(container.id, container.ticket, delay))
+        self._tell(container)
+
+    def _revive_or_forget(self, container: Container) -> None:
+        if container.desired is None or self._quitting:
+            self._forget(container)
+            return
+        container.phase = after(Phase.GONE, Happening.DESIRE)
+        container.detail = ""
+        self._start(container)
+
+    def _forget(self, container: Container) -> None:
+        del self.containers[container.id]
+        if not self._quitting:
+            self._out.append(Tell(Gone(id=container.id, revision=container.drop_revision)))
+
+    def _failed(self, container: Container, what: str) -> None:
+        container.failures += 1
+        container.detail = what
+        if what != container.told or container.failures == 1:
+            container.told = what
+            self._fault(container, f"{what}; it is made again")
+        self._tell(container)
+
+    def _fault(self, container: Container, text: str) -> None:
+        tag = container.id.partition("/")[2]
+        self._out.append(Tell(Fault(id=container.id, text=f"container {tag}: {text}")))
+
+    def _tell(self, container: Container) -> None:
+        self._out.append(Tell(Status(status=container.status)))

@@ -1,0 +1,89 @@
+"""The life of a container as its manager sees it: phases, what may happen in each, and what follows."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+
+class Phase(Enum):
+    """Where a container is in its life."""
+
+    STARTING = "starting"
+    """Its processes are being made, or its environment has not reported yet."""
+    RUNNING = "running"
+    """Its environment reports."""
+    STOPPING = "stopping"
+    """It was told to end, because it is not desired any more; nothing of it may be left."""
+    CLEANING = "cleaning"
+    """It ended although it is desired; what is left of it is being removed."""
+    WAITING = "waiting"
+    """Nothing of it is there; it is made again after a while."""
+    GONE = "gone"
+    """Nothing of it is there, and it is not desired. The manager forgets it."""
+
+
+class Happening(Enum):
+    """What can happen to a container."""
+
+    REPORT = "report"
+    """Its environment reported."""
+    LOSS = "loss"
+    """Its environment is gone, or could not be started."""
+    REMOVED = "removed"
+    """No process and no folder of it is left."""
+    RELEASE = "release"
+    """It is not desired any more."""
+    DESIRE = "desire"
+    """It is desired, with whatever specification."""
+    DUE = "due"
+    """It waited long enough."""
+
+
+NEXT: dict[Phase, dict[Happening, Phase]] = {
+    Phase.STARTING: {
+        Happening.REPORT: Phase.RUNNING,
+        Happening.LOSS: Phase.CLEANING,
+        Happening.RELEASE: Phase.STOPPING,
+        Happening.DESIRE: Phase.STARTING,
+    },
+    Phase.RUNNING: {
+        Happening.REPORT: Phase.RUNNING,
+        Happening.LOSS: Phase.CLEANING,
+        Happening.RELEASE: Phase.STOPPING,
+        Happening.DESIRE: Phase.RUNNING,
+    },
+    Phase.STOPPING: {
+        Happening.REPORT: Phase.STOPPING,
+        Happening.LOSS: Phase.STOPPING,
+        Happening.REMOVED: Phase.GONE,
+        Happening.RELEASE: Phase.STOPPING,
+        Happening.DESIRE: Phase.STOPPING,
+    },
+    Phase.CLEANING: {
+        Happening.REPORT: Phase.CLEANING,
+        Happening.REMOVED: Phase.WAITING,
+        Happening.RELEASE: Phase.STOPPING,
+        Happening.DESIRE: Phase.CLEANING,
+    },
+    Phase.WAITING: {
+        Happening.DUE: Phase.STARTING,
+        Happening.RELEASE: Phase.GONE,
+        Happening.DESIRE: Phase.WAITING,
+    },
+    Phase.GONE: {
+        Happening.DESIRE: Phase.STARTING,
+        Happening.RELEASE: Phase.GONE,
+    },
+}
+
+
+def after(phase: Phase, happening: Happening) -> Phase:
+    """The phase that follows.
+
+    Raises:
+        ValueError: This cannot happen in that phase.
+    """
+    found = NEXT[phase].get(happening)
+    if found is None:
+        raise ValueError(f"{happening.value} cannot happen to a container that is {phase.value}")
+    return found

@@ -1,0 +1,296 @@
+"""The manager: does what :mod:`rce_container.core` decides, and tells it what happens."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+import psutil
+
+from rce.control.messages import (
+    CONTROL_VERSION,
+    Drop,
+    Hello,
+    LogChunk,
+    MachineInfo,
+    Put,
+    ReadLog,
+    Sync,
+    TaskSetKind,
+    ToMaster,
+    ToTaskSet,
+    Usage,
+)
+from rce.control.model import EndpointStatus, LinkAddress
+from rce.protocol.names import EndpointId, is_name
+from rce_container import core
+from rce_container.environment import messages as m
+from rce_container.environment import proc
+from rce_container.environment.channel import connect
+from rce_container.exceptions import ContainerError, StateError
+from rce_container.folder import ContainerFolder, Record
+from rce_container.logs import read_log
+from rce_container.runtimes.base import Handle, Order
+from rce_container.unit import Office, Unit
+from rce_container.usage import UsageMeter
+
+if TYPE_CHECKING:
+    from rce.link.handover import Doorman
+    from rce_container.folder import StateFolder
+    from rce_container.runtimes.base import Runtime
+    from rce_container.settings import ContainerSettings
+
+log = logging.getLogger(__name__)
+
+ROS_PORT = 11311
+_STRIKE_PAUSE_S = 0.02
+
+
+class Manager:
+    """All containers of one machine, or of one task set on it.
+
+    Args:
+        name: Names the task set; the same after a restart.
+        info: The machine.
+        settings: How containers are run.
+        runtimes: All runtimes by name, for containers that an earlier manager started.
+        runtime: The one for new containers.
+        state: Where everything is kept.
+        doorman: Accepts links by TCP.
+        links: Host and port where it does.
+
+    Attributes:
+        send: Sends a message to the master, or drops it while there is none.
+    """
+
+    def __init__(
+        self,
+        *,
+        name: str,
+        info: MachineInfo,
+        settings: ContainerSettings,
+        runtimes: Mapping[str, Runtime],
+        runtime: Runtime,
+        state: StateFolder,
+        doorman: Doorman,
+        links: tuple[str, int],
+    ) -> None:
+        self._name = name
+        self._info = info
+        self._settings = settings
+        self._runtimes = runtimes
+        self._runtime = runtime
+        self._state = state
+        self._links = links
+        self.send: Callable[[ToMaster], None] = lambda _: None
+        self._core = core.ManagerCore()
+        self._office = Office(settings=settings, doorman=doorman, feed=self._feed)
+        self._units: dict[str, Unit] = {}
+        """All lives of which something may be left, by mark."""
+        self._tasks: asyncio.TaskGroup
+        self._empty = asyncio.Event()
+        self._meter = UsageMeter()
+        self._process = psutil.Process()
+
+    # The master's side
+
+    def hello(self) -> Hello:
+        """Say who this is and what is there."""
+        return Hello(
+            version=CONTROL_VERSION,
+            kind=TaskSetKind.CONTAINER,
+            process=self._name,
+            machine=self._info,
+            endpoints=self._core.statuses,
+        )
+
+    async def handle(self, message: ToTaskSet) -> None:
+        """Do what the master says."""
+        match message:
+            case Put(endpoint=spec):
+                self._feed(core.Put(spec))
+            case Drop(id=id_, revision=revision):
+                self._feed(core.Drop(id_, revision))
+            case Sync(endpoints=specs):
+                self._feed(core.Sync(specs))
+            case ReadLog():
+                self.send(await asyncio.to_thread(self._read_log, message))
+            case _:
+                log.debug("not for a container task set: %s", type(message).__name__)
+
+    @property
+    def statuses(self) -> tuple[EndpointStatus, ...]:
+        """What there is now."""
+        return self._core.statuses
+
+    # Life
+
+    async def run(self, ready: Callable[[], None], quit_: asyncio.Event) -> None:
+        """Adopt what an earlier manager left, then manage until told to quit, and end all containers.
+
+        A manager that is cancelled leaves its containers to themselves.
+
+        Args:
+            ready: Called when the past is dealt with.
+            quit_: Ends the manager.
+        """
+        async with asyncio.TaskGroup() as self._tasks:
+            await self._deal_with_the_past()
+            ready()
+            usage = self._tasks.create_task(self._report_usage(), name="usage")
+            await quit_.wait()
+            self._feed(core.Quit())
+            if self._units:
+                await self._empty.wait()
+            usage.cancel()
+
+    def kill_all(self) -> None:
+        """End all containers at once; for a quit that takes too long."""
+        for unit in self._units.values():
+            unit.kill()
+
+    async def _deal_with_the_past(self) -> None:
+        async with asyncio.TaskGroup() as tasks:
+            for folder in self._state.existing():
+                tasks.create_task(self._adopt_or_prune(folder))
+
+    async def _adopt_or_prune(self, folder: ContainerFolder) -> None:
+        record = folder.read_record()
+        process = proc.read(record.pid) if record is not None else None
+        if record is None or process is None or process.start != record.start:
+            await self._prune(folder)
+            return
+        runtime = self._runtimes.get(record.runtime, self._runtime)
+        unit = self._own(record.id, folder, runtime.adopt(process, folder.mark), isolated=runtime.isolated)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(self._settings.adopt_timeout):
+                await unit.reported.wait()
+        if unit.status is None or unit.mark not in self._units or record.id in self._core.containers:
+            log.warning("container %s of an earlier manager does not answer; it is removed", record.id)
+            unit.kill()
+            return
+        log.info("adopted container %s", record.id)
+        self._feed(core.Adopted(unit.mark, unit.status, self._address(folder)))
+
+    async def _prune(self, folder: ContainerFolder) -> None:
+        """Remove what a dead container left."""
+        try:
+            channel = await connect(str(folder.control_socket))
+        except OSError:
+            while proc.strike(folder.mark):
+                await asyncio.sleep(_STRIKE_PAUSE_S)
+            await asyncio.to_thread(folder.remove)
+        else:  # it lives, but its manager died before it could note who it is
+            channel.send(m.encode(m.Stop()))
+            channel.close()
+
+    # What the core decides
+
+    def _feed(self, event: core.Event) -> None:
+        for instruction in self._core.handle(event, asyncio.get_running_loop().time()):
+            self._perform(instruction)
+
+    def _perform(self, instruction: core.Instruction) -> None:
+        match instruction:
+            case core.Tell(message=message):
+                self.send(message)
+            case core.Start(id=id_):
+                self._start(id_)
+            case core.Apply(mark=mark, spec=spec):
+                self._units[mark].apply(spec)
+            case core.Stop(mark=mark):
+                self._units[mark].stop()
+            case core.Wait(id=id_, ticket=ticket, delay=delay):
+                asyncio.get_running_loop().call_later(delay, self._feed, core.Due(id_, ticket))
+
+    def _start(self, id_: str) -> None:
+        try:
+            folder = self._state.create()
+        except StateError as error:
+            self._feed(core.Lost(id_, "", str(error)))
+            return
+        try:
+            handle = self._launch(id_, folder)
+        except ContainerError as error:
+            folder.remove()
+            self._feed(core.Lost(id_, "", str(error)))
+            return
+        self._own(id_, folder, handle, isolated=self._runtime.isolated)
+        self._feed(core.Made(id_, folder.mark, self._address(folder)))
+
+    def _launch(self, id_: str, folder: ContainerFolder) -> Handle:
+        settings = self._settings
+        boot = m.Boot(
+            id=id_,
+            mark=folder.mark,
+            machine=settings.machine,
+            home="",
+            logs="",
+            ros_port=ROS_PORT if self._runtime.isolated else 0,
+            isolated=self._runtime.isolated,
+            packages=tuple(map(str, settings.packages)),
+            grace=settings.grace,
+            interrupt_timeout=settings.interrupt_timeout,
+            terminate_timeout=settings.terminate_timeout,
+        )
+        with folder.listen(folder.control_socket) as control, folder.listen(folder.link_socket) as links:
+            order = Order(
+                EndpointId.parse(id_).tag, boot, folder, settings.packages, control.fileno(), links.fileno()
+            )
+            handle = self._runtime.start(order)
+        process = handle.process
+        record = Record(
+            id=id_, mark=folder.mark, runtime=self._runtime.name, pid=process.pid, start=process.start
+        )
+        try:
+            folder.write_record(record)
+        except StateError:
+            proc.kill(process)  # all of the container ends with it
+            raise
+        return handle
+
+    def _own(self, id_: str, folder: ContainerFolder, handle: Handle, *, isolated: bool) -> Unit:
+        unit = Unit(id_, folder, handle, self._office, isolated=isolated)
+        self._units[unit.mark] = unit
+        self._tasks.create_task(self._run_unit(unit), name=f"container {id_}")
+        return unit
+
+    async def _run_unit(self, unit: Unit) -> None:
+        await unit.run()
+        del self._units[unit.mark]
+        self._feed(core.Removed(unit.id, unit.mark))
+        if not self._units:
+            self._empty.set()
+
+    def _address(self, folder: ContainerFolder) -> LinkAddress:
+        host, port = self._links
+        return LinkAddress(machine=self._settings.machine, unix=str(folder.link_socket), host=host, port=port)
+
+    # Reading
+
+    def _read_log(self, message: ReadLog) -> LogChunk:
+        container = self._core.containers.get(message.id)
+        unit = self._units.get(container.mark) if container is not None else None
+        if unit is None or (message.node and not is_name(message.node)):
+            return LogChunk(
+                request=message.request, offset=message.offset, error=f"there is no log of {message.node!r}"
+            )
+        try:
+            chunk = read_log(unit.folder.logs, message.node, message.offset, message.limit)
+        except OSError as error:
+            return LogChunk(request=message.request, offset=message.offset, error=str(error))
+        return LogChunk(request=message.request, offset=chunk.offset, text=chunk.text)
+
+    async def _report_usage(self) -> None:
+        while True:
+            await asyncio.sleep(self._settings.usage_interval)
+            for unit in self._units.values():
+                unit.poll()
+            wanted = {u.id: (u.handle.process.pid, u.counters) for u in self._units.values()}
+            usage = await asyncio.to_thread(self._meter.measure, wanted)
+            times = self._process.cpu_times()
+            memory = self._process.memory_info().rss
+            self.send(Usage(cpu_s=times.user + times.system, memory=memory, endpoints=usage))

@@ -1,0 +1,34 @@
+"""What can be set of a container task set. Times in seconds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ContainerSettings:
+    """How a manager and its containers are run."""
+
+    machine: str
+    """See :class:`rce.control.model.LinkAddress`."""
+    packages: tuple[Path, ...] = ()
+    """Folders with packages, the more important first; containers see them read-only."""
+    grace: float = 30.0
+    """A container without a manager ends itself after so long."""
+    interrupt_timeout: float = 15.0
+    """A node has so long to end after SIGINT, before it gets SIGTERM."""
+    terminate_timeout: float = 2.0
+    """A node has so long to end after SIGTERM, before it gets SIGKILL."""
+    start_timeout: float = 30.0
+    """An environment that did not report for so long after its start is killed."""
+    adopt_timeout: float = 3.0
+    """A container of an earlier manager that does not answer within this time is killed."""
+    cleanup_timeout: float = 10.0
+    """What a container has on top of its nodes' times to end by itself, before it is killed."""
+    usage_interval: float = 2.0
+
+    @property
+    def stop_timeout(self) -> float:
+        """How long a container may take to stop."""
+        return self.interrupt_timeout + self.terminate_timeout + self.cleanup_timeout

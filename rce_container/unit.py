@@ -1,0 +1,246 @@
+"""One life of one container: its processes, its control connection and its folder, owned by one task."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import msgspec
+
+from rce.control.model import EndpointSpec, EndpointStatus, InterfaceUsage, LinkAddress, NodeStatus
+from rce.link.handover import Doorman, HandoverSender
+from rce.link.tasks import TaskScope
+from rce_container import core
+from rce_container.dial import dial
+from rce_container.environment import messages as m
+from rce_container.environment import proc
+from rce_container.environment.channel import Channel, connect
+from rce_container.environment.exceptions import ChannelError
+from rce_container.exceptions import StartError
+from rce_container.folder import ContainerFolder
+from rce_container.logs import read_log
+from rce_container.runtimes.base import Handle
+from rce_container.settings import ContainerSettings
+
+log = logging.getLogger(__name__)
+
+_SHIM_TIMEOUT_S = 5.0
+"""What the shim gets to remove the folders of a container that ended properly."""
+_LAST_WORDS_BYTES = 4096
+_LAST_WORDS_LENGTH = 300
+_DIAL_TIMEOUT_S = 5.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Office:
+    """What all lives of all containers share."""
+
+    settings: ContainerSettings
+    doorman: Doorman
+    feed: Callable[[core.Event], None]
+
+
+class Unit:
+    """One life of one container, from the first process to the removal of the last file.
+
+    Args:
+        id: The container.
+        folder: Belongs to this life.
+        handle: Its outermost process.
+        office: What all lives share.
+        isolated: Whether pids that the environment reports are those of a namespace of its own.
+    """
+
+    def __init__(
+        self,
+        id: str,  # noqa: A002 - what it is
+        folder: ContainerFolder,
+        handle: Handle,
+        office: Office,
+        *,
+        isolated: bool,
+    ) -> None:
+        self.id = id
+        self.folder = folder
+        self.handle = handle
+        self.counters: dict[str, InterfaceUsage] = {}
+        """The interfaces' counters, as the environment said last."""
+        self.status: EndpointStatus | None = None
+        """What the environment reported last."""
+        self.reported = asyncio.Event()
+        """Set by the first report, and by an end without one."""
+        self._office = office
+        self._isolated = isolated
+        self._channel: Channel | None = None
+        self._sender: HandoverSender | None = None
+        self._spec: EndpointSpec | None = None
+        self._pids: dict[int, int] = {}
+        self._deadline: asyncio.Timeout | None = None
+        self._stopping = False
+        self._hurry = False
+        self._errands = TaskScope()
+
+    @property
+    def mark(self) -> str:
+        """Names this life."""
+        return self.folder.mark
+
+    def apply(self, spec: EndpointSpec) -> None:
+        """Give the environment what is desired."""
+        self._spec = spec
+        if self._channel is not None:
+            self._channel.send(m.encode(m.Apply(spec=spec)))
+        if self._sender is not None:
+            self._errands.spawn(self._route(self._sender, spec), f"links of {self.id}")
+
+    def poll(self) -> None:
+        """Ask for new :attr:`counters`."""
+        if self._channel is not None:
+            self._channel.send(m.encode(m.Poll()))
+
+    def stop(self) -> None:
+        """Tell the environment to end; if it does not, it is killed."""
+        self._stopping = True
+        if self._channel is not None:
+            self._channel.send(m.encode(m.Stop()))
+            self._limit(self._office.settings.stop_timeout)
+
+    def kill(self) -> None:
+        """End at once."""
+        self._stopping = self._hurry = True
+        self._limit(0.0)
+
+    async def run(self) -> None:
+        """Live to the end. A cancelled manager leaves the container to itself: it may be adopted."""
+        try:
+            reason = await self._live()
+            if not self._stopping:
+                reason += await asyncio.to_thread(self._last_words)
+                log.warning("container %s: %s", self.id, reason)
+            self._office.feed(core.Lost(self.id, self.mark, reason))
+            await self._clean(_SHIM_TIMEOUT_S if self._stopping and not self._hurry else 0.0)
+        except asyncio.CancelledError:
+            self.handle.abandon()
+            raise
+        finally:
+            self.reported.set()
+
+    async def _live(self) -> str:
+        """Talk with the environment until it is gone; returns why."""
+        try:
+            async with asyncio.timeout(self._office.settings.start_timeout) as self._deadline:
+                self._channel = await connect(str(self.folder.control_socket))
+                self._open_handover(self._channel)
+                if self._stopping:
+                    self.stop()
+                if self._spec is not None:
+                    self.apply(self._spec)
+                await self._converse(self._channel)
+        except TimeoutError:
+            self._hurry = True
+            return (
+                "its environment did not end in time" if self._stopping else "its environment does not answer"
+            )
+        except (OSError, ChannelError, msgspec.DecodeError) as error:
+            return f"its environment cannot be talked to: {error}"
+        finally:
+            await self._hang_up()
+        return "its environment died"
+
+    async def _hang_up(self) -> None:
+        self._deadline = None
+        sender, self._sender = self._sender, None
+        await self._errands.close()
+        if self._channel is not None:
+            self._channel.close()
+            self._channel = None
+        if sender is not None:
+            self._office.doorman.forget(sender)
+            sender.close()
+
+    async def _converse(self, channel: Channel) -> None:
+        while (line := await channel.receive()) is not None:
+            match m.decode_to_manager(line):
+                case m.Report(status=status):
+                    self._report(status)
+                case m.Fault(text=text):
+                    self._office.feed(core.Faulted(self.id, self.mark, text))
+                case m.Counters(interfaces=interfaces):
+                    self.counters = interfaces
+                case m.Dial() as request:
+                    self._errands.spawn(self._dial(channel, request), f"dial for {self.id}")
+
+    def _report(self, status: EndpointStatus) -> None:
+        if not self._stopping:
+            self._limit(None)
+        if self._isolated:
+            status = msgspec.structs.replace(status, nodes=self._with_outer_pids(status))
+        self.status = status
+        self.reported.set()
+        self._office.feed(core.Reported(self.id, self.mark, status))
+
+    def _with_outer_pids(self, status: EndpointStatus) -> tuple[NodeStatus, ...]:
+        """Replace the nodes' pids inside the container by those outside."""
+        if any(node.pid and node.pid not in self._pids for node in status.nodes):
+            inside = proc.descendants(self.handle.process.pid, proc.table())
+            self._pids = {proc.inner_pid(process.pid): process.pid for process in inside}
+        return tuple(
+            msgspec.structs.replace(node, pid=self._pids.get(node.pid, 0)) if node.pid else node
+            for node in status.nodes
+        )
+
+    def _limit(self, seconds: float | None) -> None:
+        if self._deadline is not None:
+            loop = asyncio.get_running_loop()
+            self._deadline.reschedule(None if seconds is None else loop.time() + seconds)
+
+    # Links
+
+    def _open_handover(self, channel: Channel) -> None:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._sender = HandoverSender(ours)
+        with theirs:
+            channel.send(m.encode(m.Handover()), theirs.fileno())
+
+    async def _route(self, sender: HandoverSender, spec: EndpointSpec) -> None:
+        await self._office.doorman.assign(sender, [link.id for link in spec.links if not link.dial])
+
+    async def _dial(self, channel: Channel, request: m.Dial) -> None:
+        """Connect to a peer of this container, and to nothing else."""
+        allowed: list[LinkAddress] = [link.address for link in self._spec.links] if self._spec else []
+        try:
+            if request.address not in allowed:
+                raise ConnectionError("the container has no link to there")
+            async with asyncio.timeout(_DIAL_TIMEOUT_S):
+                sock = await dial(request.address, self._office.settings.machine)
+        except OSError as error:
+            text = str(error) or type(error).__name__
+            channel.send(m.encode(m.Dialed(request=request.request, error=text)))
+            return
+        with sock:
+            channel.send(m.encode(m.Dialed(request=request.request)), sock.fileno())
+
+    # The end
+
+    def _last_words(self) -> str:
+        try:
+            text = read_log(self.folder.logs, "", -_LAST_WORDS_BYTES, _LAST_WORDS_BYTES).text
+        except OSError:
+            return ""
+        lines = text.strip().splitlines()
+        return f"; its last words: {lines[-1].strip()[:_LAST_WORDS_LENGTH]}" if lines else ""
+
+    async def _clean(self, patience: float) -> None:
+        """Let the shim do its work for ``patience`` seconds, then kill what is left and remove the folder."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(patience):
+                await self.handle.wait()
+        try:
+            await self.handle.kill()
+        except StartError as error:
+            log.error("container %s: %s", self.id, error)  # noqa: TRY400 - its text says it all
+        await asyncio.to_thread(self.folder.remove)
