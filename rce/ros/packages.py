@@ -253,6 +253,6 @@ def _folder_of(target: str) -> Path:
         spec = find_spec(module)
     except ImportError as error:
         raise BadPackage(f"entry point {target}: {error}") from error
-    if spec is None or spec.origin is None:
-        raise BadPackage(f"entry point {target}: there is no module {module}")
+    if spec is None or spec.origin is None or not spec.has_location:
+        raise BadPackage(f"entry point {target}: there is no file of a module {module}")
     return Path(spec.origin).parent

@@ -8,7 +8,12 @@ from rce.ros.types.codegen import Code
 from rce.ros.types.readers import ReaderBuilder
 from rce.ros.types.values import NUMBERS
 from rce.ros.types.writers import WriterBuilder
-from rce_robot.converters.stamps import duration_from_json, time_from_json, time_to_json
+from rce_robot.converters.stamps import (
+    duration_from_json,
+    duration_to_json,
+    time_from_json,
+    time_to_json,
+)
 from rce_robot.converters.values import number_packer, to_float, to_octets, unpack_list
 
 if TYPE_CHECKING:
@@ -57,9 +62,8 @@ class _JsonReading:
         return value
 
     def stamp(self, code: Code, field: Field, secs: str, nsecs: str) -> str:
-        if field.type == "time":
-            return f"{code.bind(time_to_json)}({secs}, {nsecs})"
-        return f"({secs} + {nsecs} / 1e9)"
+        write = code.bind(time_to_json if field.type == "time" else duration_to_json)
+        return f"{write}({secs}, {nsecs})"
 
     def octets(self, code: Code, chunk: str) -> str:
         # A view, not a copy: what is big in a message is here.

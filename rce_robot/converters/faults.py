@@ -5,11 +5,10 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING, Any
 
-from rce.ros.types.faults import short
 from rce.ros.types.values import NUMBERS
 from rce_robot.converters.exceptions import ConversionError
 from rce_robot.converters.stamps import duration_from_json, time_from_json
-from rce_robot.converters.values import BINARY, to_octets
+from rce_robot.converters.values import BINARY, describe, to_octets
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -28,7 +27,7 @@ def find_fault(kind: MessageType, value: Any, customs: Mapping[str, CustomConver
         custom = customs.get(kind.name)
         if custom is None:
             raise ConversionError(
-                path or kind.name, f"{_name(value)} is not an object of the fields of {kind.name}"
+                path or kind.name, f"{describe(value)} is not an object of the fields of {kind.name}"
             )
         try:
             value = custom.decode(value)
@@ -46,7 +45,7 @@ def _check_field(field: Field, value: Any, customs: Mapping[str, CustomConverter
     elif field.is_bytes and isinstance(value, (*BINARY, str)):
         _check_octets(field, value, path)
     elif not isinstance(value, (list, tuple)):
-        raise ConversionError(path, f"{_name(value)} is not a {field.declared} (a list)")
+        raise ConversionError(path, f"{describe(value)} is not a {field.declared} (a list)")
     else:
         _check_length(field, len(value), path)
         for index, item in enumerate(value):
@@ -58,7 +57,7 @@ def _check_octets(field: Field, value: Any, path: str) -> None:
         octets = to_octets(value)
     except ValueError:
         raise ConversionError(
-            path, f"{short(value)} is not a {field.declared} (a string must be base64)"
+            path, f"{describe(value)} is not a {field.declared} (a string must be base64)"
         ) from None
     _check_length(field, len(octets), path)
 
@@ -86,7 +85,7 @@ def _check_scalar(type_name: str, value: Any) -> None:
         duration_from_json(value)
     elif type_name == "string":
         if not isinstance(value, str):
-            raise ValueError(f"{_name(value)} is not a string")
+            raise ValueError(f"{describe(value)} is not a string")
         value.encode()
     else:
         _check_number(type_name, value)
@@ -100,22 +99,13 @@ def _check_number(type_name: str, value: Any) -> None:
         kinds = (int, float, type(None)) if number.is_float else (int,)
         fits = isinstance(value, kinds) and not isinstance(value, bool)
     if not fits:
-        raise ValueError(f"{_name(value)} is not a {type_name}")
+        raise ValueError(f"{describe(value)} is not a {type_name}")
     if value is None:
         return
     try:
         struct.pack("<" + number.code, value)
     except (struct.error, OverflowError):
-        raise ValueError(f"{short(value)} is out of the range of {type_name}") from None
-
-
-def _name(value: Any) -> str:
-    """Name a value as one who reads JSON knows it."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, BINARY):
-        return "a binary value"
-    return {dict: "an object", list: "a list", type(None): "null"}.get(type(value)) or short(value)
+        raise ValueError(f"{describe(value)} is out of the range of {type_name}") from None
 
 
 def unknown_fields(kind: MessageType, value: Any, path: str = "") -> Iterator[str]:

@@ -13,7 +13,7 @@ from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 from typing import Any
 
-from rce.ros.types.faults import short
+from rce_robot.converters.values import describe
 
 _NANOSECONDS = 1_000_000_000
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -41,18 +41,23 @@ def time_from_json(value: Any) -> tuple[int, int]:
     if value.__class__ is dict:
         return _parts(value, "time", 0, 0xFFFFFFFF)
     if value.__class__ is not str:
-        raise ValueError(f"{short(value)} is not a time (an ISO 8601 string)")
+        raise ValueError(f"{describe(value)} is not a time (an ISO 8601 string)")
     try:
         moment = datetime.fromisoformat(value)
     except ValueError:
-        raise ValueError(f"{short(value)} is not an ISO 8601 time") from None
+        raise ValueError(f"{describe(value)} is not an ISO 8601 time") from None
     if moment.tzinfo is None:
         moment = moment.replace(tzinfo=UTC)
     since = moment - _EPOCH
     secs = since.days * 86400 + since.seconds
     if not 0 <= secs <= 0xFFFFFFFF:  # noqa: PLR2004
-        raise ValueError(f"{short(value)} is out of the range of time (1970 to 2106)")
+        raise ValueError(f"{describe(value)} is out of the range of time (1970 to 2106)")
     return secs, since.microseconds * 1000
+
+
+def duration_to_json(secs: int, nsecs: int) -> float:
+    """Write a duration: the float nearest to it."""
+    return (secs * _NANOSECONDS + nsecs) / _NANOSECONDS
 
 
 def duration_from_json(value: Any) -> tuple[int, int]:
@@ -70,9 +75,9 @@ def duration_from_json(value: Any) -> tuple[int, int]:
         carry, nsecs = divmod(round((value - whole) * _NANOSECONDS), _NANOSECONDS)
         secs = whole + carry
     else:
-        raise ValueError(f"{short(value)} is not a duration (a number of seconds)")
+        raise ValueError(f"{describe(value)} is not a duration (a number of seconds)")
     if not -0x80000000 <= secs <= 0x7FFFFFFF:  # noqa: PLR2004
-        raise ValueError(f"{short(value)} is out of the range of duration")
+        raise ValueError(f"{describe(value)} is out of the range of duration")
     return secs, nsecs
 
 
@@ -85,5 +90,7 @@ def _parts(value: dict[str, Any], kind: str, low: int, high: int) -> tuple[int, 
     # On the wire both have the range of the seconds.
     for name, part in (("secs", secs), ("nsecs", nsecs)):
         if part.__class__ is not int or not low <= part <= high:
-            raise ValueError(f"{name} of a {kind} is {short(part)}, must be an integer from {low} to {high}")
+            raise ValueError(
+                f"{name} of a {kind} is {describe(part)}, must be an integer from {low} to {high}"
+            )
     return secs, nsecs

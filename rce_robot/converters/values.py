@@ -15,6 +15,7 @@ from typing import Any
 
 from rce.ros.types.arrays import pack_numbers, unpack_numbers
 from rce.ros.types.codegen import RefusedValueError
+from rce.ros.types.faults import short
 from rce.ros.types.values import Number
 
 BINARY = (bytes, bytearray, memoryview)
@@ -76,3 +77,12 @@ def unpack_list(code: str, chunk: Any) -> list[Any]:
         return list(unpack_numbers(code, chunk))
     values: list[Any] = memoryview(chunk).cast(code).tolist()  # type: ignore[call-overload]  # of any code
     return values
+
+
+def describe(value: Any) -> str:
+    """Name a value as one who reads JSON knows it."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, BINARY):
+        return "a binary value"
+    return {dict: "an object", list: "a list", type(None): "null"}.get(type(value)) or short(value)

@@ -126,14 +126,15 @@ def split_full_text(name: str, text: str) -> Iterator[tuple[str, str]]:
         BadDefinition: A part does not begin with ``MSG: package/Type``.
     """
     first, *rest = re.split(rf"^{SEPARATOR}=*[ \t]*\r?\n", text, flags=re.MULTILINE)
+    # ROS puts a line end after every part but the last.
     yield name, first.removesuffix("\n") if rest else first
-    for part in rest:
+    for index, part in enumerate(rest, 1):
         head, _, body = part.partition("\n")
         if not head.startswith(PART_HEADER):
             raise BadDefinition(
                 name, 0, f"a part of the definition begins with {head[:80]!r}, not with 'MSG: '"
             )
-        yield head.removeprefix(PART_HEADER).strip(), body.removesuffix("\n")
+        yield head.removeprefix(PART_HEADER).strip(), body.removesuffix("\n") if index < len(rest) else body
 
 
 def checksum_text(definition: Definition, md5_of: Callable[[str], str]) -> str:

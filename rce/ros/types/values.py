@@ -85,7 +85,7 @@ class _Stamp:
 
     def to_sec(self) -> float:
         """Return the whole as seconds."""
-        return self.secs + self.nsecs / NANOSECONDS
+        return self.to_nsec() / NANOSECONDS
 
     def __eq__(self, other: object) -> bool:
         if other.__class__ is not self.__class__:

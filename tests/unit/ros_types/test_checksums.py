@@ -1,0 +1,151 @@
+"""Checksums and definition texts are those of ROS; rosbags and Debian's own ROS are the oracles."""
+
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from rce.ros.packages import PackageIndex
+from rce.ros.types import TypeRegistry
+from rce.ros.types.registry import builtin_definitions
+
+MESSAGES = sorted(name for kind, name in builtin_definitions() if kind == "msg")
+SERVICES = sorted(name for kind, name in builtin_definitions() if kind == "srv")
+SYSTEM_PYTHON = "/usr/bin/python3"
+SYSTEM_PACKAGES = (
+    "std_msgs",
+    "geometry_msgs",
+    "sensor_msgs",
+    "nav_msgs",
+    "std_srvs",
+    "rosgraph_msgs",
+    "roscpp",
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "md5sum"),
+    [
+        ("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1"),
+        ("std_msgs/Empty", "d41d8cd98f00b204e9800998ecf8427e"),
+        ("std_msgs/Header", "2176decaecbce78abc3b96ef049fabed"),
+        ("geometry_msgs/PoseWithCovarianceStamped", "953b798c0f514ff060a53a3498ce6246"),
+        ("nav_msgs/OccupancyGrid", "3381f2d731d4076ec5c71b0759edbe4e"),
+        ("sensor_msgs/Image", "060021388200f6f0f447d0fcd9c64743"),
+        ("rosgraph_msgs/Log", "acffd30cd6b6de30f120938c17c593fb"),
+        ("tf2_msgs/TFMessage", "94810edda583a504dfda3829e70d7eec"),
+        ("actionlib_msgs/GoalStatusArray", "8b2b82f13216d0a8ea88bd3af735e619"),
+        ("move_base_msgs/MoveBaseAction", "70b6aca7c7f7746d8d1609ad94c80bb8"),
+        ("tf2_msgs/LookupTransformAction", "7ee01ba91a56c2245c610992dbaa3c37"),
+    ],
+)
+def test_known_checksums_of_messages(name: str, md5sum: str) -> None:
+    assert TypeRegistry().message(name).md5sum == md5sum
+
+
+@pytest.mark.parametrize(
+    ("name", "md5sum"),
+    [
+        ("std_srvs/Empty", "d41d8cd98f00b204e9800998ecf8427e"),
+        ("std_srvs/Trigger", "937c9679a518e3a18d831e57125ea522"),
+        ("rospy_tutorials/AddTwoInts", "6a2e34150c00229791cc89ff309fff21"),
+        ("roscpp/GetLoggers", "32e97e85527d4678a8f9279894bb64b0"),
+        ("dynamic_reconfigure/Reconfigure", "bb125d226a21982a4a98760418dc2672"),
+    ],
+)
+def test_known_checksums_of_services(name: str, md5sum: str) -> None:
+    assert TypeRegistry().service(name).md5sum == md5sum
+
+
+def test_every_builtin_message_has_the_checksum_that_rosbags_has() -> None:
+    store, types = get_typestore(Stores.ROS1_NOETIC), TypeRegistry()
+    compared = 0
+    for name in MESSAGES:
+        full = name.replace("/", "/msg/")
+        if full in store.fielddefs:
+            assert types.message(name).md5sum == store.generate_msgdef(full)[1], name
+            compared += 1
+    assert compared > 130
+
+
+def test_every_builtin_service_can_be_made() -> None:
+    types = TypeRegistry()
+    for name in SERVICES:
+        service = types.service(name)
+        assert service.request.serialize({}) is not None
+        assert service.response.name == f"{name}Response"
+
+
+def test_a_type_learned_from_its_full_text_is_the_same() -> None:
+    types = TypeRegistry()
+    for name in MESSAGES:
+        original = types.message(name)
+        learned = TypeRegistry(PackageIndex([])).from_definition(name, original.definition)
+        assert (learned.md5sum, learned.definition) == (original.md5sum, original.definition)
+
+
+def test_a_learned_type_is_remembered_but_does_not_replace_another() -> None:
+    types = TypeRegistry()
+    learned = types.from_definition("mine/Thing", "int8 x\n")
+    assert types.message("mine/Thing") is learned
+    assert types.from_definition("mine/Thing", "int8 x # again\n") is learned
+    other = types.from_definition("std_msgs/String", "int8 x\n")
+    assert types.message("std_msgs/String") is not other
+
+
+def test_the_full_text_lists_each_needed_type_once_depth_first() -> None:
+    text = TypeRegistry().message("geometry_msgs/PoseWithCovarianceStamped").definition
+    parts = [line for line in text.splitlines() if line.startswith("MSG: ")]
+    assert parts == [
+        "MSG: std_msgs/Header",
+        "MSG: geometry_msgs/PoseWithCovariance",
+        "MSG: geometry_msgs/Pose",
+        "MSG: geometry_msgs/Point",
+        "MSG: geometry_msgs/Quaternion",
+    ]
+    assert text.count("=" * 80 + "\n") == 5
+
+
+def _system_ros() -> dict[str, list[str]]:
+    """Return md5sum and full text of Debian's generated classes; empty where ROS is not installed."""
+    program = (
+        "import json, std_msgs.msg, rosgraph_msgs.msg, roscpp.msg\n"
+        "modules = [std_msgs.msg, rosgraph_msgs.msg, roscpp.msg]\n"
+        "classes = [c for m in modules for c in vars(m).values() if hasattr(c, '_md5sum')]\n"
+        "print(json.dumps({c._type: [c._md5sum, c._full_text] for c in classes}))\n"
+    )
+    try:
+        done = subprocess.run(
+            [SYSTEM_PYTHON, "-c", program], capture_output=True, text=True, check=True, timeout=30
+        )
+    except (OSError, subprocess.SubprocessError):
+        return {}
+    found: dict[str, list[str]] = json.loads(done.stdout)
+    return found
+
+
+def test_checksum_and_full_text_are_those_of_installed_ros_classes() -> None:
+    classes = _system_ros()
+    if not classes:
+        pytest.skip(f"{SYSTEM_PYTHON} has no std_msgs, rosgraph_msgs or roscpp")
+    types = TypeRegistry(PackageIndex(["/usr/share"]))
+    for name, (md5sum, full_text) in classes.items():
+        assert types.message(name).md5sum == md5sum, name
+        # genpy's classes may carry the text without its last line end.
+        assert types.message(name).definition.rstrip("\n") == full_text.rstrip("\n"), name
+
+
+def test_builtin_definitions_are_those_of_installed_packages() -> None:
+    folders = [Path("/usr/share") / package for package in SYSTEM_PACKAGES]
+    if not all(folder.is_dir() for folder in folders):
+        pytest.skip(f"not all of {', '.join(SYSTEM_PACKAGES)} are installed in /usr/share")
+    installed, builtin = TypeRegistry(PackageIndex(["/usr/share"])), TypeRegistry(PackageIndex([]))
+    for folder in folders:
+        for file in folder.glob("msg/*.msg"):
+            name = f"{folder.name}/{file.stem}"
+            assert builtin.message(name).md5sum == installed.message(name).md5sum, name
+        for file in folder.glob("srv/*.srv"):
+            name = f"{folder.name}/{file.stem}"
+            assert builtin.service(name).md5sum == installed.service(name).md5sum, name

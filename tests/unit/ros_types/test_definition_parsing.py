@@ -1,0 +1,135 @@
+"""Reading definition texts, and what is refused."""
+
+from pathlib import Path
+
+import pytest
+
+from rce.ros.packages import PackageIndex
+from rce.ros.types import BadDefinition, TypeRegistry, UnknownType
+from rce.ros.types.definition import parse_message, parse_service, split_full_text
+
+
+def test_fields_know_their_type_and_array() -> None:
+    fields = parse_message(
+        "my_pkg/All",
+        "Header header\nPoint[3] corners\nother/Thing[] things # why\n\n  uint8[16]\tid\nstring s\n",
+    ).fields
+    assert [(field.name, field.type, field.is_array, field.length) for field in fields] == [
+        ("header", "std_msgs/Header", False, None),
+        ("corners", "my_pkg/Point", True, 3),
+        ("things", "other/Thing", True, None),
+        ("id", "uint8", True, 16),
+        ("s", "string", False, None),
+    ]
+
+
+def test_constants_have_values_of_their_type() -> None:
+    constants = parse_message(
+        "p/C",
+        "int8 A=-1\nuint32 B = 0x10 # hex\nfloat32 C=1e3\nbool D=True\n"
+        "string E= has # and = inside  \nint32 F=010",
+    ).constants
+    assert {constant.name: constant.value for constant in constants} == {
+        "A": -1,
+        "B": 16,
+        "C": 1000.0,
+        "D": True,
+        "E": "has # and = inside",
+        "F": 10,
+    }
+
+
+@pytest.mark.parametrize(
+    ("line", "part"),
+    [
+        ("string", "'string' is neither"),
+        ("string a b", "is neither"),
+        ("str!ng a", "is not a type"),
+        ("a/b/c d", "is not a type"),
+        ("uint8 9a", "is not a field name"),
+        ("uint8[-1] a", "is not a type"),
+        ("uint8[99999999] a", "longer than"),
+        ("uint8 A=300", "out of the range of uint8"),
+        ("uint8 A=x", "invalid literal"),
+        ("bool A=maybe", "is not a bool"),
+        ("time A=1", "cannot be of type time"),
+        ("p/Other A=1", "cannot be of type p/Other"),
+        ("uint8 first", "'first' is declared twice"),
+    ],
+)
+def test_a_fault_is_told_with_file_and_line(line: str, part: str) -> None:
+    with pytest.raises(BadDefinition) as caught:
+        parse_message("p/T", f"# a comment\nuint8 first\n{line}\n", "/some/T.msg")
+    assert caught.value.line == 3
+    assert str(caught.value).startswith("/some/T.msg:3: ")
+    assert part in str(caught.value)
+
+
+def test_a_service_is_a_request_and_a_response_with_lines_of_the_file() -> None:
+    request, response = parse_service("p/S", "int64 a\n  ---  \nint64 sum\n")
+    assert [field.name for field in request.fields] == ["a"]
+    assert [(field.name, field.line) for field in response.fields] == [("sum", 3)]
+    with pytest.raises(BadDefinition) as caught:
+        parse_service("p/S", "int64 a\n---\nbad\n", "S.srv")
+    assert caught.value.line == 3
+
+
+@pytest.mark.parametrize("text", ["int64 a\n", "---\n---\n"])
+def test_a_service_has_exactly_one_separator(text: str) -> None:
+    with pytest.raises(BadDefinition, match="one '---' line"):
+        parse_service("p/S", text)
+
+
+def test_a_full_text_is_split_and_a_wrong_part_refused() -> None:
+    separator = "=" * 80
+    parts = dict(split_full_text("a/A", f"b/B b\n\n{separator}\nMSG: b/B\nint8 x\n"))
+    assert parts == {"a/A": "b/B b\n", "b/B": "int8 x\n"}
+    with pytest.raises(BadDefinition, match="not with 'MSG: '"):
+        list(split_full_text("a/A", f"int8 x\n{separator}\nb/B\n"))
+
+
+def test_a_type_that_holds_itself_is_refused() -> None:
+    separator = "=" * 80
+    with pytest.raises(BadDefinition, match="a/A > a/B > a/A"):
+        TypeRegistry().from_definition("a/A", f"B b\n{separator}\nMSG: a/B\nA[] a\n")
+
+
+def test_an_unknown_type_is_told_with_the_place_that_needs_it(tmp_path: Path) -> None:
+    messages = tmp_path / "mine" / "msg"
+    messages.mkdir(parents=True)
+    (messages / "Outer.msg").write_text("int8 x\nmine/Inner inner\n")
+    types = TypeRegistry(PackageIndex([tmp_path]))
+    with pytest.raises(UnknownType) as caught:
+        types.message("mine/Outer")
+    assert caught.value.name == "mine/Inner"
+    assert f"no file {messages / 'Inner.msg'}" in str(caught.value)
+    assert f"{messages / 'Outer.msg'}:2" in str(caught.value)
+    with pytest.raises(UnknownType, match=f"no package nowhere on the package path \\({tmp_path}\\)"):
+        types.service("nowhere/Thing")
+    with pytest.raises(UnknownType, match="named package/Type"):
+        types.message("../../etc/passwd")
+
+
+def test_a_package_wins_over_a_builtin_definition(tmp_path: Path) -> None:
+    (tmp_path / "std_msgs" / "msg").mkdir(parents=True)
+    (tmp_path / "std_msgs" / "msg" / "String.msg").write_text("# mine\nstring data\nint8 more\n")
+    string = TypeRegistry(PackageIndex([tmp_path])).message("std_msgs/String")
+    assert [field.name for field in string.fields] == ["data", "more"]
+    assert string.definition == "# mine\nstring data\nint8 more\n"
+
+
+def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "p" / "msg").mkdir(parents=True)
+    (tmp_path / "p" / "msg" / "T.msg").write_bytes(b"string \xff\n")
+    with pytest.raises(BadDefinition, match="not UTF-8"):
+        TypeRegistry(PackageIndex([tmp_path])).message("p/T")
+
+
+def test_an_empty_package_path_of_the_environment_is_no_path(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "p" / "srv").mkdir(parents=True)
+    (tmp_path / "p" / "srv" / "S.srv").write_text("---\n")
+    monkeypatch.setenv("RCE_PACKAGE_PATH", "")
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path))
+    assert TypeRegistry().service("p/S").md5sum == "d41d8cd98f00b204e9800998ecf8427e"
