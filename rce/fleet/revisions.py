@@ -1,7 +1,7 @@
 """How the number of a list of cells travels in a ``std_msgs/Int32MultiArray``.
 
-The array's one dimension is labelled ``revision=17``. Who does not number lists leaves the label as it likes, and
-who does not care need not look at it.
+The array's one dimension is labelled ``revision=17``. Who does not number lists leaves the label as it
+likes, and who does not care need not look at it.
 """
 
 from __future__ import annotations

@@ -7,6 +7,7 @@ from math import pi
 from random import Random
 from typing import TYPE_CHECKING
 
+from rce.fleet.dijkstra import shortest_path
 from rce.fleet.exceptions import ScenarioError
 
 if TYPE_CHECKING:
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from rce.fleet.grid import GridMap
 
 _ATTEMPTS = 1000
+_HEADINGS = (0.0, pi / 2, pi, -pi / 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +55,9 @@ def make_scenario(
 ) -> Scenario:
     """Draw a scenario; the same arguments make the same one.
 
-    Free cells that could reach one another still can with all boxes in place, and one more cell can be blocked
-    without parting them: nobody's goal is cut off.
+    Robots and boxes are drawn from the largest part of the map whose cells can reach one another, and they
+    still can with all boxes in place. A hidden box stands on the shortest way of a robot if that is possible,
+    so that somebody finds it.
 
     Raises:
         ScenarioError: The map has no room for so many robots and boxes.
@@ -64,20 +67,21 @@ def make_scenario(
     boxes_wanted = known_boxes + hidden_boxes
     # Robots need some cells to get around one another.
     if robots < 1 or 2 * robots + boxes_wanted > len(room):
-        raise ScenarioError(
-            f"{robots} robots and {boxes_wanted} boxes do not fit into {len(room)} free cells"
-        )
+        raise ScenarioError(f"{robots} robots and {boxes_wanted} boxes do not fit into {len(room)} cells")
     for _ in range(_ATTEMPTS):
-        boxes = rng.sample(room, boxes_wanted)
-        left = sorted(set(room) - set(boxes))
-        if not grid.with_blocked(grid.blocked.union(boxes)).connected(left):
-            continue
-        starts, goals = rng.sample(left, robots), rng.sample(left, robots)
+        starts, goals = rng.sample(room, robots), rng.sample(room, robots)
         if any(start == goal for start, goal in zip(starts, goals, strict=True)):
             continue
-        headings = tuple(rng.choice((0.0, pi / 2, pi, -pi / 2)) for _ in starts)
-        known, hidden = tuple(sorted(boxes[:known_boxes])), tuple(sorted(boxes[known_boxes:]))
-        return Scenario(grid, tuple(starts), headings, tuple(goals), known, hidden)
+        spare = sorted(set(room).difference(starts, goals))
+        rng.shuffle(spare)
+        known = _place_boxes(grid, spare, known_boxes)
+        told = grid.with_blocked(grid.blocked.union(known))
+        ways = [cell for robot in range(robots) for cell in _way(told, starts[robot], goals[robot])]
+        rng.shuffle(ways)
+        hidden = _place_boxes(told, [cell for cell in [*ways, *spare] if cell in spare], hidden_boxes)
+        if len(known) + len(hidden) == boxes_wanted:
+            headings = tuple(rng.choice(_HEADINGS) for _ in starts)
+            return Scenario(grid, tuple(starts), headings, tuple(goals), known, hidden)
     raise ScenarioError(f"no scenario was found for {robots} robots and {boxes_wanted} boxes")
 
 
@@ -94,7 +98,7 @@ def given_scenario(grid: GridMap, pairs: Iterable[tuple[int, int]], *, seed: int
     for start, goal in zip(starts, goals, strict=True):
         if not grid.connected((start, goal)):
             raise ScenarioError(f"no way leads from cell {start} to cell {goal}")
-    headings = tuple(rng.choice((0.0, pi / 2, pi, -pi / 2)) for _ in starts)
+    headings = tuple(rng.choice(_HEADINGS) for _ in starts)
     return Scenario(grid, starts, headings, goals, (), ())
 
 
@@ -128,6 +132,23 @@ def midway_cell(
             ):
                 return cell
     return None
+
+
+def _place_boxes(grid: GridMap, candidates: Sequence[int], count: int) -> tuple[int, ...]:
+    """The first ``count`` cells that can be blocked without parting the cells around them, ascending."""
+    placed: list[int] = []
+    for cell in candidates:
+        if len(placed) == count:
+            break
+        shut = grid.with_blocked({*grid.blocked, *placed, cell})
+        if cell not in placed and shut.connected(shut.neighbours[cell]):
+            placed.append(cell)
+    return tuple(sorted(placed))
+
+
+def _way(grid: GridMap, start: int, goal: int) -> list[int]:
+    """Cells of the shortest way between two cells, without both."""
+    return (shortest_path(grid, start, goal) or [])[1:-1]
 
 
 def _largest_part(grid: GridMap) -> list[int]:

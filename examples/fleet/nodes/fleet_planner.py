@@ -2,7 +2,8 @@
 """Steers a fleet: gives every robot cells of the map to drive on, so that no two ever claim the same one.
 
 A robot is whatever publishes ``/NAME/amcl_pose`` and has a move client. The work is done by
-:mod:`rce.fleet.coordination`; this node carries messages to it and from it. README.md lists topics and parameters.
+:mod:`rce.fleet.coordination`; this node carries messages to it and from it. README.md lists topics and
+parameters.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from rce.fleet.coordination.events import (
     CellFreed,
     Event,
     GoalSet,
+    Instruction,
     ObstacleSeen,
     PoseSeen,
     Reply,
@@ -38,6 +40,7 @@ from rce.fleet.move_client import ClientReport, ClientState
 from rce.fleet.movingai import read_map
 from rce.fleet.occupancy import occupancy
 from rce.fleet.revisions import numbered_array
+from rce.ros.errors import MasterError
 from rce.ros.node import Node
 from rce.ros.node.master import MasterClient
 from rce.ros.types import Time
@@ -100,10 +103,13 @@ class PlannerNode:
         async with RpcClient() as rpc:
             master = MasterClient(self._node.master_uri, self._node.name, self._node.uri, rpc)
             while True:
-                for topic, _ in await master.call("getPublishedTopics", ""):
-                    found = ROBOT_TOPIC.fullmatch(topic)
-                    if found is not None and found[1] not in self._cells:
-                        await self._join(found[1])
+                try:
+                    for topic, _ in await master.call("getPublishedTopics", ""):
+                        found = ROBOT_TOPIC.fullmatch(topic)
+                        if found is not None and found[1] not in self._cells:
+                            await self._join(found[1])
+                except MasterError as error:
+                    self._node.log.warning("cannot look for robots: %s", error)
                 if not await self._node.sleep(LOOK_AROUND):
                     return
 
@@ -114,17 +120,17 @@ class PlannerNode:
         await node.subscribe(
             f"/{robot}/moveClient/status",
             "fleet/MoveStatus",
-            lambda message: self._handle(ReportSeen(robot, _report(message))),
+            lambda message: self._take(ReportSeen(robot, _report(message))),
         )
         await node.subscribe(
             f"/{robot}/blockedCells",
             "std_msgs/Int32MultiArray",
-            lambda message: self._handle(ObstacleSeen(robot, tuple(message.data))),
+            lambda message: self._take(ObstacleSeen(robot, tuple(message.data))),
         )
         await node.subscribe(
             f"/{robot}/amcl_pose",
             "geometry_msgs/PoseWithCovarianceStamped",
-            lambda message: self._handle(_pose(robot, message)),
+            lambda message: self._take(_pose(robot, message)),
         )
         node.log.info("%s is here", robot)
 
@@ -147,15 +153,19 @@ class PlannerNode:
     # -- what goes out ------------------------------------------------------------------------------
 
     def _ask(self, event: Event) -> dict[str, Any]:
-        reply = self._handle(event)
-        assert reply is not None, "every request is answered"
+        """Give a request to the planner; the fields of the response."""
+        reply = next(done for done in self._handle(event) if isinstance(done, Reply))
         self._node.log.info("%s", reply.message)
         return {"ok": reply.ok, "message": reply.message}
 
-    def _handle(self, event: Event) -> Reply | None:
+    def _take(self, event: Event) -> None:
+        """Give an event to the planner."""
+        self._handle(event)
+
+    def _handle(self, event: Event) -> list[Instruction]:
         """Give an event to the planner and do what it says."""
-        reply = None
-        for instruction in self._planner.handle(event, time.monotonic()):
+        instructions = self._planner.handle(event, time.monotonic())
+        for instruction in instructions:
             match instruction:
                 case SendCells(robot, revision, cells):
                     self._cells[robot].publish(numbered_array(cells, revision))
@@ -165,9 +175,7 @@ class PlannerNode:
                     self._publish_blocked(cells)
                 case StateChanged():
                     self._state_changed = True
-                case Reply():
-                    reply = instruction
-        return reply
+        return instructions
 
     def _publish_blocked(self, cells: tuple[int, ...]) -> None:
         self._blocked.publish(data=list(cells))
@@ -270,7 +278,7 @@ async def main() -> None:
     async with Node("fleet_planner") as node:
         values = await read_parameters(node)
         settings = FleetSettings(
-            robot_radius=float(values.get("robot_radius", FleetSettings.robot_radius)),
+            robot_radius=float(values.get("robot_radius", FleetSettings().robot_radius)),
             seed=int(values.get("seed", 0)),
         )
         planner = FleetPlanner(make_grid(values), settings)

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Sends a robot along the cells that it was granted, goal by goal. Runs in the robot's namespace.
 
-The work is done by :mod:`rce.fleet.move_client`; this node carries messages to it and from it. README.md lists
-the topics.
+The work is done by :mod:`rce.fleet.move_client`; this node carries messages to it and from it. README.md
+lists the topics.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class MoveClientNode:
         try:
             self._do(self._client.take_cells(revision, list(message.data), time.time()))
         except ValueError as error:
-            self._node.log.error("refused a list of cells: %s", error)
+            self._node.log.warning("refused a list of cells: %s", error)
 
     def _take_cancel(self, message: Message) -> None:
         if self._client is not None and message.data:
