@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 Buffer = bytes | bytearray | memoryview
 """What a serialized message is read from."""
 
+LARGE = 1 << 16
+"""Bytes above which a message is read through a view, whose slices copy nothing but cost more than small copies."""
+
 
 class Field(NamedTuple):
     """A field of a message type."""

@@ -9,7 +9,7 @@ from rce.ros.types.arrays import BOOL_BYTES, pack_bools, pack_numbers, pack_octe
 from rce.ros.types.codegen import FAULTS, Code
 from rce.ros.types.exceptions import SerializationError
 from rce.ros.types.faults import array_fault, find_fault, read_fault
-from rce.ros.types.message import Message, attribute, default_value
+from rce.ros.types.message import LARGE, Message, attribute, default_value
 from rce.ros.types.readers import ReaderBuilder
 from rce.ros.types.values import NUMBERS, Duration, Time
 from rce.ros.types.writers import WriterBuilder
@@ -67,6 +67,8 @@ def make_codec(kind: MessageType) -> tuple[Callable[[Message], bytes], Callable[
         return data
 
     def deserialize(buffer: Buffer) -> Message:
+        if len(buffer) > LARGE:
+            buffer = memoryview(buffer)
         try:
             message, end = read(buffer, 0)
         except FAULTS as error:
