@@ -21,7 +21,7 @@ Buffer = bytes | bytearray | memoryview
 """What a serialized message is read from."""
 
 LARGE = 1 << 16
-"""Bytes above which a message is read through a view, whose slices copy nothing but cost more than small copies."""
+"""Bytes above which a message is read through a view: slicing it copies nothing."""
 
 
 class Field(NamedTuple):
