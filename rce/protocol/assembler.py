@@ -87,7 +87,34 @@ class Assembler:
         Raises:
             AssemblyError: A reference in it is wrong; the message is refused.
         """
-        places = self._claim_places(value)
+        return self._await(value, self._claim_places(value), size, now)
+
+    def add_single(
+        self, value: Any, id_: str, holder: list[Any], size: int, now: float
+    ) -> tuple[bool, list[str]]:
+        """Take a message of which it is known already that it refers to one binary value only.
+
+        Args:
+            value: What :meth:`add_binary` returns when it is complete.
+            id_: The id that it refers to, 32 hexadecimal characters.
+            holder: A list of one element, where the binary value is put.
+            size: As for :meth:`add_message`.
+            now: Seconds on the caller's clock.
+
+        Returns:
+            As :meth:`add_message`.
+
+        Raises:
+            AssemblyError: Another message refers to that id.
+        """
+        if id_ in self._awaited:
+            raise AssemblyError(f"binary value {id_} is referred to twice")
+        return self._await(value, {id_: (holder, 0)}, size, now)
+
+    def _await(
+        self, value: Any, places: dict[str, tuple[Any, Any]], size: int, now: float
+    ) -> tuple[bool, list[str]]:
+        """Put in place what is there already, and wait for the rest."""
         found = [self._unclaimed[id_] for id_ in places if id_ in self._unclaimed]
         for unclaimed in found:
             self._forget(unclaimed)

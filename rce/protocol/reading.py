@@ -8,19 +8,21 @@ from __future__ import annotations
 
 import json
 import re
-from typing import TYPE_CHECKING, Any, AnyStr, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, AnyStr, Literal, TypeVar
 
 import msgspec
-from msgspec import Struct
+from msgspec import UNSET, Meta, Struct, UnsetType, field
 
 from rce.protocol.exceptions import MessageError
 from rce.protocol.limits import DEFAULT_LIMITS
 from rce.protocol.messages import (
     HUMAN_PATTERNS,
+    NO_ID,
     REQUEST_TYPES,
     TYPES,
     AddInterface,
     AddNode,
+    ClassName,
     ClientMessage,
     ConfigureComponents,
     ConfigureConnections,
@@ -28,6 +30,8 @@ from rce.protocol.messages import (
     DataMessage,
     DeleteParam,
     ErrorReport,
+    MessageId,
+    Name,
     RemoveInterface,
     RemoveNode,
     Request,
@@ -46,7 +50,25 @@ class _DataFrame(Struct):
     data: DataMessage
 
 
+class SerializedData(Struct):
+    """A data message that travels serialized, as its text frame tells it."""
+
+    i_tag: Name = field(name="iTag")
+    type: ClassName
+    binary: Annotated[str, Meta(pattern=r"^[0-9A-Fa-f]{32}\Z")] = field(name="msg*")
+    """The id of the binary frame."""
+    msg_id: MessageId = field(name="msgID", default=NO_ID)
+    msg: UnsetType = UNSET
+    """Must not be there beside ``msg*``."""
+
+
+class _SerializedFrame(Struct):
+    type: Literal["DM"]
+    data: SerializedData
+
+
 _decode_data_frame = msgspec.json.Decoder(_DataFrame).decode
+_decode_serialized_frame = msgspec.json.Decoder(_SerializedFrame).decode
 _decode_any = msgspec.json.Decoder().decode
 
 _DECODE_FAULTS = (msgspec.MsgspecError, UnicodeError, RecursionError)
@@ -98,6 +120,18 @@ def decode_data(text: str | bytes) -> DataMessage | None:
     """Read a data message, the quick way. ``None``: it is another type or wrong, the slow way tells which."""
     try:
         return _decode_data_frame(text).data
+    except _DECODE_FAULTS:
+        return None
+
+
+def decode_serialized(text: str | bytes) -> SerializedData | None:
+    """Read a data message that is one binary value, the quick way. ``None``: take the slow way."""
+    stars = text.count('*"') if isinstance(text, str) else text.count(b'*"')
+    escaped = "\\" in text if isinstance(text, str) else b"\\" in text
+    if stars != 1 or escaped:
+        return None
+    try:
+        return _decode_serialized_frame(text).data
     except _DECODE_FAULTS:
         return None
 

@@ -18,8 +18,17 @@ from rce.protocol.messages import (
     DOWNWARD,
     UPWARD,
     ClientMessage,
+    DataMessage,
 )
-from rce.protocol.reading import check_depth, decode_data, is_shallow, message_from_json, parse_json
+from rce.protocol.reading import (
+    SerializedData,
+    check_depth,
+    decode_data,
+    decode_serialized,
+    is_shallow,
+    message_from_json,
+    parse_json,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -35,6 +44,21 @@ class Fault(Struct, frozen=True):
 
 Event: TypeAlias = ClientMessage | Fault
 """What comes out of a stream."""
+
+
+class _Serialized:
+    """A data message that waits for its one binary value; most that Forwarders get is such."""
+
+    __slots__ = ("_data", "holder")
+
+    def __init__(self, data: SerializedData) -> None:
+        self._data = data
+        self.holder: list[Any] = [None]
+
+    def message(self) -> DataMessage:
+        """Return the message with the bytes that were put into ``holder``."""
+        data = self._data
+        return DataMessage(data.i_tag, data.type, self.holder[0], data.msg_id)
 
 
 class ProtocolStream:
@@ -95,6 +119,12 @@ class ProtocolStream:
             if message is not None:
                 return [message]
         try:
+            if shallow and starred and (data := decode_serialized(text)) is not None:
+                partial = _Serialized(data)
+                complete, dropped = self._assembler.add_single(
+                    partial, data.binary, partial.holder, len(text), now
+                )
+                return self._events(partial if complete else None, dropped)
             value = parse_json(text)
             if not shallow:
                 check_depth(value, limits.max_depth)
@@ -103,10 +133,7 @@ class ProtocolStream:
             complete, dropped = self._assembler.add_message(value, len(text), now)
         except ProtocolError as error:
             return [Fault(str(error))]
-        events: list[Event] = [Fault(reason) for reason in dropped]
-        if complete:
-            events.append(self._message(value))
-        return events
+        return self._events(value if complete else None, dropped)
 
     def feed_binary(self, frame: Binary, now: float) -> list[Event]:
         """Take a binary frame, which is kept and must not be changed afterwards.
@@ -122,15 +149,22 @@ class ProtocolStream:
             value, dropped = self._assembler.add_binary(frame, now)
         except ProtocolError as error:
             return [Fault(str(error))]
-        if value is not None:
-            return [self._message(value)]
-        return [Fault(reason) for reason in dropped]
+        return self._events(value, dropped)
 
     def expire(self, now: float) -> list[Event]:
         """Drop what has been incomplete for too long."""
         return [Fault(reason) for reason in self._assembler.expire(now)]
 
+    def _events(self, value: Any, dropped: list[str]) -> list[Event]:
+        """Make the events of a complete message, if there is one, and of what had to be dropped for it."""
+        events: list[Event] = [Fault(reason) for reason in dropped] if dropped else []
+        if value is not None:
+            events.append(self._message(value))
+        return events
+
     def _message(self, value: Any) -> Event:
+        if type(value) is _Serialized:
+            return value.message()
         try:
             return message_from_json(value, self._accept)
         except ProtocolError as error:

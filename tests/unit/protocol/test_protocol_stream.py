@@ -300,3 +300,48 @@ def test_no_frame_raises_and_memory_stays_bounded(frames: list[Frame]) -> None:
         assert 0 <= stream.pending_bytes <= 400
     stream.expire(1e9)
     assert (stream.pending, stream.pending_bytes) == (0, 0)
+
+
+def serialized(id_: str, **more: Any) -> str:
+    return json.dumps({"type": "DM", "data": {"iTag": "i", "type": "a/B", "msg*": id_, **more}})
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        (serialized("short"), "an id must be"),
+        (serialized(ID, msg={}), "there is a value 'msg' already"),
+        (serialized(ID, msgID="x" * 256), None),
+        (serialized(ID, iTag="9"), None),
+    ],
+)
+def test_wrong_serialized_message_is_refused(text: str, problem: str | None) -> None:
+    stream = ProtocolStream.for_engine()
+    events = [*stream.feed(text, 0.0), *stream.feed(binary(ID, b"x"), 0.0)]
+    (fault,) = events
+    assert isinstance(fault, Fault)
+    assert problem is None or problem in fault.text
+
+
+def test_second_serialized_message_with_the_same_id_is_refused() -> None:
+    stream = ProtocolStream.for_engine()
+    assert stream.feed(serialized(ID), 0.0) == []
+    assert stream.feed(serialized(ID), 0.0) == [Fault(f"binary value {ID} is referred to twice")]
+    (message,) = stream.feed(binary(ID, b"x"), 0.0)
+    assert isinstance(message, DataMessage)
+
+
+def test_serialized_message_expires_and_leaves_nothing() -> None:
+    stream = ProtocolStream.for_engine()
+    stream.feed(serialized(ID), 0.0)
+    assert len(stream.expire(60.0)) == 1
+    assert (stream.pending, stream.pending_bytes) == (0, 0)
+
+
+def test_serialized_message_with_another_binary_beside_it() -> None:
+    stream = ProtocolStream.for_engine()
+    assert stream.feed(serialized(ID, **{"extra*": OTHER}), 0.0) == []
+    assert stream.feed(binary(ID, b"x"), 0.0) == []
+    (message,) = stream.feed(binary(OTHER, b"y"), 0.0)
+    assert isinstance(message, DataMessage)
+    assert bytes(message.msg) == b"x"
