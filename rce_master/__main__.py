@@ -29,7 +29,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
 @app.command()
-def command(  # noqa: PLR0917 - options of a command line
+def command(
     bind: Annotated[str, typer.Option(help="Address to listen on; all by default.")] = "",
     http_port: Annotated[int, typer.Option(help="For clients, REST and metrics.")] = HTTP_PORT,
     control_port: Annotated[int, typer.Option(help="For task sets.")] = CONTROL_PORT,

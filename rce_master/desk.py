@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rce.control.messages import ClientReply, ClientRequest, Left, Login, LoginReply, Status
@@ -28,6 +29,16 @@ MAX_PENDING = 1000
 _UNAUTHORIZED, _CONFLICT, _TOO_MANY, _UNAVAILABLE = 401, 409, 429, 503
 
 
+@dataclass(eq=False, slots=True)
+class _Visit:
+    """A login in work."""
+
+    process: str
+    id: str
+    left: bool = False
+    """Whether the robot left meanwhile."""
+
+
 class Desk:
     """Takes what task sets send: reports go on to the reconciler, questions are answered here.
 
@@ -41,8 +52,7 @@ class Desk:
         self._authenticator = authenticator
         self._pending = asyncio.Semaphore(MAX_PENDING)
         self._group = asyncio.TaskGroup()
-        self._entering: dict[tuple[str, str], bool] = {}
-        """Process and robot of logins in work, and whether the robot left meanwhile."""
+        self._visits: set[_Visit] = set()
 
     async def run(self) -> None:
         """Answer until cancelled."""
@@ -62,7 +72,9 @@ class Desk:
         process = peer.process
         match message:
             case Login():
-                await self._spawn(self._login(peer, message))
+                visit = _Visit(process, f"{message.user}/{message.robot}")
+                self._visits.add(visit)
+                await self._spawn(self._login(peer, message, visit))
             case ClientRequest():
                 await self._request(peer, message)
             case _:
@@ -75,19 +87,15 @@ class Desk:
 
     # Logins
 
-    async def _login(self, peer: Peer, login: Login) -> None:
-        process = peer.process
-        id_ = f"{login.user}/{login.robot}"
-        self._entering[process, id_] = False
+    async def _login(self, peer: Peer, login: Login, visit: _Visit) -> None:
         try:
-            reply = await self._answer_login(process, id_, login)
+            reply = await self._answer_login(visit.process, visit.id, login)
         finally:
-            left = self._entering.pop((process, id_))
+            self._visits.discard(visit)
         peer.send(reply)
-        if left and reply.endpoint is not None:
-            await self._realm.enqueue(
-                [commands.RobotLeft(process=process, id=id_, reason="left at the door")]
-            )
+        if visit.left and reply.endpoint is not None:
+            gone = commands.RobotLeft(process=visit.process, id=visit.id, reason="it left while it logged in")
+            await self._realm.enqueue([gone])
 
     async def _answer_login(self, process: str, id_: str, login: Login) -> LoginReply:
         try:
@@ -115,8 +123,9 @@ class Desk:
                 id_ = message.status.id
             case _:
                 return
-        if (process, id_) in self._entering:
-            self._entering[process, id_] = True
+        for visit in self._visits:
+            if (visit.process, visit.id) == (process, id_):
+                visit.left = True
 
     # Requests
 

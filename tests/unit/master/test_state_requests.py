@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from support.master_world import World
 
-from rce.control.model import ParameterSpec
+from rce.control.model import ParameterSpec, ParameterValue
 from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound, Refused
 from rce_master.state import commands
 from rce_master.state.records import UserRole
@@ -147,10 +147,11 @@ def test_users_do_not_see_each_other(world: World) -> None:
 def test_parameters_are_set_and_replaced(world: World) -> None:
     world.wired()
 
-    def set_(value: object) -> None:
-        world.do(commands.SetParameter(user="anna", container="c", name="p", value=value))  # type: ignore[arg-type]
+    def set_(value: ParameterValue) -> None:
+        world.do(commands.SetParameter(user="anna", container="c", name="p", value=value))
 
-    for value in (1, True, 1.0, "one", [1, "a", False]):
+    values: list[ParameterValue] = [1, True, 1.0, "one", [1, "a", False]]
+    for value in values:
         before = revision(world, "c")
         set_(value)
         (found,) = world.spec("c").parameters
@@ -175,13 +176,12 @@ def test_a_refused_command_changes_nothing_and_uses_no_number() -> None:
     world.wired()
     world.node("c", "n")
     before = {table.name: list(table) for table in world.state.tables.all}
-    for refused in (
-        lambda: world.container("other"),
-        lambda: world.interface("c/more", "PublisherInterface"),
-        lambda: world.node("c", "more"),
-    ):
-        with pytest.raises(LimitReached):
-            refused()
+    with pytest.raises(LimitReached):
+        world.container("other")
+    with pytest.raises(LimitReached):
+        world.interface("c/more", "PublisherInterface")
+    with pytest.raises(LimitReached):
+        world.node("c", "more")
     with pytest.raises(Refused):
         world.login("rob")
     assert {table.name: list(table) for table in world.state.tables.all} == before

@@ -1,0 +1,160 @@
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+from argon2 import PasswordHasher
+
+from rce.config.secret import Secret
+from rce.control.channel import TaskSetChannel
+from rce.control.messages import (
+    CONTROL_VERSION,
+    Hello,
+    LogChunk,
+    MachineInfo,
+    ReadLog,
+    Status,
+    Sync,
+    TaskSetKind,
+    ToTaskSet,
+)
+from rce.control.model import EndpointStatus
+from rce_master.master import Master, RunningMaster
+from rce_master.settings import LOOPBACK, MasterSettings
+from rce_master.store import MemoryStore, Store
+
+SECRET = Secret("a secret for the tests")
+HASHER = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
+
+
+class TaskSet:
+    """A task set on a real control channel."""
+
+    def __init__(self, master: RunningMaster, kind: TaskSetKind, process: str, **hello: Any) -> None:
+        self.kind = kind
+        self.process = process
+        self.fields = hello
+        self.endpoints: tuple[EndpointStatus, ...] = ()
+        self.inbox: asyncio.Queue[ToTaskSet] = asyncio.Queue()
+        self.log = b""
+        url = f"ws://{LOOPBACK}:{master.control_port}/"
+        self.channel = TaskSetChannel(url, SECRET, self.hello, self.handle)
+
+    def hello(self) -> Hello:
+        return Hello(
+            version=CONTROL_VERSION,
+            kind=self.kind,
+            process=self.process,
+            machine=MachineInfo(name="machine", cores=2),
+            endpoints=self.endpoints,
+            **self.fields,
+        )
+
+    async def handle(self, message: ToTaskSet) -> None:
+        if isinstance(message, ReadLog):
+            text = self.log[message.offset :][: message.limit].decode()
+            offset = message.offset + len(text)
+            self.channel.send(LogChunk(request=message.request, offset=offset, text=text))
+        else:
+            self.inbox.put_nowait(message)
+
+    async def get(self, kind: type[Any]) -> Any:
+        async with asyncio.timeout(10):
+            while True:
+                message = await self.inbox.get()
+                if isinstance(message, kind):
+                    return message
+
+    def report(self, status: EndpointStatus) -> None:
+        self.channel.send(Status(status=status))
+
+
+class Site:
+    """A running master and ways to use it."""
+
+    def __init__(self, master: RunningMaster, session: aiohttp.ClientSession) -> None:
+        self.master = master
+        self.session = session
+        self.token = ""
+
+    @property
+    def url(self) -> str:
+        return self.master.url
+
+    async def api(
+        self,
+        method: str,
+        path: str,
+        body: Any = None,
+        *,
+        token: str | None = None,
+        status: int = 200,
+        **query: Any,
+    ) -> Any:
+        """Use the REST API and check the status."""
+        headers = {"Authorization": f"Bearer {self.token if token is None else token}"}
+        async with self.session.request(
+            method, f"{self.url}api/v1{path}", json=body, params=query, headers=headers
+        ) as reply:
+            text = await reply.text()
+            assert reply.status == status, f"{reply.status}: {text}"
+            return await reply.json() if text else None
+
+    async def login(self, user: str = "testUser", password: str = "testUser") -> str:
+        reply = await self.api("POST", "/login", {"userID": user, "password": password}, token="")
+        return str(reply["token"])
+
+    @asynccontextmanager
+    async def task_set(self, kind: TaskSetKind, process: str, **fields: Any) -> AsyncIterator[TaskSet]:
+        made = TaskSet(self.master, kind, process, **fields)
+        task = asyncio.create_task(made.channel.run())
+        try:
+            await made.get(Sync)
+            yield made
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+    def robots(self, process: str = "r1") -> AbstractAsyncContextManager[TaskSet]:
+        return self.task_set(TaskSetKind.ROBOT, process, url=f"ws://{process}:9010/")
+
+    def containers(self, process: str = "c1") -> AbstractAsyncContextManager[TaskSet]:
+        return self.task_set(TaskSetKind.CONTAINER, process)
+
+
+@asynccontextmanager
+async def running_site(store: Store | None = None, **options: Any) -> AsyncIterator[Site]:
+    """Run a master in development mode on free ports."""
+    settings = MasterSettings(
+        bind=LOOPBACK, http_port=0, control_port=0, state_dir=Path("unused"), dev=True, **options
+    )
+    ready: asyncio.Future[RunningMaster] = asyncio.get_running_loop().create_future()
+    master = Master(settings, SECRET, store or MemoryStore(), hasher=HASHER)
+    task = asyncio.create_task(master.run(ready.set_result))
+    try:
+        await asyncio.wait([task, ready], return_when=asyncio.FIRST_COMPLETED)
+        if task.done():
+            await task
+        async with aiohttp.ClientSession() as session:
+            site = Site(ready.result(), session)
+            site.token = await site.login()
+            yield site
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+@pytest.fixture
+def run_site() -> Callable[..., AbstractAsyncContextManager[Site]]:
+    return running_site
+
+
+@pytest.fixture
+async def site() -> AsyncIterator[Site]:
+    async with running_site() as made:
+        yield made

@@ -1,0 +1,153 @@
+"""``rce-master`` and the commands as real processes: kill -9, restart, users."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import stat
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING
+
+import aiohttp
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SCRIPT = "from rce.cli.main import build_app; from importlib.metadata import EntryPoint;"
+COMMANDS = {
+    "user": "rce_master.cli.users:app",
+    "login": "rce_master.cli.session:login",
+    "logout": "rce_master.cli.session:logout",
+    "token": "rce_master.cli.session:token",
+    "ps": "rce_master.cli.show:ps",
+    "logs": "rce_master.cli.follow:logs",
+    "events": "rce_master.cli.follow:events",
+}
+
+
+def environment(folder: Path) -> dict[str, str]:
+    return {
+        **{key: value for key, value in os.environ.items() if not key.startswith("RCE_")},
+        "RCE_SECRET": "a secret for the tests",
+        "RCE_LOGIN_FILE": str(folder / "login.json"),
+        "XDG_STATE_HOME": str(folder / "home"),
+    }
+
+
+async def rce(folder: Path, command: str, *args: str, text: str = "", code: int = 0) -> str:
+    """Run a command of the ``rce`` program; returns what it printed."""
+    point = f"[EntryPoint({command!r}, {COMMANDS[command]!r}, 'rce.commands')]"
+    process = await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-c",
+        f"{SCRIPT} build_app({point})(prog_name='rce')",
+        command,
+        *args,
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
+        env=environment(folder),
+    )
+    output, _ = await process.communicate(text.encode())
+    assert process.returncode == code, output.decode()
+    return output.decode()
+
+
+@asynccontextmanager
+async def master(folder: Path, *args: str, end: signal.Signals = signal.SIGTERM) -> AsyncIterator[str]:
+    """Run ``rce-master`` and give its address."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable,
+        *(
+            "-m",
+            "rce_master",
+            "--http-port",
+            "0",
+            "--control-port",
+            "0",
+            "--state-dir",
+            str(folder / "state"),
+        ),
+        *args,
+        stdout=asyncio.subprocess.PIPE,
+        env=environment(folder),
+    )
+    try:
+        assert process.stdout is not None
+        line = (await asyncio.wait_for(process.stdout.readline(), 30)).decode()
+        assert line.startswith("rce-master ready: http://127.0.0.1:"), line
+        yield line.split()[-1]
+    finally:
+        process.send_signal(end)
+        code = await process.wait()
+    assert code == (0 if end != signal.SIGKILL else -signal.SIGKILL)
+
+
+async def test_what_was_accepted_survives_kill_9(tmp_path: Path) -> None:
+    async with master(tmp_path, "--dev", end=signal.SIGKILL) as url:
+        await rce(tmp_path, "login", url, "--user", "testUser", "--password-stdin", text="testUser\n")
+        headers = {"Authorization": f"Bearer {(await rce(tmp_path, 'token')).strip()}"}
+        async with aiohttp.ClientSession(headers=headers) as session:
+            for number in range(20):
+                async with session.post(f"{url}api/v1/containers", json={"tag": f"c{number}"}) as reply:
+                    assert reply.status == 204
+    async with master(tmp_path, "--dev", end=signal.SIGINT) as url, aiohttp.ClientSession() as session:
+        # The token is in the store too: nobody has to log in again.
+        async with session.get(f"{url}api/v1/containers", headers=headers) as reply:
+            found = (await reply.json())["containers"]
+    assert [c["tag"] for c in found] == [f"c{number}" for number in range(20)]
+
+
+async def test_users_in_the_state_folder_and_over_the_api(tmp_path: Path) -> None:
+    state = ("--state-dir", str(tmp_path / "state"))
+    await rce(tmp_path, "user", "add", "root", "--admin", "--password-stdin", *state, text="secret\n")
+    await rce(tmp_path, "user", "add", "anna", "--password-stdin", *state, text="one\n")
+    assert "is a user 'anna' already" in (
+        await rce(tmp_path, "user", "add", "anna", "--password-stdin", *state, text="x\n", code=1)
+    )
+    listed = await rce(tmp_path, "user", "list", *state)
+    assert "root" in listed
+    assert "admin" in listed
+    assert "not logged in" in await rce(tmp_path, "ps", code=1)
+    async with master(tmp_path, "--bind", "127.0.0.1") as url:
+        assert "a master is running" in await rce(tmp_path, "user", "list", *state, code=1)
+        refused = await rce(tmp_path, "login", url, "-u", "root", "--password-stdin", text="no\n", code=1)
+        assert "wrong password" in refused
+        await rce(tmp_path, "login", url, "-u", "root", "--password-stdin", text="secret\n")
+        assert stat.S_IMODE((tmp_path / "login.json").stat().st_mode) == 0o600
+        await rce(tmp_path, "user", "passwd", "anna", "--password-stdin", text="two\n")
+        await rce(tmp_path, "user", "remove", "anna")
+        assert "anna" not in await rce(tmp_path, "user", "list")
+        assert json.loads(await rce(tmp_path, "ps", "--json"))["robots"] == []
+        assert "container" in await rce(tmp_path, "ps")
+        assert "there is no container" in await rce(tmp_path, "logs", "c/n", code=1)
+        await rce(tmp_path, "logout")
+        assert "not logged in" in await rce(tmp_path, "token", code=1)
+
+
+async def test_a_master_that_cannot_start_says_why(tmp_path: Path) -> None:
+    env = environment(tmp_path)
+    del env["RCE_SECRET"]
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "rce_master", "--state-dir", str(tmp_path / "state")),
+        stderr=asyncio.subprocess.PIPE,
+        env=env,
+    )
+    _, errors = await process.communicate()
+    assert process.returncode == 1
+    assert b"secret" in errors
+    assert b"Traceback" not in errors
+    async with master(tmp_path, "--dev"):
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "rce_master", "--dev", "--state-dir", str(tmp_path / "state")),
+            stderr=asyncio.subprocess.PIPE,
+            env=environment(tmp_path),
+        )
+        _, errors = await process.communicate()
+        assert process.returncode == 1
+        assert b"a master is running" in errors
+        assert b"Traceback" not in errors

@@ -1,0 +1,38 @@
+from __future__ import annotations
+
+import asyncio
+
+from rce_master.events import EventLog
+from rce_master.state.changes import Happening
+
+
+def happening(text: str) -> Happening:
+    return Happening("kind", "anna", "anna/c", text)
+
+
+def test_ids_grow_over_a_restart() -> None:
+    old = EventLog(1000.0)
+    for _ in range(5):
+        old.add(happening("x"), 1000.0)
+    assert EventLog(1000.5).last_id > old.last_id
+
+
+def test_the_ring_keeps_the_newest() -> None:
+    log = EventLog(0.0, capacity=3)
+    for number in range(5):
+        log.add(happening(str(number)), 0.0)
+    assert [e.text for e in log.since(-1)] == ["2", "3", "4"]
+    assert [e.text for e in log.since(3)] == ["4"]
+    assert [e.text for e in log.since(-1, limit=1)] == ["2"]
+    assert log.since(log.last_id) == []
+    assert log.since(10**9) == []
+
+
+async def test_followers_wait_for_news() -> None:
+    log = EventLog(0.0)
+    waiting = [asyncio.ensure_future(log.wait(log.last_id, 30)) for _ in range(3)]
+    await asyncio.sleep(0)
+    log.add(happening("news"), 1.0)
+    for found in await asyncio.gather(*waiting):
+        assert [e.text for e in found] == ["news"]
+    assert await log.wait(log.last_id, 0.01) == []

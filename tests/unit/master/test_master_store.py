@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+import sqlite3
+import stat
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rce_master.exceptions import StoreBusy, StoreError
+from rce_master.store import MemoryStore, Row, SqliteStore
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from rce_master.store import Store
+
+
+async def check_round_trip(store: Store) -> None:
+    await store.save([Row("users", "a", b"1"), Row("users", "b", b"2"), Row("links", "a", b"3")])
+    await store.save([Row("users", "a", None), Row("users", "b", b"4"), Row("users", "none", None)])
+    assert await store.load() == {"users": {"b": b"4"}, "links": {"a": b"3"}}
+
+
+async def test_memory_store_keeps_rows() -> None:
+    await check_round_trip(MemoryStore())
+
+
+async def test_sqlite_store_keeps_rows_over_a_restart(tmp_path: Path) -> None:
+    store = await SqliteStore.open(tmp_path / "state")
+    await check_round_trip(store)
+    await store.close()
+    store = await SqliteStore.open(tmp_path / "state")
+    assert await store.load() == {"users": {"b": b"4"}, "links": {"a": b"3"}}
+    await store.close()
+
+
+async def test_what_was_saved_is_there_without_a_close(tmp_path: Path) -> None:
+    store = await SqliteStore.open(tmp_path)
+    await store.save([Row("users", "a", b"1")])
+    reader = sqlite3.connect(tmp_path / "rce.sqlite")
+    assert reader.execute("SELECT kind, key, body FROM record").fetchall() == [("users", "a", b"1")]
+    reader.close()
+    await store.close()
+
+
+async def test_only_the_owner_can_read_it(tmp_path: Path) -> None:
+    store = await SqliteStore.open(tmp_path / "state")
+    await store.close()
+    assert stat.S_IMODE((tmp_path / "state").stat().st_mode) == 0o700
+    assert stat.S_IMODE((tmp_path / "state" / "rce.sqlite").stat().st_mode) == 0o600
+
+
+async def test_two_masters_do_not_share_a_folder(tmp_path: Path) -> None:
+    store = await SqliteStore.open(tmp_path)
+    with pytest.raises(StoreBusy, match="a master is running"):
+        await SqliteStore.open(tmp_path)
+    await store.close()
+    await (await SqliteStore.open(tmp_path)).close()
+
+
+async def test_a_store_of_a_newer_program_is_refused(tmp_path: Path) -> None:
+    database = sqlite3.connect(tmp_path / "rce.sqlite")
+    database.execute("PRAGMA user_version = 99")
+    database.commit()
+    database.close()
+    with pytest.raises(StoreError, match="has version 99"):
+        await SqliteStore.open(tmp_path)
+
+
+async def test_a_file_that_is_no_store_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "rce.sqlite").write_bytes(b"nonsense" * 1000)
+    with pytest.raises(StoreError, match="cannot open the store"):
+        await SqliteStore.open(tmp_path)
+
+
+async def test_a_failed_save_writes_nothing(tmp_path: Path) -> None:
+    store = await SqliteStore.open(tmp_path)
+    bad = Row("users", "b", object())  # type: ignore[arg-type]
+    with pytest.raises(StoreError):
+        await store.save([Row("users", "a", b"1"), bad])
+    await store.save([Row("users", "c", b"3")])
+    assert await store.load() == {"users": {"c": b"3"}}
+    await store.close()

@@ -1,0 +1,449 @@
+"""The realm, the reconciler and the desk, with task sets that live in the test."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from typing import Any, TypeVar
+
+import pytest
+from argon2 import PasswordHasher
+
+from rce.control.exceptions import PeerTimeoutError
+from rce.control.messages import (
+    CONTROL_VERSION,
+    ClientReply,
+    ClientRequest,
+    Drop,
+    Fault,
+    Gone,
+    Hello,
+    Left,
+    LogChunk,
+    Login,
+    LoginReply,
+    MachineInfo,
+    Notify,
+    Put,
+    Status,
+    Sync,
+    TaskSetKind,
+    ToTaskSet,
+    Usage,
+)
+from rce.control.model import EndpointState, EndpointStatus, LinkAddress
+from rce_master.auth import Authenticator, client_digest
+from rce_master.desk import Desk
+from rce_master.exceptions import MasterError, NotFound, StoreError, TaskSetAway
+from rce_master.realm import Realm
+from rce_master.reconciler import Reconciler
+from rce_master.state import commands
+from rce_master.state.records import User, UserRole
+from rce_master.store import MemoryStore, Row
+
+M = TypeVar("M")
+HASHER = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
+PASSWORD = client_digest("secret")
+
+
+class FragileStore(MemoryStore):
+    """Breaks when told to, and notes how often it wrote."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.broken = False
+        self.saves = 0
+        self.free = asyncio.Event()
+        self.free.set()
+
+    async def save(self, rows: Sequence[Row]) -> None:
+        await self.free.wait()
+        self.saves += 1
+        if self.broken:
+            raise StoreError("disk full")
+        await super().save(rows)
+
+
+class FakePeer:
+    """A task set: what the master sends it lies in ``inbox``."""
+
+    def __init__(self, cloud: Cloud, process: str, kind: TaskSetKind) -> None:
+        self.cloud = cloud
+        self.process = process
+        self.kind = kind
+        self.inbox: asyncio.Queue[ToTaskSet] = asyncio.Queue()
+        self.log = LogChunk(request=0, offset=5, text="hello")
+        self.requests = 0
+
+    def send(self, message: ToTaskSet) -> None:
+        self.inbox.put_nowait(message)
+
+    async def read_log(self, id: str, node: str, offset: int = 0, limit: int = 65536) -> LogChunk:  # noqa: A002
+        if self.log.text == "away":
+            raise PeerTimeoutError(self.process, 1.0)
+        return self.log
+
+    async def get(self, kind: type[M]) -> M:
+        """Take messages until one of a kind comes."""
+        async with asyncio.timeout(5):
+            while True:
+                message = await self.inbox.get()
+                if isinstance(message, kind):
+                    return message
+
+    async def hello(self, *endpoints: EndpointStatus) -> Sync:
+        await self.cloud.desk.on_hello(
+            self,
+            Hello(
+                version=CONTROL_VERSION,
+                kind=self.kind,
+                process=self.process,
+                machine=MachineInfo(name="m"),
+                url="ws://x/",
+                endpoints=endpoints,
+            ),
+        )
+        return await self.get(Sync)
+
+    async def say(self, message: Any) -> None:
+        await self.cloud.desk.on_message(self, message)
+
+    async def login(self, robot: str = "rob", password: str = PASSWORD) -> LoginReply:
+        self.requests += 1
+        await self.say(Login(request=self.requests, user="anna", robot=robot, password=password))
+        reply = await self.get(LoginReply)
+        assert reply.request == self.requests
+        return reply
+
+    async def ask(self, kind: str, data: Any, robot: str = "rob") -> tuple[str, ...]:
+        self.requests += 1
+        await self.say(ClientRequest(request=self.requests, id=f"anna/{robot}", type=kind, data=data))
+        reply = await self.get(ClientReply)
+        assert reply.request == self.requests
+        return reply.errors
+
+
+class Cloud:
+    def __init__(self, realm: Realm, store: FragileStore) -> None:
+        self.realm = realm
+        self.store = store
+        self.reconciler = Reconciler(realm)
+        self.auth = Authenticator(realm.tables, hasher=HASHER)
+        self.desk = Desk(realm, self.reconciler, self.auth)
+
+    def robots(self, process: str = "r1") -> FakePeer:
+        return FakePeer(self, process, TaskSetKind.ROBOT)
+
+    def containers(self, process: str = "c1") -> FakePeer:
+        return FakePeer(self, process, TaskSetKind.CONTAINER)
+
+    async def flush(self) -> None:
+        """Wait until all that was sent before is done."""
+        await self.realm.submit(commands.Tick())
+
+
+@asynccontextmanager
+async def running(store: FragileStore) -> AsyncIterator[Cloud]:
+    cloud = Cloud(await Realm.open(store), store)
+    async with asyncio.TaskGroup() as group:
+        workers = [group.create_task(cloud.realm.run()), group.create_task(cloud.desk.run())]
+        await asyncio.sleep(0)
+        if "anna" not in cloud.realm.tables.users:
+            user = User(name="anna", role=UserRole.USER, password=HASHER.hash(PASSWORD), created=0.0)
+            await cloud.realm.submit(commands.AddUser(user=user))
+        try:
+            yield cloud
+            cloud.realm.state.validate()
+        finally:
+            for worker in workers:
+                worker.cancel()
+            cloud.auth.close()
+
+
+@pytest.fixture
+async def cloud() -> AsyncIterator[Cloud]:
+    async with running(FragileStore()) as made:
+        yield made
+
+
+CN = {
+    "addInterfaces": [
+        {
+            "endpointTag": "rob",
+            "interfaceTag": "out",
+            "interfaceType": "SubscriberConverter",
+            "className": "p/T",
+        },
+        {
+            "endpointTag": "c",
+            "interfaceTag": "in",
+            "interfaceType": "PublisherInterface",
+            "className": "p/T",
+            "addr": "/in",
+        },
+    ],
+    "addNodes": [{"containerTag": "c", "nodeTag": "n", "pkg": "Test", "exe": "x.py"}],
+}
+CX = {"connect": [{"tagA": "rob/out", "tagB": "c/in"}]}
+
+
+async def wire(robots: FakePeer) -> None:
+    assert (await robots.login()).status == 200
+    assert await robots.ask("CC", {"containerTag": "c"}) == ()
+    assert await robots.ask("CN", CN) == ()
+    assert await robots.ask("CX", CX) == ()
+
+
+# Realm
+
+
+async def test_nothing_changes_if_it_cannot_be_stored(cloud: Cloud) -> None:
+    heard: list[object] = []
+    cloud.realm.listeners.append(heard.append)
+    cloud.store.broken = True
+    with pytest.raises(StoreError, match="disk full"):
+        await cloud.realm.submit(commands.CreateContainer(user="anna", tag="c"))
+    assert heard == []
+    assert len(cloud.realm.tables.endpoints) == 0
+    cloud.store.broken = False
+    await cloud.realm.submit(commands.CreateContainer(user="anna", tag="c"))
+    assert len(heard) == 1
+
+
+async def test_changes_are_stored_before_anybody_hears_of_them(cloud: Cloud) -> None:
+    stored: list[bool] = []
+    cloud.realm.listeners.append(lambda _: stored.append("anna/c" in cloud.store.tables["endpoints"]))
+    await cloud.realm.submit(commands.CreateContainer(user="anna", tag="c"))
+    assert stored == [True]
+
+
+async def test_a_storm_is_stored_at_once(cloud: Cloud) -> None:
+    cloud.store.free.clear()
+    saves = cloud.store.saves
+    made = [
+        asyncio.ensure_future(cloud.realm.submit(commands.CreateContainer(user="anna", tag=f"c{i}")))
+        for i in range(100)
+    ]
+    await asyncio.sleep(0)
+    cloud.store.free.set()
+    await asyncio.gather(*made)
+    assert cloud.store.saves - saves <= 2
+    assert len(cloud.store.tables["endpoints"]) == 100
+
+
+async def test_of_several_commands_only_the_bad_ones_are_refused(cloud: Cloud) -> None:
+    outcomes = await cloud.realm.submit_all(
+        [
+            commands.CreateContainer(user="anna", tag="c"),
+            commands.DestroyContainer(user="anna", tag="none"),
+            commands.CreateContainer(user="anna", tag="d"),
+        ]
+    )
+    assert [type(outcome) for outcome in outcomes] == [type(None), NotFound, type(None)]
+    assert await cloud.realm.submit_all([]) == []
+
+
+async def test_a_fault_of_ours_is_no_end(cloud: Cloud, caplog: pytest.LogCaptureFixture) -> None:
+    with pytest.raises(MasterError, match="internal error"):
+        await cloud.realm.submit("nonsense")  # type: ignore[arg-type]
+    assert "could not apply 'nonsense'" in caplog.text
+    await cloud.realm.submit(commands.CreateContainer(user="anna", tag="c"))
+
+
+# Reconciling
+
+
+async def test_everything_is_said_at_hello_and_changes_after_it(cloud: Cloud) -> None:
+    robots, containers = cloud.robots(), cloud.containers()
+    assert (await robots.hello()).endpoints == ()
+    await wire(robots)
+    (spec,) = (await containers.hello()).endpoints
+    assert [n.tag for n in spec.nodes] == ["n"]
+    assert [c.interface for c in spec.connections] == ["in"]
+    address = LinkAddress(machine="m", unix="/run/c")
+    await containers.say(
+        Status(status=EndpointStatus(id="anna/c", revision=1, state=EndpointState.RUNNING, address=address))
+    )
+    put = await robots.get(Put)
+    while not put.endpoint.links or put.endpoint.links[0].address != address:
+        put = await robots.get(Put)
+    assert put.endpoint.links[0].dial
+    await robots.ask("DC", {"containerTag": "c"})
+    assert (await containers.get(Drop)).id == "anna/c"
+
+
+async def test_a_logins_answer_carries_the_spec_and_no_put_precedes_it(cloud: Cloud) -> None:
+    robots = cloud.robots()
+    await robots.hello()
+    reply = await robots.login()
+    assert reply.endpoint is not None
+    assert reply.endpoint.id == "anna/rob"
+    assert robots.inbox.empty()
+
+
+async def test_logins_that_are_refused_say_why(cloud: Cloud) -> None:
+    robots, containers = cloud.robots(), cloud.containers()
+    await robots.hello()
+    wrong = await robots.login(password=client_digest("wrong"))
+    assert (wrong.status, wrong.endpoint) == (401, None)
+    assert (await robots.login()).status == 200
+    twice = await robots.login()
+    assert twice.status == 409
+    assert "connected already" in twice.reason
+    await containers.hello()
+    await robots.ask("CC", {"containerTag": "c"})
+    assert (await robots.login("c")).status == 409
+    cloud.store.broken = True
+    assert (await robots.login("other")).status == 503
+    cloud.store.broken = False
+
+
+async def test_a_robot_that_leaves_while_it_logs_in_is_not_connected_for_ever(cloud: Cloud) -> None:
+    robots = cloud.robots()
+    await robots.hello()
+    await robots.say(Login(request=1, user="anna", robot="rob", password=PASSWORD))
+    await robots.say(Left(id="anna/rob", reason="gone"))
+    await robots.get(LoginReply)
+    assert (await robots.login()).status == 200
+
+
+async def test_every_bad_item_is_told_and_the_others_are_done(cloud: Cloud) -> None:
+    robots = cloud.robots()
+    await robots.hello()
+    await wire(robots)
+    errors = await robots.ask(
+        "CN",
+        {
+            "addNodes": [
+                {"containerTag": "c", "nodeTag": "good", "pkg": "Test", "exe": "x.py"},
+                {"containerTag": "none", "nodeTag": "n", "pkg": "Test", "exe": "x.py"},
+                {"containerTag": "c", "nodeTag": "9bad", "pkg": "Test", "exe": "x.py"},
+            ],
+            "setParam": [{"containerTag": "c", "name": "p", "value": 2**40}],
+        },
+    )
+    assert len(errors) == 3
+    assert any("addNodes[2].nodeTag" in error for error in errors)
+    assert any("there is no container 'none'" in error for error in errors)
+    assert any("32 bits" in error for error in errors)
+    assert {n.tag for n in cloud.realm.spec("anna/c").nodes} == {"n", "good"}
+    assert len(await robots.ask("XX", {})) == 1
+    assert len(await robots.ask("CN", "nonsense")) == 1
+    assert "connect again" in (await robots.ask("CC", {"containerTag": "d"}, robot="stranger"))[0]
+
+
+async def test_one_message_can_replace_something(cloud: Cloud) -> None:
+    robots = cloud.robots()
+    await robots.hello()
+    await wire(robots)
+    new = {"containerTag": "c", "nodeTag": "n", "pkg": "Test", "exe": "other.py"}
+    old = {"containerTag": "c", "nodeTag": "n"}
+    assert await robots.ask("CN", {"addNodes": [new], "removeNodes": [old]}) == ()
+    assert [n.exe for n in cloud.realm.spec("anna/c").nodes] == ["other.py"]
+
+
+async def test_requests_of_one_channel_are_done_in_order(cloud: Cloud) -> None:
+    robots = cloud.robots()
+    await robots.hello()
+    await robots.login()
+    for number in range(20):
+        kind = "CC" if number % 2 == 0 else "DC"
+        await robots.say(ClientRequest(request=number, id="anna/rob", type=kind, data={"containerTag": "c"}))
+    replies = [await robots.get(ClientReply) for _ in range(20)]
+    assert [(r.request, r.errors) for r in replies] == [(number, ()) for number in range(20)]
+
+
+async def test_faults_go_to_the_robots_of_the_user(cloud: Cloud) -> None:
+    one, two, containers = cloud.robots("r1"), cloud.robots("r2"), cloud.containers()
+    for peer in (one, two, containers):
+        await peer.hello()
+    await wire(one)
+    await two.login("second")
+    await containers.say(Fault(id="anna/c", text="node n died"))
+    assert await one.get(Notify) == Notify(id="anna", text="node n died")
+    assert await two.get(Notify) == Notify(id="anna", text="node n died")
+    await containers.say(Fault(id="anna/c", text="for one", robot="anna/second"))
+    assert (await two.get(Notify)).text == "for one"
+    await cloud.flush()
+    assert not any(isinstance(one.inbox.get_nowait(), Notify) for _ in range(one.inbox.qsize()))
+
+
+async def test_a_task_set_that_left_hears_nothing_until_it_is_back(cloud: Cloud) -> None:
+    robots, containers = cloud.robots(), cloud.containers()
+    await robots.hello()
+    await containers.hello()
+    await wire(robots)
+    await containers.say(Usage(cpu_s=1.0, memory=2, endpoints={}))
+    assert "c1" in cloud.reconciler.usage
+    await cloud.desk.on_gone(containers)
+    assert "c1" not in cloud.reconciler.usage
+    while not containers.inbox.empty():
+        containers.inbox.get_nowait()
+    await robots.ask("CN", {"removeNodes": [{"containerTag": "c", "nodeTag": "n"}]})
+    assert containers.inbox.empty()
+    again = cloud.containers()
+    status = EndpointStatus(id="anna/c", revision=1, state=EndpointState.RUNNING)
+    (spec,) = (await again.hello(status)).endpoints
+    assert spec.nodes == ()
+    await cloud.desk.on_gone(containers)
+    assert cloud.realm.tables.is_connected("c1"), "the former channel's end is no loss"
+
+
+async def test_a_container_made_again_is_put_when_its_former_self_is_gone(cloud: Cloud) -> None:
+    robots, containers = cloud.robots(), cloud.containers()
+    await robots.hello()
+    await containers.hello()
+    await wire(robots)
+    await robots.ask("DC", {"containerTag": "c"})
+    await robots.ask("CC", {"containerTag": "c"})
+    drop = await containers.get(Drop)
+    assert not any(isinstance(containers.inbox.get_nowait(), Put) for _ in range(containers.inbox.qsize()))
+    await containers.say(Gone(id="anna/c", revision=drop.revision))
+    put = await containers.get(Put)
+    assert put.endpoint.id == "anna/c"
+    assert put.endpoint.revision > drop.revision
+
+
+async def test_logs_are_read_where_the_container_is(cloud: Cloud) -> None:
+    robots, containers = cloud.robots(), cloud.containers()
+    await robots.hello()
+    await wire(robots)
+    with pytest.raises(TaskSetAway, match="cannot be reached"):
+        await cloud.reconciler.read_log("anna/c", "n", 0, 10)
+    await containers.hello()
+    assert (await cloud.reconciler.read_log("anna/c", "n", 0, 10)).text == "hello"
+    with pytest.raises(NotFound, match="has no node 'x'"):
+        await cloud.reconciler.read_log("anna/c", "x", 0, 10)
+    with pytest.raises(NotFound, match="no container 'd'"):
+        await cloud.reconciler.read_log("anna/d", "x", 0, 10)
+    containers.log = LogChunk(request=0, offset=0, error="no such log")
+    with pytest.raises(NotFound, match="no such log"):
+        await cloud.reconciler.read_log("anna/c", "n", 0, 10)
+    containers.log = LogChunk(request=0, offset=0, text="away")
+    with pytest.raises(TaskSetAway, match="did not answer"):
+        await cloud.reconciler.read_log("anna/c", "n", 0, 10)
+
+
+async def test_a_restarted_master_takes_over_what_runs() -> None:
+    store = FragileStore()
+    address = LinkAddress(machine="m", unix="/run/c")
+    running_c = EndpointStatus(id="anna/c", revision=1, state=EndpointState.RUNNING, address=address)
+    async with running(store) as cloud:
+        robots, containers = cloud.robots(), cloud.containers()
+        await robots.hello()
+        await containers.hello()
+        await wire(robots)
+        await containers.say(Status(status=running_c))
+        await cloud.flush()
+        before = cloud.realm.spec("anna/rob"), cloud.realm.spec("anna/c")
+    async with running(store) as cloud:
+        robots, containers = cloud.robots(), cloud.containers()
+        status = EndpointStatus(id="anna/rob", revision=before[0].revision, state=EndpointState.RUNNING)
+        assert (await robots.hello(status)).endpoints == (before[0],)
+        assert (await containers.hello(running_c)).endpoints == (before[1],)
+        assert robots.inbox.empty(), "nothing changed, so nothing is to be said"
+        assert await robots.ask("CC", {"containerTag": "second"}) == ()
+        assert (await containers.get(Put)).endpoint.id == "anna/second"
+        twice = await robots.login()
+        assert twice.status == 409
