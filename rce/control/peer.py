@@ -55,6 +55,7 @@ class Peer:
         except asyncio.QueueFull:
             _log.warning("%r takes no messages; cut off", self)
             self.abort()
+            self.leave()
 
     def abort(self) -> None:
         """Cut the connection off."""

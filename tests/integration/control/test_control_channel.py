@@ -386,7 +386,7 @@ async def test_silent_peer_is_noticed() -> None:
             silent.transport.abort()
 
 
-async def test_peer_that_takes_no_messages_is_cut_off() -> None:
+async def test_peer_that_takes_no_messages_is_cut_off(caplog: pytest.LogCaptureFixture) -> None:
     master = Master()
     async with master.server:
         url = f"ws://127.0.0.1:{master.server.port}"
@@ -397,6 +397,7 @@ async def test_peer_that_takes_no_messages_is_cut_off() -> None:
             for _ in range(9000):
                 peer.send(Notify(id="u/r", text="x"))
             await master.gone.get()
+            assert caplog.text.count("takes no messages; cut off") == 1
             stuck.transport.abort()
 
 
