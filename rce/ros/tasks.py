@@ -11,8 +11,8 @@ from typing import Any, Self
 class TaskScope:
     """A task group whose end means "stop", not "wait": for the background work of a server or client.
 
-    Leaving the block cancels what still runs and waits for it. As with :class:`asyncio.TaskGroup`, a task that
-    fails cancels the block and its error comes out of it; an error of the block itself passes unchanged.
+    Leaving the block cancels what still runs and waits for it. As with :class:`asyncio.TaskGroup`, a task
+    that fails cancels the block and its error comes out of it; an error of the block itself passes unchanged.
     """
 
     def __init__(self) -> None:

@@ -59,7 +59,7 @@ class Graph:
         return next(iter(self._registrations.of(Kind.SERVICE, name).values()), None)
 
     def published(self, namespace: str = "") -> list[list[str]]:
-        """Return ``[[topic, type], ...]`` of what is published below ``namespace`` (with a trailing slash)."""
+        """Return ``[[topic, type], ...]`` of what is published below ``namespace`` (``/ns/``)."""
         topics = self._registrations.names(Kind.PUBLISHER)
         return [[topic, self._types.get(topic, ANY_TYPE)] for topic in topics if topic.startswith(namespace)]
 

@@ -21,8 +21,8 @@ CALLER = "/master"
 class Notifier:
     """One queue for each node that is owed calls.
 
-    A newer call takes the place of a waiting one with the same key, so a queue is never longer than the number
-    of topics and parameters of its node, however slow the node is.
+    A newer call takes the place of a waiting one with the same key, so a queue is never longer than the
+    number of topics and parameters of its node, however slow the node is.
     """
 
     def __init__(self, client: RpcClient, tasks: TaskScope) -> None:
@@ -58,6 +58,6 @@ class Notifier:
             await self._client.call(call.uri, call.method, (CALLER, *call.arguments), timeout=CALL_TIMEOUT)
         except RpcUnreachable as error:
             _log.info("%s is not delivered: %s", call.method, error)
-            queue.clear()  # nobody is there; whoever takes the address over registers and learns the state anew
+            queue.clear()  # nobody is there; who takes the address over registers and learns the state anew
         except XmlRpcError as error:
             _log.warning("%s to %s: %s", call.method, call.uri, error)

@@ -73,7 +73,7 @@ class Core:
         Args:
             host: Address to listen on; ``0.0.0.0`` for all.
             port: 0 takes a free one.
-            advertised: Host name or address in :attr:`uri`; by default ``host``, or loopback if that is "all".
+            advertised: Host or address in :attr:`uri`; by default ``host``, or loopback if that is "all".
         """
         self.graph = Graph()
         self._advertised = advertised or ("127.0.0.1" if host == "0.0.0.0" else host)  # noqa: S104
@@ -140,7 +140,9 @@ class Core:
     def forget_uri(self, uri: str) -> bool:
         """Unregister everything of the nodes whose slave API is ``uri``; tell whether there was anything."""
         found = [name for name, node_uri in self.graph.nodes.items() if node_uri == uri]
-        return any([self.forget_node(name) for name in found])
+        for name in found:
+            self.forget_node(name)
+        return bool(found)
 
     def set_param(self, name: str, value: Any) -> None:
         """Set a parameter or namespace by its global name."""

@@ -153,7 +153,7 @@ class GraphMember:
                 settings.master_uri,
                 lambda: (settings.host, self._listener.port),
                 self.shutdown,
-                lambda name, value: self._parameters.changed(name, value),
+                self._parameter_changed,
             )
             server = await stack.enter_async_context(RpcServer(Dispatcher(slave.methods()), settings.bind))
             slave_uri = f"http://{settings.host}:{server.port}/"
@@ -233,6 +233,9 @@ class GraphMember:
     @property
     def _service_uri(self) -> str:
         return f"rosrpc://{self._settings.host}:{self._listener.port}"
+
+    def _parameter_changed(self, name: str, value: object) -> None:
+        self._parameters.changed(name, value)
 
     def _accept_service(self, connection: Connection, fields: dict[str, str]) -> None:
         service = self._services.get(fields["service"])

@@ -37,9 +37,9 @@ class Node(GraphMember):
 
     ``async with Node("listener") as node: await node.subscribe("chatter", "std_msgs/String", print)``
 
-    Leaving the block unregisters everything and closes all connections. A node that is told to stop (by the
-    master, by ``rosnode kill`` or by a signal) ends its iterators, :meth:`spin` and :meth:`sleep`; the program
-    then leaves the block.
+    Leaving the block unregisters everything and closes all connections. A node that is told to stop (by
+    the master, by ``rosnode kill`` or by a signal) ends its iterators, :meth:`spin` and :meth:`sleep`; the
+    program then leaves the block.
 
     All names may be global, relative or private and are remapped. Types are given by name or as objects.
 
@@ -68,8 +68,8 @@ class Node(GraphMember):
             master_uri: The master; if ``None``, ``ROS_MASTER_URI``.
             types: Where types come from; if ``None``, those that are built in.
             anonymous: Make the name unique.
-            signals: Stop the node at SIGINT and SIGTERM; ``None`` means: if it is the program's main node, which
-                is the one that takes the program's command line.
+            signals: Stop the node at SIGINT and SIGTERM; ``None`` means: if it is the program's main node,
+                which is the one that takes the program's command line.
             master_timeout: Seconds to wait for a master that is not up yet; ``None`` for ever.
 
         Raises:
@@ -131,9 +131,9 @@ class Node(GraphMember):
         Args:
             topic: The topic.
             kind: Its type.
-            callback: Called with each message, in order. A plain function is called as soon as a message is there
-                and must not block; a coroutine function is awaited before the next message. Without a
-                callback, iterate over the subscriber.
+            callback: Called with each message, in order. A plain function is called as soon as a message is
+                there and must not block; a coroutine function is awaited before the next message. Without
+                a callback, iterate over the subscriber.
             queue_size: How many messages wait for a coroutine or an iteration before the oldest is dropped.
 
         Raises:
@@ -162,8 +162,8 @@ class Node(GraphMember):
         Args:
             topic: The topic.
             kind: Its type; ``*`` for any.
-            callback: Called with ``(payload, latched)``; ``latched`` is what the publisher says of itself. Plain
-                function or coroutine function, as for :meth:`subscribe`.
+            callback: Called with ``(payload, latched)``; ``latched`` is what the publisher says of itself.
+                Plain function or coroutine function, as for :meth:`subscribe`.
             queue_size: As for :meth:`subscribe`.
 
         Raises:
@@ -185,9 +185,10 @@ class Node(GraphMember):
         Args:
             name: The service.
             kind: Its type.
-            handler: Called with each request; returns a response or a mapping of its fields. A plain function must
-                not block; coroutine functions run side by side for different clients. What it raises is the
-                caller's answer: :class:`~rce.ros.errors.ServiceFault` with its text, anything else is logged too.
+            handler: Called with each request; returns a response or a mapping of its fields. A plain function
+                must not block; coroutine functions run side by side for different clients. What it raises is
+                the caller's answer: :class:`~rce.ros.errors.ServiceFault` with its text, anything else is
+                logged too.
 
         Raises:
             TypeMismatch: This node provides the service already.
@@ -227,7 +228,7 @@ class Node(GraphMember):
         self._clients.append(client)
         return client
 
-    async def wait_for_service(self, name: str, *, timeout: float | None = None) -> None:  # noqa: ASYNC109
+    async def wait_for_service(self, name: str, *, timeout: float | None = None) -> None:
         """Wait until a service has a provider that answers.
 
         Raises:
@@ -236,7 +237,7 @@ class Node(GraphMember):
         """
         runtime, service = self._running, self.resolve(name)
         async with asyncio.timeout(timeout):
-            while not await answers(runtime, service):
+            while not await answers(runtime, service):  # noqa: ASYNC110 - a master tells nobody of services
                 await asyncio.sleep(SERVICE_POLL)
 
     async def _advertise_service(self, name: str, kind: ServiceType, handler: SerializedHandler) -> Service:

@@ -56,7 +56,7 @@ class ServiceClient:
         """
         return await self.call(self.type.request.new(**fields) if request is None else request)
 
-    async def call(self, request: Message | Mapping[str, Any], *, timeout: float | None = None) -> Message:  # noqa: ASYNC109
+    async def call(self, request: Message | Mapping[str, Any], *, timeout: float | None = None) -> Message:
         """Call the service.
 
         Args:
@@ -74,7 +74,7 @@ class ServiceClient:
         self,
         payload: bytes | bytearray | memoryview,
         *,
-        timeout: float | None = None,  # noqa: ASYNC109
+        timeout: float | None = None,
     ) -> bytes:
         """Call the service with a serialized request; return the serialized response.
 
@@ -194,7 +194,9 @@ class _Call:
         try:
             host, port = address.hostname, address.port
             if host is None or port is None:
-                raise ServiceLost(service, f"the provider's URI {uri!r} is not of the form rosrpc://host:port")
+                raise ServiceLost(
+                    service, f"the provider's URI {uri!r} is not of the form rosrpc://host:port"
+                )
             _, call.connection = await loop.create_connection(lambda: Connection(call, scratch), host, port)
         except (OSError, ValueError) as error:
             raise ServiceLost(service, f"the provider at {uri} cannot be reached: {error}") from error
@@ -234,6 +236,7 @@ class _Call:
 
     def connection_lost(self, connection: Connection, error: Exception | None) -> None:
         """Tell who waits for an answer."""
+        del connection  # the only one
         if self._answer is not None and not self._answer.done():
             lost = ServiceLost(self._service)
             lost.__cause__ = error

@@ -1,4 +1,4 @@
-"""What a node is told from outside: environment variables and command line. Pure but for asking for addresses."""
+"""What a node is told from outside: environment variables and command line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rce.ros.names import Resolver, parse_arguments
 
 DEFAULT_MASTER_URI = "http://127.0.0.1:11311/"
 LOOPBACK = "127.0.0.1"
-EVERYWHERE = "0.0.0.0"  # noqa: S104
+EVERYWHERE = "0.0.0.0"  # noqa: S104 - nodes of other machines must reach it
 
 
 @dataclass(frozen=True, slots=True)

@@ -52,7 +52,7 @@ class CallbackSink:
         """Call."""
         try:
             self._callback(payload, latched)
-        except Exception:
+        except Exception:  # noqa: BLE001 - the program's own fault, which must not stop the next message
             _log.exception("the callback of %s failed", self._topic)
 
     def end(self) -> None:
@@ -107,7 +107,7 @@ async def call_in_order(
             return
         try:
             await callback(payload, latched)
-        except Exception:
+        except Exception:  # noqa: BLE001 - as above
             _log.exception("the callback of %s failed", topic)
 
 

@@ -66,7 +66,7 @@ class TopicInput:
         self.set_publishers(())
 
     async def _follow(self, uri: str) -> None:
-        """Receive from one publisher for as long as the master names it, over as many connections as it takes."""
+        """Receive from one publisher for as long as the master names it, reconnecting when needed."""
         waits = _waits()
         while True:
             link = InputLink(self, uri)
@@ -156,6 +156,7 @@ class InputLink:
 
     def connection_lost(self, connection: Connection, error: Exception | None) -> None:
         """Let who waits for the end go on."""
+        del connection  # the only one
         self._end(error)
 
     def writable(self, connection: Connection) -> None:

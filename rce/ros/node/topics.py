@@ -140,7 +140,7 @@ class Topics:
         ]
 
     def subscribe_stats(self) -> list[list[object]]:
-        """Return ``[topic, [[id, bytes, messages, dropped, connected], ...]]`` of each topic subscribed to."""
+        """Return ``[topic, [[id, bytes, messages, dropped, connected], ...]]`` of each subscribed topic."""
         return [
             [topic, [[_id(link), link.bytes_in, link.messages, -1, True] for link in source.links]]
             for topic, source in self.inputs.items()

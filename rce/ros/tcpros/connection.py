@@ -46,7 +46,7 @@ class Connection(asyncio.BufferedProtocol):
     """A TCPROS connection in either direction.
 
     Attributes:
-        owner: Takes the frames; may be exchanged, for instance when the header told what the connection is for.
+        owner: Takes the frames; may be exchanged, as when the header told what the connection is for.
         full: Whether too much waits to be sent already. Writing is possible still, but unwise.
         bytes_in: Bytes of frames received, without their heads.
         frames_in: Frames received, the connection header among them.

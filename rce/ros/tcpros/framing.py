@@ -3,9 +3,9 @@
 A service's answer has one byte in front of the length, the *lead*, that tells success from error.
 
 Reading is made for two kinds of traffic. Many small frames arrive in one read into a scratch buffer that all
-connections of a node share, and are cut out of it. A large frame gets memory of its own as soon as its length is
-known and is read straight into it; :class:`io.BytesIO` lends its memory to the socket and then hands it over as
-``bytes`` without a copy.
+connections of a node share, and are cut out of it. A large frame gets memory of its own as soon as its length
+is known and is read straight into it; :class:`io.BytesIO` lends its memory to the socket and then hands it
+over as ``bytes`` without a copy.
 """
 
 from __future__ import annotations

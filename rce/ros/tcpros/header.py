@@ -1,6 +1,6 @@
 """Connection headers: the first frame in either direction. Pure.
 
-Each field is ``name=value`` after its length (4 bytes, little-endian); the header is the frame of all of them.
+Each field is ``name=value`` after its length (4 bytes, little-endian); the header is the frame of all.
 http://wiki.ros.org/ROS/Connection%20Header
 """
 

@@ -19,7 +19,7 @@ HEADER_TIMEOUT = 30.0
 """Seconds that a peer may take to say what it wants."""
 
 Accept = Callable[[Connection, dict[str, str]], None]
-"""Takes a connection over, given the peer's header: answers it and sets the owner, or raises HandshakeRefused."""
+"""Takes a connection over, given the peer's header: answers it and sets its owner, or refuses."""
 
 
 class Listener:

@@ -6,8 +6,9 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import Sequence
+from http import HTTPStatus
 from types import TracebackType
-from typing import Any
+from typing import Any, Self
 from urllib.parse import urlsplit
 
 import h11
@@ -38,7 +39,7 @@ class RpcClient:
         self._idle: dict[tuple[str, int], list[_Connection]] = {}
         self._closed = False
 
-    async def __aenter__(self) -> RpcClient:
+    async def __aenter__(self) -> Self:
         return self
 
     async def __aexit__(
@@ -166,7 +167,7 @@ class _Connection:
                     raise EOFError("the connection was closed before an answer")
                 self._http.receive_data(data)
             elif isinstance(event, h11.Response):
-                if event.status_code != 200:  # noqa: PLR2004
+                if event.status_code != HTTPStatus.OK:
                     raise ValueError(f"HTTP status {event.status_code}")
             elif isinstance(event, h11.Data):
                 body += event.data

@@ -43,7 +43,7 @@ class Dispatcher:
         """Answer the call in ``document``. Never raises."""
         try:
             method, arguments = decode_call(document)
-        except Exception as error:  # noqa: BLE001 - whatever a document does to the parser, its sender is told
+        except Exception as error:  # noqa: BLE001 - whatever it does to the parser, its sender is told
             return encode_fault(_FAULT_NO_CALL, str(error))
         try:
             result = self._call(method, arguments)
@@ -63,18 +63,21 @@ class Dispatcher:
         handler = self._methods.get(method)
         if handler is None:
             raise _NoSuchMethod(f"there is no method {method!r}")
-        at_least, at_most = self._arity[method]
-        if not at_least <= len(arguments) <= at_most:
-            return ERROR, f"{method} takes {at_least} arguments, not {len(arguments)}", 0
-        if not isinstance(arguments[0], str):
-            return ERROR, f"{method}: the caller's id must be a string", 0
         try:
+            self._check(method, arguments)
             return handler(*arguments)
         except BadArgument as error:
             return ERROR, f"{method}: {error}", 0
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001 - a caller is answered, whatever happens
             _log.exception("%s failed for %s", method, arguments[0])
             return FAILURE, f"internal failure: {error}", 0
+
+    def _check(self, method: str, arguments: Sequence[Any]) -> None:
+        at_least, at_most = self._arity[method]
+        if not at_least <= len(arguments) <= at_most:
+            raise BadArgument(f"takes {at_least} arguments, not {len(arguments)}")
+        if not isinstance(arguments[0], str):
+            raise BadArgument("the caller's id must be a string")
 
     def _multicall(self, arguments: Sequence[Any]) -> list[Any]:
         if len(arguments) != 1 or not isinstance(arguments[0], list) or len(arguments[0]) > MAX_MULTICALL:
@@ -85,7 +88,7 @@ class Dispatcher:
         try:
             method, parameters = call["methodName"], call["params"]
             if method == "system.multicall" or not isinstance(parameters, list):
-                raise _NoSuchMethod("a call within system.multicall needs a method's name and a list")
+                raise _NoSuchMethod("a call within system.multicall needs a name and a list")  # noqa: TRY301
             return [self._call(method, parameters)]
         except (_NoSuchMethod, KeyError, TypeError) as error:
             return {"faultCode": _FAULT_NO_METHOD, "faultString": str(error)}

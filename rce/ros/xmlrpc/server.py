@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from http import HTTPStatus
 from types import TracebackType
-from typing import cast
+from typing import Self, cast
 
 import h11
 
@@ -47,7 +48,7 @@ class RpcServer:
         self._connections: set[_Connection] = set()
         self._server: asyncio.Server | None = None
 
-    async def __aenter__(self) -> RpcServer:
+    async def __aenter__(self) -> Self:
         loop = asyncio.get_running_loop()
         host = self._host or "0.0.0.0"  # noqa: S104 - nodes of other machines must reach it
         self._server = await loop.create_server(self._accept, host, self.port, backlog=512)
@@ -167,7 +168,8 @@ class _Connection(asyncio.Protocol):
         headers = [(b"Content-type", kind), (b"Content-length", b"%d" % len(body))]
         if last:
             headers.append((b"Connection", b"close"))
-        self._send(h11.Response(status_code=status, reason=b"OK" if status == 200 else b"", headers=headers))  # noqa: PLR2004
+        reason = HTTPStatus(status).phrase.encode()
+        self._send(h11.Response(status_code=status, reason=reason, headers=headers))
         self._send(h11.Data(data=body))
         self._send(h11.EndOfMessage())
 
