@@ -23,10 +23,11 @@ _LOOPBACK = "127.0.0.1"
 
 
 RuntimeName = Enum("RuntimeName", {name: name for name in (AUTO, *RUNTIMES)})  # type: ignore[misc]
+_AUTO = RuntimeName(AUTO)
 
 
 @app.command()
-def container(  # noqa: PLR0917 - the options of the program
+def container(
     master: Annotated[str, typer.Argument(metavar="MASTER_IP", help="Host or address of the master.")],
     control_port: Annotated[int, typer.Option(help="The master's port for task sets.")] = 8080,
     link_port: Annotated[
@@ -37,7 +38,7 @@ def container(  # noqa: PLR0917 - the options of the program
     state_dir: Annotated[
         Path | None, typer.Option(help="Folder for name, logs and homes of the containers.")
     ] = None,
-    runtime: Annotated[RuntimeName, typer.Option(help="How containers are made.")] = RuntimeName(AUTO),
+    runtime: Annotated[RuntimeName, typer.Option(help="How containers are made.")] = _AUTO,
     grace: Annotated[
         float,
         typer.Option(help="Seconds after which containers without this program end themselves.", min=0.1),

@@ -142,7 +142,7 @@ def choose_runtime(wish: str, runtimes: dict[str, Runtime]) -> tuple[Runtime, st
 
 
 def package_path(given: Sequence[Path]) -> tuple[Path, ...]:
-    """All folders with packages: what was given, what the environment variables name, the shipped examples."""
+    """All folders with packages: those given, those of the environment variables, the shipped examples."""
     paths = [*given, *PackageIndex.from_environ().path]
     with contextlib.suppress(ShippedFileError):
         paths.append(examples_dir())

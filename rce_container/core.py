@@ -1,14 +1,13 @@
 """What a manager decides: events in, instructions out. Pure: no I/O, no clock, no task.
 
-A container lives several lives, each with a *mark* of its own (reported as its incarnation). Events of a life that is
-over are ignored.
+A container lives several lives, each with a *mark* of its own (reported as its incarnation). Events of a
+life that is over are ignored.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Union
 
 import msgspec
 
@@ -110,7 +109,7 @@ class Quit:
     """The manager is to end, with all its containers."""
 
 
-Event = Union[Put, Drop, Sync, Adopted, Made, Reported, Faulted, Lost, Removed, Due, Quit]
+Event = Put | Drop | Sync | Adopted | Made | Reported | Faulted | Lost | Removed | Due | Quit
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +152,7 @@ class Tell:
     message: ToMaster
 
 
-Instruction = Union[Start, Apply, Stop, Wait, Tell]
+Instruction = Start | Apply | Stop | Wait | Tell
 
 
 @dataclass(slots=True)
@@ -207,8 +206,8 @@ _STATES = {
 class ManagerCore:
     """All containers of one manager.
 
-    Invariants: a container has a mark exactly while something of a life may be there; a container that is gone is
-    forgotten.
+    Invariants: a container has a mark exactly while something of a life may be there; a container that is
+    gone is forgotten.
     """
 
     def __init__(self) -> None:

@@ -30,7 +30,7 @@ async def dial(address: LinkAddress, machine: str) -> socket.socket:
 async def _connect(family: int, target: object) -> socket.socket:
     sock = socket.socket(family, socket.SOCK_STREAM)
     try:
-        sock.setblocking(False)  # noqa: FBT003
+        sock.setblocking(False)
         if family != socket.AF_UNIX:
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         await asyncio.get_running_loop().sock_connect(sock, target)  # type: ignore[arg-type]

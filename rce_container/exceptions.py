@@ -3,6 +3,7 @@
 ContainerError
 ├── RuntimeUnavailableError   no runtime of that name works on this machine
 ├── StartError                a container could not be started
+├── KillError                 a container could not be ended
 └── StateError                the state directory cannot be used
 """
 
@@ -27,6 +28,10 @@ class RuntimeUnavailableError(ContainerError):
 
 class StartError(ContainerError):
     """A container could not be started; the text says what to do."""
+
+
+class KillError(ContainerError):
+    """Processes of a container do not die, not even by SIGKILL."""
 
 
 class StateError(ContainerError):

@@ -1,8 +1,8 @@
 """Where a container task set keeps what it needs on disk.
 
-``STATE/name`` and one folder per life of a container, ``STATE/containers/MARK`` (record, logs, private home), are
-in the state directory; the container's sockets are in a short path, ``RUN/MARK``. Everything belongs to one task
-set at a time: the state directory is locked while it runs.
+``STATE/name`` and one folder per life of a container, ``STATE/containers/MARK`` (record, logs, private
+home), are in the state directory; the container's sockets are in a short path, ``RUN/MARK``. Everything
+belongs to one task set at a time: the state directory is locked while it runs.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import re
 import secrets
 import shutil
 import socket
-import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Self
@@ -104,15 +103,22 @@ class ContainerFolder:
     def remove(self) -> None:
         """Remove everything, also what a node made unreadable. Blocks; may be repeated."""
         for path in (self.run, self.path):
-            shutil.rmtree(path, onerror=_make_writable_and_retry)
+            shutil.rmtree(path, ignore_errors=True)
+            if path.exists():
+                _make_accessible(path)
+                shutil.rmtree(path, ignore_errors=True)
 
 
-def _make_writable_and_retry(function: object, path: str, _: object) -> None:
+def _make_accessible(root: Path) -> None:
+    """Undo what a node did to the permissions of its folders. Follows no links."""
     with contextlib.suppress(OSError):
-        for broken in (os.path.dirname(path), path):
-            if not stat.S_ISLNK(os.lstat(broken).st_mode):
-                os.chmod(broken, 0o700)
-        shutil.rmtree(path) if os.path.isdir(path) and not os.path.islink(path) else os.unlink(path)
+        root.chmod(0o700)
+    for parent, folders, _ in os.walk(root):
+        for folder in folders:
+            path = Path(parent, folder)
+            if not path.is_symlink():
+                with contextlib.suppress(OSError):
+                    path.chmod(0o700)
 
 
 class StateFolder:

@@ -28,7 +28,8 @@ def read_log(folder: Path, node: str, offset: int, limit: int) -> Chunk:
     Args:
         folder: The container's log folder.
         node: The node's tag; empty for the environment's own log.
-        offset: Bytes since the log began; negative counts from its end. What is not kept any more is passed over.
+        offset: Bytes since the log began; negative counts from its end. What is not kept
+            any more is passed over.
         limit: Bytes to read at most.
 
     Raises:
@@ -68,7 +69,7 @@ def _read(path: Path, offset: int, count: int) -> bytes:
 
 
 def _decode(data: bytes) -> tuple[str, int]:
-    """Decode UTF-8; an unfinished character at the end is left for the next read, unless it is all there is."""
+    """Decode UTF-8; an unfinished character at the end is left for the next read if it can be."""
     decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")
     text = decoder.decode(data)
     rest = len(decoder.getstate()[0])

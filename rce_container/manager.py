@@ -30,6 +30,7 @@ from rce_container import core
 from rce_container.environment import messages as m
 from rce_container.environment import proc
 from rce_container.environment.channel import connect
+from rce_container.environment.process import strike_all
 from rce_container.exceptions import ContainerError, StateError
 from rce_container.folder import ContainerFolder, Record
 from rce_container.logs import read_log
@@ -46,7 +47,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 ROS_PORT = 11311
-_STRIKE_PAUSE_S = 0.02
 
 
 class Manager:
@@ -180,8 +180,7 @@ class Manager:
         try:
             channel = await connect(str(folder.control_socket))
         except OSError:
-            while proc.strike(folder.mark):
-                await asyncio.sleep(_STRIKE_PAUSE_S)
+            await strike_all(folder.mark)
             await asyncio.to_thread(folder.remove)
         else:  # it lives, but its manager died before it could note who it is
             channel.send(m.encode(m.Stop()))

@@ -20,7 +20,7 @@ from rce_container.environment import messages as m
 from rce_container.environment import proc
 from rce_container.environment.channel import Channel, connect
 from rce_container.environment.exceptions import ChannelError
-from rce_container.exceptions import StartError
+from rce_container.exceptions import KillError
 from rce_container.folder import ContainerFolder
 from rce_container.logs import read_log
 from rce_container.runtimes.base import Handle
@@ -241,6 +241,6 @@ class Unit:
                 await self.handle.wait()
         try:
             await self.handle.kill()
-        except StartError as error:
+        except KillError as error:
             log.error("container %s: %s", self.id, error)  # noqa: TRY400 - its text says it all
         await asyncio.to_thread(self.folder.remove)

@@ -27,7 +27,8 @@ class UsageMeter:
             containers: Pid of the outermost process and counters of the interfaces, by id.
 
         Returns:
-            The usage by id. Memory is the proportional share (PSS), or the resident size where that may not be read.
+            The usage by id. Memory is the proportional share (PSS), or the resident size where that may not
+            be read.
         """
         self._round += 1
         processes = proc.table()

@@ -1,1 +1,4 @@
-"""What runs inside a container: its ROS core, its nodes, parameters and interfaces. Imports little, to start fast."""
+"""What runs inside a container: its ROS core, nodes, parameters and interfaces.
+
+It imports little, to start fast.
+"""

@@ -1,4 +1,4 @@
-"""``python -m rce_container.environment BOOT``: the first process of a container. Started by the manager only."""
+"""``python -m rce_container.environment BOOT``: the first process of a container."""
 
 from __future__ import annotations
 

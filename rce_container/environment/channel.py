@@ -21,13 +21,14 @@ _CLOEXEC = getattr(socket, "MSG_CMSG_CLOEXEC", 0)
 
 
 class Channel:
-    """One end of a connected unix stream socket. A descriptor arrives no later than the line it was sent with.
+    """One end of a connected unix stream socket.
 
+    A descriptor arrives no later than the line it was sent with.
     One task receives; anybody sends. The channel owns the socket and the descriptors that nobody took.
     """
 
     def __init__(self, sock: socket.socket) -> None:
-        sock.setblocking(False)  # noqa: FBT003
+        sock.setblocking(False)
         self._sock = sock
         self._loop = asyncio.get_running_loop()
         self._received = bytearray()
@@ -68,7 +69,7 @@ class Channel:
         return self._fds.popleft()
 
     def send(self, line: bytes, fd: int | None = None) -> None:
-        """Send a line, and a duplicate of ``fd`` with it. Never blocks; does nothing once the channel is closed.
+        """Send a line, and a duplicate of ``fd`` with it. Never blocks; does nothing on a closed channel.
 
         A peer that leaves more than :data:`MAX_UNSENT` bytes unread is given up: the channel closes.
         """
@@ -152,7 +153,7 @@ def _wake(waiting: asyncio.Future[None]) -> None:
 async def accept(listener: socket.socket, take: Callable[[socket.socket], None]) -> None:
     """Give every connection that comes in on a listening socket to ``take``, until cancelled."""
     loop = asyncio.get_running_loop()
-    listener.setblocking(False)  # noqa: FBT003
+    listener.setblocking(False)
     while True:
         sock, _ = await loop.sock_accept(listener)
         try:
@@ -171,7 +172,7 @@ async def connect(path: str) -> Channel:
     """
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        sock.setblocking(False)  # noqa: FBT003
+        sock.setblocking(False)
         await asyncio.get_running_loop().sock_connect(sock, path)
     except BaseException:
         sock.close()

@@ -24,12 +24,12 @@ from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce.ros.xmlrpc import RpcClient
 from rce_container.environment import messages as m
-from rce_container.environment import proc
 from rce_container.environment.channel import Channel, accept
 from rce_container.environment.exceptions import ChannelError
 from rce_container.environment.interfaces import InterfaceMaker, Readiness
 from rce_container.environment.nodes import NodeSet, Workshop
 from rce_container.environment.parameters import Values, difference, evaluate_all
+from rce_container.environment.process import strike_all
 from rce_container.environment.reach import ContainerHub, Operator
 from rce_container.environment.reaper import Reaper
 
@@ -39,14 +39,14 @@ NODE_NAME = "rce_environment"
 """The environment's own node in the container's graph."""
 
 _MAX_UNTOLD = 100
-_STRIKE_PAUSE_S = 0.02
 _GET_PID_TIMEOUT_S = 5.0
 
 
 class Environment:
     """One container from the inside. Its :meth:`run` lives as long as the container.
 
-    It ends when a manager says so, when :meth:`end` is called, or when no manager was connected for the grace time.
+    It ends when a manager says so, when :meth:`end` is called, or when no manager was connected for the
+    grace time.
 
     Args:
         boot: What the manager says of the container.
@@ -117,8 +117,7 @@ class Environment:
         await self._endpoint.close()
         await self._nodes.close()
         if not self._boot.isolated:
-            while proc.strike(self._boot.mark):
-                await asyncio.sleep(_STRIKE_PAUSE_S)
+            await strike_all(self._boot.mark)
         self._report()
         for service in services:
             service.cancel()

@@ -12,6 +12,7 @@ from rce.ros import names
 from rce.ros.errors import RosError
 
 if TYPE_CHECKING:
+    from rce.control.model import InterfaceSpec
     from rce.ros.node import Node, Publisher, Service, ServiceClient, Subscriber
     from rce.ros.types import TypeRegistry
 
@@ -177,17 +178,19 @@ class InterfaceMaker:
         """
         spec = port.spec
         try:
-            kind = InterfaceType.parse(spec.type)
-            if kind.form is not Form.INTERFACE:
-                raise ValueError(f"a container has no {spec.type}; use {kind.role.value}Interface")
-            if not spec.addr or not names.is_graph_name(spec.addr):
-                raise ValueError(
-                    f"addr {spec.addr!r} is no ROS name; give the topic or service it stands for"
-                )
-            if kind.role.is_service:
-                self._types.service(spec.cls)
-            else:
-                self._types.message(spec.cls)
+            kind = self._check(spec)
         except (ValueError, LookupError, RosError, OSError) as error:
             raise InterfaceError(f"interface {spec.tag}: {error}") from error
-        return _KINDS[kind.role](port, self._node, self._readiness)
+        return kind(port, self._node, self._readiness)
+
+    def _check(self, spec: InterfaceSpec) -> type[RosInterface]:
+        kind = InterfaceType.parse(spec.type)
+        if kind.form is not Form.INTERFACE:
+            raise ValueError(f"a container has no {spec.type}; use {kind.role.value}Interface")
+        if not spec.addr or not names.is_graph_name(spec.addr):
+            raise ValueError(f"addr {spec.addr!r} is no ROS name; give the topic or service it stands for")
+        if kind.role.is_service:
+            self._types.service(spec.cls)
+        else:
+            self._types.message(spec.cls)
+        return _KINDS[kind.role]

@@ -1,7 +1,8 @@
-"""Logs of bounded size: a row of segments, each named by the offset of its first byte (``echo.000001048576.log``).
+"""Logs of bounded size: rows of segments, each named by the offset of its first byte.
 
-An offset counts the bytes since the log began, so it stays valid when old segments are thrown away, and a reader in
-another process needs nothing but the folder.
+``echo.000001048576.log`` holds the log of ``echo`` after its first megabyte.
+An offset counts the bytes since the log began, so it stays valid when old segments are thrown away, and a
+reader in another process needs nothing but the folder.
 """
 
 from __future__ import annotations

@@ -1,12 +1,10 @@
 """The messages between the manager and an environment (JSON lines on the control socket, tagged by ``t``).
 
-Both are of one release and run on one machine. A manager may die and another one come: the newest connection is
-the one that counts, and the first thing an environment says on it is a :class:`Report`.
+Both are of one release and run on one machine. A manager may die and another one come: the newest connection
+is the one that counts, and the first thing an environment says on it is a :class:`Report`.
 """
 
 from __future__ import annotations
-
-from typing import Union
 
 import msgspec
 from msgspec import Struct
@@ -96,14 +94,14 @@ class Counters(_Message):
 
 
 class Dial(_Message):
-    """Asks for a connection to a peer, which the environment cannot reach by itself. Answered by :class:`Dialed`."""
+    """Asks for a connection to a peer that is out of reach from inside. Answered by :class:`Dialed`."""
 
     request: int
     address: LinkAddress
 
 
-ToEnvironment = Union[Apply, Handover, Dialed, Poll, Stop]
-ToManager = Union[Report, Fault, Counters, Dial]
+ToEnvironment = Apply | Handover | Dialed | Poll | Stop
+ToManager = Report | Fault | Counters | Dial
 
 encode = msgspec.json.Encoder().encode
 """Write a message as JSON; holds no newline."""

@@ -1,4 +1,4 @@
-"""The nodes of a container: each is a process group with a log and one task that owns it from start to end."""
+"""The nodes of a container: each is a process group with a log and one task that owns it."""
 
 from __future__ import annotations
 
@@ -12,14 +12,12 @@ from pathlib import Path
 
 from rce.control.model import NodeSpec, NodeState, NodeStatus
 from rce.ros.packages import PackageIndex
-from rce_container.environment import proc
 from rce_container.environment.exceptions import NodeError
 from rce_container.environment.launch import NODE_MARK, Launch, prepare
 from rce_container.environment.logs import LogWriter, Pump
+from rce_container.environment.process import strike_all
 from rce_container.environment.reaper import Child, Reaper
 
-_STRIKE_PAUSE_S = 0.02
-_STRIKES = 50
 _LAST_LINE_LENGTH = 300
 _REGISTERS_WITHIN_S = 10.0
 """A node that did not register with the ROS core for so long probably never will."""
@@ -60,7 +58,7 @@ class NodeSet:
         self._nodes: dict[str, _Node] = {}
 
     def apply(self, specs: Iterable[NodeSpec]) -> None:
-        """Start the nodes that are missing, stop those that are too many, restart those that are different now."""
+        """Start nodes that are missing, stop those that are too many, restart those that changed."""
         desired = {spec.tag: spec for spec in specs}
         for tag, node in self._nodes.items():
             if node.desired != desired.get(tag):
@@ -161,7 +159,7 @@ class _Node:
                     code = await self._watch(child)
                 finally:
                     child.signal_group(signal.SIGKILL)
-                    await _strike_all(launch.env[NODE_MARK])
+                    await strike_all(launch.env[NODE_MARK], variable=NODE_MARK)
             finally:
                 pump.close()
             self.settled_at = 0.0
@@ -219,14 +217,6 @@ class _Node:
     ) -> None:
         self.status = NodeStatus(tag=self._tag, state=state, pid=pid, exit_code=exit_code, detail=detail)
         self._workshop.on_change()
-
-
-async def _strike_all(mark: str) -> None:
-    """Kill what left the node's process group but carries its mark."""
-    for _ in range(_STRIKES):
-        if not proc.strike(mark, variable=NODE_MARK):
-            return
-        await asyncio.sleep(_STRIKE_PAUSE_S)
 
 
 def describe_exit(code: int) -> str:

@@ -23,7 +23,7 @@ class Difference(NamedTuple):
 
 
 def difference(now: Values, desired: Values) -> Difference:
-    """Work out what to change. A value of equal content but another type (``1``, ``1.0``, ``True``) is a change."""
+    """Work out what to change. An equal value of another type (``1``, ``1.0``, ``True``) is a change."""
     changed = {
         name: value for name, value in desired.items() if name not in now or not _same(now[name], value)
     }

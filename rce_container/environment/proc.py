@@ -1,7 +1,7 @@
-"""Processes as ``/proc`` shows them: who descends from whom, who carries a mark, who is really the same process.
+"""Processes as ``/proc`` shows them: who descends from whom, who carries a mark, who is still the same.
 
-Runs inside containers too, and as a script (``proc.py MARK``: kill all that carry the mark), so it imports nothing
-but the standard library. Where there is no ``/proc`` the functions find nothing.
+Runs inside containers too, and as a script (``proc.py MARK``: kill all that carry the mark), so it imports
+nothing but the standard library. Where there is no ``/proc`` the functions find nothing.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import time
 from typing import NamedTuple
 
 MARK = "RCE_MARK"
-"""Environment variable that every process of a container carries; its value names one life of one container."""
+"""Environment variable of every process of a container without isolation; names one life of it."""
 
 _PROC = "/proc"
 _PAGE = os.sysconf("SC_PAGE_SIZE")
@@ -24,7 +24,7 @@ _PAUSE_S = 0.02
 
 
 class Process(NamedTuple):
-    """One process. Two readings with equal ``pid`` and ``start`` are the same process; a reused pid has another start."""
+    """One process. It is told by ``pid`` and ``start``: a reused pid has another start."""
 
     pid: int
     start: int
@@ -62,7 +62,7 @@ def read(pid: int) -> Process | None:
 def table() -> dict[int, Process]:
     """Read all living processes."""
     try:
-        names = os.listdir(_PROC)
+        names = os.listdir(_PROC)  # noqa: PTH208
     except OSError:
         return {}
     found = (read(int(name)) for name in names if name.isdigit())

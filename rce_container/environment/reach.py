@@ -1,4 +1,7 @@
-"""The container's way to its peers: links come in on a socket that was made outside, and go out through the manager."""
+"""The container's way to its peers.
+
+Links come in on a socket that was made outside, and go out through the manager.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +41,8 @@ class Operator:
             OSError: The peer cannot be reached, or there is no manager now.
         """
         number = next(self._numbers)
-        answer = self._asked[number] = asyncio.get_running_loop().create_future()
+        answer: asyncio.Future[socket.socket] = asyncio.get_running_loop().create_future()
+        self._asked[number] = answer
         try:
             if not self._send(Dial(request=number, address=address)):
                 raise ConnectionError("there is no container manager to dial for this container")
@@ -73,7 +77,7 @@ class ContainerHub(LinkHub):
 
     async def listen(self, sock: socket.socket) -> None:
         """Accept links on a listening unix socket; it belongs to the hub from now on."""
-        sock.setblocking(False)  # noqa: FBT003
+        sock.setblocking(False)
         self._servers.append(await self.loop.create_unix_server(self._accept, sock=sock, backlog=128))
 
     async def connect(self, spec: LinkSpec) -> Carrier:

@@ -40,8 +40,8 @@ class Child:
 class Reaper:
     """Waits for every child of this process, so that orphans which the kernel hands to it leave no zombie.
 
-    Use as a context manager in the main thread, one per process, and start processes by :meth:`spawn` only: it
-    collects exit codes that nobody else will see then.
+    Use as a context manager in the main thread, one per process, and start processes by :meth:`spawn` only:
+    it collects exit codes that nobody else will see then.
     """
 
     def __init__(self) -> None:
@@ -49,7 +49,7 @@ class Reaper:
         self._before: Any = None
 
     def __enter__(self) -> Self:
-        # Not loop.add_signal_handler: uvloop keeps this signal for its own subprocesses, of which there are none.
+        # Not loop.add_signal_handler: uvloop keeps this signal for subprocesses of its own.
         loop = asyncio.get_running_loop()
         self._before = signal.signal(signal.SIGCHLD, lambda *_: loop.call_soon_threadsafe(self._reap))
         return self

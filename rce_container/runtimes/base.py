@@ -1,8 +1,8 @@
 """What a runtime is: the way in which a container's first process is started and all its processes are ended.
 
-Whatever the runtime, a container hangs on a *shim*, a shell in a session of its own that outlives the manager. It
-starts the environment, waits for it, and removes the container's folders after it. After an environment that did not
-end properly it lingers, so that a manager can look at what is left.
+Whatever the runtime, a container hangs on a *shim*, a shell in a session of its own that outlives the
+manager. It starts the environment, waits for it, and removes the container's folders after it. After an
+environment that did not end properly it lingers, so that a manager can look at what is left.
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
+import msgspec
+
 from rce_container.environment import proc
 from rce_container.environment.logs import ENVIRONMENT_LOG, segment_path
 from rce_container.environment.messages import Boot, encode
-from rce_container.exceptions import StartError
+from rce_container.exceptions import KillError, StartError
 from rce_container.folder import ContainerFolder
 
 SHELL = "/bin/sh"
@@ -89,7 +91,7 @@ class Handle:
         """Kill all processes of the container, and wait until none is left.
 
         Raises:
-            StartError: Some process does not die, not even by SIGKILL.
+            KillError: Some process does not die, not even by SIGKILL.
         """
         seen: dict[int, proc.Process] = {}
         loop = asyncio.get_running_loop()
@@ -104,7 +106,7 @@ class Handle:
             if not left:
                 break
             if loop.time() > deadline:
-                raise StartError(f"processes that cannot be killed: {sorted(one.pid for one in left)}")
+                raise KillError(f"processes that cannot be killed: {sorted(one.pid for one in left)}")
             for one in left:
                 proc.kill(one)
             await asyncio.sleep(_KILL_PAUSE_S)
@@ -178,8 +180,6 @@ class Runtime(ABC):
 
 def encode_boot(boot: Boot, home: str, logs: str) -> str:
     """Write what the environment is told, with its paths."""
-    import msgspec
-
     return encode(msgspec.structs.replace(boot, home=home, logs=logs)).decode()
 
 
@@ -205,8 +205,13 @@ def source_root() -> Path:
 async def _readable(fd: int) -> None:
     loop = asyncio.get_running_loop()
     ready = loop.create_future()
-    loop.add_reader(fd, lambda: ready.done() or ready.set_result(None))
+    loop.add_reader(fd, _wake, ready)
     try:
         await ready
     finally:
         loop.remove_reader(fd)
+
+
+def _wake(ready: asyncio.Future[None]) -> None:
+    if not ready.done():
+        ready.set_result(None)

@@ -1,14 +1,14 @@
 """The runtime of Linux namespaces, made by bubblewrap.
 
-A container has its own user, pid, mount, network, ipc, uts and cgroup namespaces. Its root is read-only and holds the
-system's programs, the engine's Python and the packages; its home and /tmp are private. The environment is process 1:
-when it dies, however that happens, the kernel kills every other process of the container. Shim, bubblewrap and
-environment are tied to each other, so that none outlives the one outside of it.
+A container has its own user, pid, mount, network, ipc, uts and cgroup namespaces. Its root is read-only and
+holds the
+system's programs, the engine's Python and the packages; its home and /tmp are private. The environment is
+process 1: when it dies, however that happens, the kernel kills every other process of the container. Shim,
+bubblewrap and environment are tied to each other, so that none outlives the one outside of it.
 """
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 import sys
@@ -74,7 +74,7 @@ class NamespaceRuntime(Runtime):
             words = found.stderr.strip().splitlines()
             raise RuntimeUnavailableError(self.name, words[-1] if words else f"exit code {found.returncode}")
 
-    def paths(self, folder: ContainerFolder) -> tuple[str, str]:
+    def paths(self, folder: ContainerFolder) -> tuple[str, str]:  # noqa: ARG002
         """The same in every container."""
         return HOME, LOGS
 
@@ -122,7 +122,7 @@ def _system() -> list[str]:
     options = ["--ro-bind", "/usr", "/usr"]
     for path in map(Path, _SYSTEM):
         if path.is_symlink():
-            options += ["--symlink", os.readlink(path), str(path)]
+            options += ["--symlink", str(path.readlink()), str(path)]
         elif path.is_dir():
             options += ["--ro-bind", str(path), str(path)]
     return [*options, "--ro-bind-try", "/opt/ros", "/opt/ros"]
