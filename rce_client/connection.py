@@ -14,7 +14,7 @@ import asyncio
 import logging
 from collections import deque
 from enum import Enum
-from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, Self, TypeVar, overload
 
 from rce.protocol.codec import encode
 from rce.protocol.messages import DataMessage, ErrorReport, InterfaceStatus
@@ -43,6 +43,10 @@ E = TypeVar("E", bound="End")
 
 Json = dict[str, Any]
 """A message as an object of its fields; binary values are bytes-like."""
+
+
+CONNECTING = "looking for the engine"
+"""The words of the first report of an attempt; the reports of failures tell what went wrong."""
 
 
 class State(Enum):
@@ -176,6 +180,11 @@ class Connection(Requests):
         for request in self._desired.undo():
             await self.request(request)
 
+    async def repeat_requests(self) -> None:
+        """Ask again for everything that was made, because something that it needs may be there by now."""
+        for request in self._desired.restore():
+            await self.request(request)
+
     # Own interfaces
 
     @overload
@@ -278,6 +287,16 @@ class Connection(Requests):
                 f"interface {tag} did not become active within {timeout:g} s.{hint}"
             ) from error
 
+    async def wait_refused(self) -> NoReturn:
+        """Wait until the engine refuses this client for good; any other loss is repaired meanwhile.
+
+        Raises:
+            RefusedError: It did.
+            NotConnectedError: The program closed the connection.
+        """
+        while True:
+            await self._until(lambda: False)
+
     # What the ends use: rce_client.ends.Way
 
     def post_data(self, tag: str, frames: Sequence[Frame]) -> bool:
@@ -310,7 +329,7 @@ class Connection(Requests):
 
     def on_connecting(self) -> None:
         """An attempt to connect begins."""
-        self._set_state(State.CONNECTING, "looking for the engine")
+        self._set_state(State.CONNECTING, CONNECTING)
 
     def on_failure(self, error: ClientError) -> None:
         """It failed."""

@@ -21,14 +21,14 @@ _LOOPBACK = "127.0.0.1"
 
 
 @app.command()
-def robot(  # noqa: PLR0917 - the options of the program
+def robot(
     master: Annotated[str, typer.Argument(metavar="MASTER_IP", help="Host or address of the master.")],
     control_port: Annotated[int, typer.Option(help="The master's port for task sets.")] = 8080,
     ws_port: Annotated[int, typer.Option(help="Port that robots connect to; 0 takes a free one.")] = 9010,
     link_port: Annotated[
-        int,
-        typer.Option(help="Port for data links between robots of different processes; 0 takes a free one."),
-    ] = 0,
+        int | None,
+        typer.Option(help="Port for data links; 0 takes a free one [default: 10030, or a free one]"),
+    ] = None,
     bind: Annotated[str, typer.Option(help="Address to listen on [default: all]")] = "",
     public_url: Annotated[
         str, typer.Option(help="WebSocket URL that robots are sent to, if it is another.")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
+import errno
+import ipaddress
 import os
 import secrets
 import signal
@@ -14,7 +15,9 @@ from typing import TYPE_CHECKING
 
 import psutil
 
+from rce.config.exceptions import ShippedFileError
 from rce.config.folders import run_dir
+from rce.config.resources import examples_dir
 from rce.control.channel import TaskSetChannel
 from rce.control.messages import MachineInfo
 from rce.control.model import LinkAddress
@@ -33,7 +36,10 @@ if TYPE_CHECKING:
 
     from rce.config.secret import Secret
 
-_log = logging.getLogger(__name__)
+DEFAULT_LINK_PORT = 10030
+
+_SOMEWHERE = "192.0.2.1"
+"""An address that nobody has (RFC 5737); the way to it is the way to everybody outside."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,7 +76,7 @@ class App:
         machine = settings.machine or socket.gethostname()
         reach = _own_address(self.master, self.control_port) if _is_any(settings.host) else settings.host
         name = f"robot_{secrets.token_hex(4)}"
-        types = TypeRegistry(PackageIndex([*self.packages, *PackageIndex.from_environ().path]))
+        types = TypeRegistry(_package_index(self.packages))
         hub = LinkHub(machine)
         try:
             address = await _listen(hub, machine, name, reach, settings)
@@ -97,6 +103,14 @@ class App:
             await hub.close()
 
 
+def _package_index(given: Sequence[Path]) -> PackageIndex:
+    """Return the packages on the given path, then on the environment's, then those that are shipped."""
+    path = [*given, *PackageIndex.from_environ().path]
+    with contextlib.suppress(ShippedFileError):
+        path.append(examples_dir())
+    return PackageIndex(path)
+
+
 async def _announce(channel: TaskSetChannel, url: str, ready: Callable[[str], None]) -> None:
     """Say that robots can come, once the master knows where to send them."""
     await channel.wait_connected()
@@ -107,8 +121,19 @@ async def _listen(hub: LinkHub, machine: str, name: str, reach: str, settings: R
     """Accept links on a unix socket and on TCP; return where."""
     path = run_dir() / f"{name}.sock"
     await hub.listen_unix(path)
-    port = await hub.listen_tcp(settings.host, settings.link_port)
+    port = await _listen_tcp(hub, settings.host, settings.link_port)
     return LinkAddress(machine=machine, unix=str(path), host=reach, port=port)
+
+
+async def _listen_tcp(hub: LinkHub, host: str, port: int | None) -> int:
+    if port is not None:
+        return await hub.listen_tcp(host, port)
+    try:
+        return await hub.listen_tcp(host, DEFAULT_LINK_PORT)
+    except OSError as error:
+        if error.errno != errno.EADDRINUSE:
+            raise
+    return await hub.listen_tcp(host, 0)
 
 
 async def _bind(host: str, port: int) -> socket.socket:
@@ -133,13 +158,23 @@ def _is_any(host: str) -> bool:
 
 
 def _own_address(master: str, port: int) -> str:
-    """Return the address of this machine on the way to the master; nothing is sent for it."""
+    """Return the address of this machine on the way to the master, or outside if the master is here.
+
+    Nothing is sent for it.
+    """
+    found = _address_towards(master, port)
+    if found is None or ipaddress.ip_address(found).is_loopback:
+        found = _address_towards(_SOMEWHERE, port)
+    return found or "127.0.0.1"
+
+
+def _address_towards(host: str, port: int) -> str | None:
     with contextlib.suppress(OSError):
-        family, _, _, _, address = socket.getaddrinfo(master, port, type=socket.SOCK_DGRAM)[0]
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         with socket.socket(family, socket.SOCK_DGRAM) as probe:
             probe.connect(address)
-            return str(probe.getsockname()[0])
-    return "127.0.0.1"
+            return str(probe.getsockname()[0]).partition("%")[0]
+    return None
 
 
 def _in_url(host: str) -> str:

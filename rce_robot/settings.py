@@ -37,7 +37,8 @@ class RobotSettings:
 
     host: str = "0.0.0.0"  # noqa: S104 - robots come from everywhere
     ws_port: int = 9010
-    link_port: int = 10030
+    link_port: int | None = None
+    """Port for data links; None is 10030, or a free one where that is taken. The master tells it to peers."""
     public_url: str = ""
     """Where clients are sent; made of this machine's address and the port if empty."""
     machine: str = ""

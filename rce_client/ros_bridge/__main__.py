@@ -1,0 +1,174 @@
+"""The program ``rce-ros``: a robot's ROS graph in the cloud, by one config file."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+import uvloop
+
+from rce.config.client import load
+from rce.config.exceptions import ConfigError, ShippedFileError
+from rce.config.resources import examples_dir
+from rce.ros.errors import RosError
+from rce.ros.packages import PackageIndex
+from rce.ros.types import TypeRegistry
+from rce_client.connection import CONNECTING, Connection, State
+from rce_client.exceptions import ClientError
+from rce_client.ros_bridge.bridge import build, joined_graph, wait_ready
+from rce_client.ros_bridge.plan import check, make_plan
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from rce.config.client import ClientConfig
+    from rce_client.ros_bridge.plan import Plan
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+BAD_CONFIG = 2
+FAILED = 1
+DEFAULT_MASTER = "http://localhost:11311/"
+
+
+@app.command()
+def bridge(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="The robot's config file, JSON or YAML.")],
+    check_only: Annotated[
+        bool, typer.Option("--check", help="Only check the file and say what is in it.")
+    ] = False,
+    ros_master_uri: Annotated[
+        str, typer.Option(envvar="ROS_MASTER_URI", help="The robot's ROS master.")
+    ] = DEFAULT_MASTER,
+    package_path: Annotated[
+        list[Path] | None, typer.Option(help="Folder with packages that define messages; may be repeated.")
+    ] = None,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log more.")] = False,
+) -> None:
+    """Join a robot's ROS graph to the engine as CONFIG says, until stopped; then remove what was made."""
+    level = logging.DEBUG if verbose else logging.WARNING
+    logging.basicConfig(level=level, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    types = TypeRegistry(_packages(package_path or ()))
+    try:
+        read = load(config)
+        check(read, types, str(config))
+    except ConfigError as error:
+        print(error, file=sys.stderr)  # noqa: T201
+        raise typer.Exit(BAD_CONFIG) from error
+    plan = make_plan(read)
+    for tag in plan.unbridged:
+        say(f"interface {tag} has no addr, so nothing in the robot's ROS graph is joined to it")
+    if check_only:
+        print(summary(read, plan))  # noqa: T201
+        return
+    try:
+        uvloop.run(run(read, plan, types, ros_master_uri))
+    except (ClientError, RosError) as error:
+        print(f"rce-ros: {error}", file=sys.stderr)  # noqa: T201
+        raise typer.Exit(FAILED) from error
+
+
+async def run(config: ClientConfig, plan: Plan, types: TypeRegistry, master_uri: str) -> None:
+    """Bridge until SIGINT or SIGTERM. A second signal ends the program at once, and leaves what it made.
+
+    Raises:
+        ClientError: The engine does not take this robot.
+        RosError: The robot's graph does not take part.
+    """
+    task = asyncio.current_task()
+    assert task is not None
+    loop = asyncio.get_running_loop()
+
+    def on_signal(number: signal.Signals) -> None:
+        loop.remove_signal_handler(number)
+        signal.signal(number, signal.SIG_DFL)
+        task.cancel()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, on_signal, number)
+    try:
+        await serve(config, plan, types, master_uri)
+    except asyncio.CancelledError:
+        task.uncancel()
+
+
+async def serve(config: ClientConfig, plan: Plan, types: TypeRegistry, master_uri: str) -> None:
+    """Bridge until cancelled or refused, then remove what was made."""
+    conn = Connection(
+        config.url,
+        config.user,
+        config.password.get_secret_value(),
+        config.robot,
+        on_error=lambda text: say(f"engine: {text}"),
+        on_state=_tell_state,
+    )
+    async with joined_graph(config.robot, master_uri, types, say) as node, conn:
+        try:
+            await build(plan, conn, node)
+            await wait_ready(plan, conn, say)
+            print(f"rce-ros ready: robot {config.robot} connected", flush=True)  # noqa: T201
+            await conn.wait_refused()
+        except asyncio.CancelledError:
+            current = asyncio.current_task()
+            assert current is not None
+            current.uncancel()  # told to stop: what follows must not be cancelled again
+            await remove(conn)
+        except (ClientError, RosError):
+            await remove(conn)
+            raise
+
+
+async def remove(conn: Connection) -> None:
+    """Remove what was made, if the engine is there."""
+    if conn.connected:
+        say("removing what was made")
+        await conn.remove_all()
+    else:
+        say("the engine is away; what was made there stays")
+
+
+def summary(config: ClientConfig, plan: Plan) -> str:
+    """Say in words what a config file asks for."""
+    lines = [f"{config.robot} of user {config.user} at {config.url}"]
+    lines += [f"  container {item.tag}" for item in config.containers]
+    lines += [
+        f"  node {item.container}/{item.tag}: {item.pkg} {item.exe} {item.args}".rstrip()
+        for item in config.nodes
+    ]
+    lines += [f"  parameter {item.container}: {item.name} = {item.value!r}" for item in config.parameters]
+    lines += [f"  {span}" for span in plan.spans]
+    lines += [f"  connection {link.a} - {link.b}" for link in config.connections]
+    return "\n".join(lines)
+
+
+def say(text: str) -> None:
+    """Tell the user something that is no result."""
+    print(f"rce-ros: {text}", file=sys.stderr, flush=True)  # noqa: T201
+
+
+def _tell_state(state: State, words: str) -> None:
+    if state in (State.LOST, State.RESTORED) or (state is State.CONNECTING and words != CONNECTING):
+        say(f"{state.value}: {words}")
+
+
+def _packages(given: Iterable[Path]) -> PackageIndex:
+    """Return the packages on the given path, then on the environment's, then those that are shipped."""
+    path = [*given, *PackageIndex.from_environ().path]
+    with contextlib.suppress(ShippedFileError):
+        path.append(examples_dir())
+    return PackageIndex(path)
+
+
+def main() -> None:
+    """Run the program."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

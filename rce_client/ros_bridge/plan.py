@@ -1,0 +1,122 @@
+"""What is to be bridged, made of a robot's config. Pure, apart from looking up message types.
+
+An interface of the robot with an ``addr`` ends in the robot's ROS graph. It is made as a Forwarder, whatever
+the file says: messages are serialized at both ends, so nothing is gained by taking them apart on the way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from rce.config.exceptions import ConfigError, Fault
+from rce.protocol.messages import ConfigureComponents
+from rce.protocol.names import Form, InterfaceType, Role
+from rce.ros.types import TypesError
+
+if TYPE_CHECKING:
+    from rce.config.client import ClientConfig
+    from rce.protocol.messages import Request
+    from rce.ros.types import TypeRegistry
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """One interface that ends in the robot's graph."""
+
+    tag: str
+    role: Role
+    """As the engine names it: a robot's sensor is a ``SUBSCRIBER``."""
+    cls: str
+    addr: str
+    """Topic or service in the robot's graph."""
+
+    @property
+    def type(self) -> str:
+        """The interface type that is asked for."""
+        return str(InterfaceType(self.role, Form.FORWARDER))
+
+    def __str__(self) -> str:
+        return f"{self.tag}: {_WORDS[self.role].format(self.addr)}, {self.cls}"
+
+
+_WORDS = {
+    Role.SUBSCRIBER: "topic {} to the cloud",
+    Role.PUBLISHER: "topic {} from the cloud",
+    Role.SERVICE_PROVIDER: "service {}, answered in the cloud",
+    Role.SERVICE_CLIENT: "service {}, called from the cloud",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """All that ``rce-ros`` does for one robot."""
+
+    robot: str
+    spans: tuple[Span, ...]
+    requests: tuple[Request, ...]
+    """What else is asked of the engine, in order; those of :attr:`first` before the spans are made."""
+    first: int
+    awaited: frozenset[str]
+    """Tags of spans that the file connects, so that they become active."""
+    unbridged: tuple[str, ...]
+    """Tags of the robot's interfaces that have no ``addr`` and so end nowhere."""
+
+
+def make_plan(config: ClientConfig) -> Plan:
+    """Plan the bridge of a robot."""
+    spans = tuple(
+        Span(item.tag, item.kind.role, item.cls, item.addr) for item in config.robot_interfaces if item.addr
+    )
+    bridged = {span.tag for span in spans}
+    requests = [_without(request, config.robot, bridged) for request in config.setup()]
+    first = sum(1 for _ in config.containers)
+    ends = {end for link in config.connections for end in (link.a, link.b)}
+    return Plan(
+        robot=config.robot,
+        spans=spans,
+        requests=tuple(requests),
+        first=first,
+        awaited=frozenset(tag for tag in bridged if f"{config.robot}/{tag}" in ends),
+        unbridged=tuple(item.tag for item in config.robot_interfaces if not item.addr),
+    )
+
+
+def check(config: ClientConfig, types: TypeRegistry, source: str) -> None:
+    """Check what only matters to a bridge.
+
+    Raises:
+        ConfigError: A class is not known here, or a topic would go round in circles; every fault is listed.
+    """
+    faults = []
+    directions: dict[str, Role] = {}
+    for index, item in enumerate(config.interfaces):
+        if item.endpoint != config.robot or not item.addr:
+            continue
+        place = f"interfaces[{index}]"
+        try:
+            if item.kind.role.is_service:
+                types.service(item.cls)
+            else:
+                types.message(item.cls)
+        except TypesError as error:
+            faults.append(Fault(f"{place}.iCls", str(error)))
+        name = item.addr.lstrip("/")
+        if directions.setdefault(name, item.kind.role) is item.kind.role.complement:
+            faults.append(Fault(f"{place}.addr", f"{item.addr} goes to the cloud and comes from it: a loop"))
+    if faults:
+        raise ConfigError(source, faults)
+
+
+def _without(request: Request, endpoint: str, tags: set[str]) -> Request:
+    """Leave out the interfaces that the bridge makes itself."""
+    if not isinstance(request, ConfigureComponents):
+        return request
+    kept = tuple(
+        item
+        for item in request.add_interfaces
+        if item.endpoint_tag != endpoint or item.interface_tag not in tags
+    )
+    return msgspec.structs.replace(request, add_interfaces=kept)
