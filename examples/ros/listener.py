@@ -1,0 +1,15 @@
+"""Prints what is said on /chatter: ``python listener.py [chatter:=other_topic]``."""
+
+import asyncio
+
+from rce.ros.node import Node
+
+
+async def main() -> None:
+    """Run the node."""
+    async with Node("listener") as node:
+        async for message in await node.subscribe("chatter", "std_msgs/String"):
+            print(message.data, flush=True)
+
+
+asyncio.run(main())

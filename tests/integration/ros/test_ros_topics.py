@@ -1,0 +1,292 @@
+"""Topics between our nodes through our core."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+import pytest
+
+from rce.ros.core import Core
+from rce.ros.errors import MasterUnreachable, NodeClosed, TypeMismatch
+from rce.ros.node import Node, Subscriber
+from rce.ros.tcpros.header import encode_header
+from rce.ros.types import TypeRegistry
+from rce.ros.xmlrpc import RpcClient
+
+MakeNode = Callable[..., Node]
+STRING = "std_msgs/String"
+
+
+async def collect(subscriber: Subscriber, count: int) -> list[str]:
+    found = []
+    async with asyncio.timeout(20):
+        async for message in subscriber:
+            found.append(message.data)
+            if len(found) == count:
+                break
+    return found
+
+
+@pytest.mark.parametrize("size", [0, 3, 65531, 65532, 65536, 131072, 1_000_000, 10_000_000, 20_000_000])
+async def test_messages_of_any_size(make_node: MakeNode, size: int) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+        received: asyncio.Queue[tuple[bytes, bool]] = asyncio.Queue()
+        await b.subscribe_serialized(
+            "t", STRING, lambda payload, latched: received.put_nowait((payload, latched))
+        )
+        publisher = await a.advertise("t", STRING)
+        await publisher.wait_for_subscribers(timeout=10)
+        payload = publisher.type.serialize({"data": "x" * size})
+        for body in (payload, publisher.type.serialize({"data": "small"}), payload):
+            publisher.publish_serialized(body)
+            assert await asyncio.wait_for(received.get(), 20) == (body, False)
+
+
+async def test_many_messages_arrive_whole_and_in_order(make_node: MakeNode) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+        subscriber = await b.subscribe("t", STRING, queue_size=5000)
+        publisher = await a.advertise("t", STRING, queue_size=5000)
+        await publisher.wait_for_subscribers(timeout=10)
+        sent = [str(number) * (number % 300) for number in range(3000)]
+        for text in sent:
+            publisher.publish(data=text)
+        assert await collect(subscriber, len(sent)) == sent
+        assert publisher.dropped == subscriber.dropped == 0
+
+
+async def test_a_latched_message_reaches_later_subscribers(make_node: MakeNode) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+        publisher = await a.advertise("t", STRING, latch=True)
+        publisher.publish(data="old")
+        publisher.publish(data="new")
+        received: asyncio.Queue[tuple[bytes, bool]] = asyncio.Queue()
+        await b.subscribe_serialized(
+            "t", "*", lambda payload, latched: received.put_nowait((payload, latched))
+        )
+        assert await asyncio.wait_for(received.get(), 10) == (b"\x03\0\0\0new", True)
+
+
+async def test_one_message_can_be_latched(make_node: MakeNode) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+        publisher = await a.advertise("t", STRING)
+        publisher.publish_serialized(b"\x04\0\0\0kept", latch=True)
+        publisher.publish_serialized(b"\x04\0\0\0gone")
+        assert await collect(await b.subscribe("t", STRING), 1) == ["kept"]
+
+
+async def test_many_publishers_and_subscribers(make_node: MakeNode) -> None:
+    async with make_node("a") as a, make_node("b") as b, make_node("c") as c, make_node("d") as d:
+        publishers = [await node.advertise("t", STRING) for node in (a, b)]
+        subscribers = [await node.subscribe("t", STRING) for node in (c, d)]
+        second = await c.subscribe("t", STRING)
+        for publisher in publishers:
+            await publisher.wait_for_subscribers(2, timeout=10)
+            publisher.publish(data=publisher.topic)
+        for subscriber in (*subscribers, second):
+            assert await collect(subscriber, 2) == ["/t", "/t"]
+        assert subscribers[0].connections == 2
+
+
+async def test_a_node_hears_itself(make_node: MakeNode) -> None:
+    async with make_node("a") as a:
+        subscriber = await a.subscribe("t", STRING)
+        publisher = await a.advertise("t", STRING)
+        await publisher.wait_for_subscribers(timeout=10)
+        publisher.publish(data="echo")
+        assert await collect(subscriber, 1) == ["echo"]
+
+
+async def test_names_are_resolved_and_remapped(core: Core, make_node: MakeNode) -> None:
+    argv = ["t:=/other", "__name:=renamed"]
+    async with make_node("a", namespace="ns", argv=argv) as a, make_node("b") as b:
+        await a.advertise("t", STRING)
+        await a.advertise("~private", STRING)
+        await a.advertise("relative", STRING)
+        assert a.name == "/ns/renamed"
+        topics = set(core.graph.topic_types)
+        assert topics == {"/rosout", "/other", "/ns/renamed/private", "/ns/relative"}
+        assert b.name == "/b"
+
+
+async def test_callbacks_are_called_in_order_and_may_fail(
+    make_node: MakeNode, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+        seen: list[str] = []
+        done = asyncio.Event()
+
+        async def slowly(message: object) -> None:
+            text = message.data  # type: ignore[attr-defined]
+            await asyncio.sleep(0.02 if text == "0" else 0)
+            seen.append(text)
+            if text == "1":
+                raise RuntimeError("as planned")
+            if text == "3":
+                done.set()
+
+        await b.subscribe("t", STRING, slowly)
+        publisher = await a.advertise("t", STRING)
+        await publisher.wait_for_subscribers(timeout=10)
+        for number in range(4):
+            publisher.publish(data=str(number))
+        await asyncio.wait_for(done.wait(), 10)
+        assert seen == ["0", "1", "2", "3"]
+        assert "as planned" in caplog.text
+
+
+async def test_a_subscriber_that_stops_reading_loses_its_own_oldest_messages(make_node: MakeNode) -> None:
+    async with make_node("a") as a, make_node("quick") as quick, RpcClient() as rpc:
+        publisher = await a.advertise("t", STRING, queue_size=3)
+        good = await quick.subscribe("t", STRING)
+        _, _, (_, host, port) = await rpc.call(a.uri, "requestTopic", ("/stalled", "/t", [["TCPROS"]]))
+        reader, writer = await asyncio.open_connection(host, port)
+        writer.write(encode_header({"callerid": "/stalled", "topic": "/t", "type": STRING, "md5sum": "*"}))
+        await publisher.wait_for_subscribers(2, timeout=10)
+        body = "x" * 2_000_000
+        for number in range(30):
+            publisher.publish(data=f"{number} {body}")
+            assert [text.split()[0] for text in await collect(good, 1)] == [str(number)]
+        assert publisher.dropped > 10
+        publisher.publish(data="last ")
+        found: list[str] = []
+        assert await read_frame(reader)  # the header
+        while not found or found[-1] != "last":
+            found.append((await read_frame(reader))[4:].decode().split(" ")[0])
+        assert found[0] == "0"
+        assert found[-3:] == ["28", "29", "last"]
+        assert len(found) < 20
+        writer.close()
+        await writer.wait_closed()
+
+
+async def read_frame(reader: asyncio.StreamReader) -> bytes:
+    async with asyncio.timeout(20):
+        return await reader.readexactly(int.from_bytes(await reader.readexactly(4), "little"))
+
+
+async def test_a_slow_program_loses_its_oldest_messages(make_node: MakeNode) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+        kept = await b.subscribe("t", STRING, queue_size=2)
+        all_of_them = await b.subscribe("t", STRING, queue_size=100)
+        publisher = await a.advertise("t", STRING)
+        await publisher.wait_for_subscribers(timeout=10)
+        for number in range(10):
+            publisher.publish(data=str(number))
+        await collect(all_of_them, 10)
+        assert await collect(kept, 2) == ["8", "9"]
+        assert kept.dropped == 8
+
+
+async def test_subscribers_follow_a_publisher_that_comes_back(make_node: MakeNode) -> None:
+    async with make_node("b") as b:
+        subscriber = await b.subscribe("t", STRING)
+        for incarnation in ("first", "second"):
+            async with make_node("a") as a:
+                publisher = await a.advertise("t", STRING)
+                await publisher.wait_for_subscribers(timeout=10)
+                publisher.publish(data=incarnation)
+                assert await collect(subscriber, 1) == [incarnation]
+
+
+async def test_a_lost_connection_is_made_again(make_node: MakeNode) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+        subscriber = await b.subscribe("t", STRING)
+        publisher = await a.advertise("t", STRING)
+        await publisher.wait_for_subscribers(timeout=10)
+        link = a._topics.outputs["/t"].links[0]
+        link.connection.abort()
+        await link.connection.gone.wait()
+        assert publisher.connections == 0
+        await publisher.wait_for_subscribers(timeout=10)
+        publisher.publish(data="again")
+        assert await collect(subscriber, 1) == ["again"]
+
+
+async def test_types_must_agree(core: Core, make_node: MakeNode, caplog: pytest.LogCaptureFixture) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+        publisher = await a.advertise("t", STRING)
+        with pytest.raises(TypeMismatch):
+            await a.advertise("t", "std_msgs/Bool")
+        wrong = await b.subscribe("t", "std_msgs/Bool")
+        with pytest.raises(TypeMismatch):
+            await b.subscribe("t", STRING)
+        async with asyncio.timeout(10):
+            while "md5 sum" not in caplog.text:
+                await asyncio.sleep(0.01)
+        assert publisher.connections == wrong.connections == 0
+        with pytest.raises(TypeMismatch):
+            publisher.publish(TypeRegistry().message("std_msgs/Bool").new(data=True))
+
+
+async def test_handles_share_a_topic_until_the_last_is_closed(core: Core, make_node: MakeNode) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+        first, second = await a.advertise("t", STRING), await a.advertise("t", STRING)
+        one, two = await b.subscribe("t", STRING), await b.subscribe("t", STRING)
+        await second.wait_for_subscribers(timeout=10)
+        await first.close()
+        await one.close()
+        second.publish(data="still here")
+        assert await collect(two, 1) == ["still here"]
+        with pytest.raises(NodeClosed):
+            first.publish(data="no")
+        assert [message async for message in one] == []
+        await second.close()
+        await two.close()
+        assert "/t" not in core.graph.topic_types
+
+
+async def test_leaving_unregisters_everything(core: Core, make_node: MakeNode) -> None:
+    async with make_node("a") as a:
+        await a.advertise("t", STRING)
+        await a.subscribe("u", STRING)
+        await a.advertise_service("s", "std_srvs/Empty", lambda request: None)
+        assert core.graph.system_state()[2] == [["/s", ["/a"]]]
+    assert core.graph.system_state() == [[], [], []]
+    with pytest.raises(NodeClosed):
+        await a.advertise("t", STRING)
+
+
+async def test_log_records_are_published(make_node: MakeNode) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+        a.log.warning("early %d", 1)
+        heard = await b.subscribe("/rosout", "rosgraph_msgs/Log")
+        found = []
+        async with asyncio.timeout(10):
+            async for record in heard:
+                found.append((record.name, record.level, record.msg))
+                if len(found) == 2:
+                    break
+                a.log.error("late")
+        assert found == [("/a", 4, "early 1"), ("/a", 8, "late")]
+
+
+async def test_a_node_without_master_says_so() -> None:
+    with pytest.raises(MasterUnreachable, match="127.0.0.1:1/"):
+        async with Node("a", argv=[], master_uri="http://127.0.0.1:1/", master_timeout=0):
+            pass
+
+
+async def test_an_error_of_the_program_comes_out_unchanged(make_node: MakeNode) -> None:
+    with pytest.raises(ZeroDivisionError):
+        async with make_node("a"):
+            _ = 1 / 0
+
+
+async def test_statistics_count_what_flowed(make_node: MakeNode) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+        subscriber = await b.subscribe("t", STRING)
+        publisher = await a.advertise("t", STRING)
+        await publisher.wait_for_subscribers(timeout=10)
+        publisher.publish(data="four")
+        await collect(subscriber, 1)
+        rpc = b._running.rpc
+        _, _, (published, _, _) = await rpc.call(a.uri, "getBusStats", ("/x",))
+        assert [entry[:2] for entry in published if entry[0] == "/t"] == [["/t", 8]]
+        _, _, info = await rpc.call(b.uri, "getBusInfo", ("/x",))
+        assert [entry[1:5] for entry in info] == [[a.uri, "i", "TCPROS", "/t"]]
+        assert await rpc.call(a.uri, "getPublications", ("/x",)) == [
+            1,
+            "publications",
+            [["/rosout", "rosgraph_msgs/Log"], ["/t", STRING]],
+        ]

@@ -1,0 +1,74 @@
+"""Parts of a node that need no socket: settings and queues."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rce.ros.node.queue import DropOldest
+from rce.ros.node.settings import NodeSettings, anonymous_name, parse_value
+from rce.ros.names import is_base_name
+
+
+def gather(
+    argv: tuple[str, ...] = (), environ: dict[str, str] | None = None, namespace: str = ""
+) -> NodeSettings:
+    return NodeSettings.gather("node", namespace=namespace, argv=argv, environ=environ or {})
+
+
+def test_defaults() -> None:
+    settings = gather()
+    assert settings.master_uri == "http://127.0.0.1:11311/"
+    assert settings.resolver.node_name == "/node"
+    assert (settings.host, settings.bind) == ("127.0.0.1", "127.0.0.1")
+
+
+def test_the_command_line_wins_over_the_program_and_the_environment() -> None:
+    environ = {"ROS_NAMESPACE": "env", "ROS_MASTER_URI": "http://10.0.0.9:1/", "ROS_IP": "10.0.0.2"}
+    assert gather(environ=environ).resolver.node_name == "/env/node"
+    assert gather(environ=environ, namespace="own").resolver.node_name == "/own/node"
+    settings = gather(
+        ("__ns:=arg", "__name:=other", "__master:=http://10.0.0.8:2/", "__ip:=10.0.0.3"), environ, "own"
+    )
+    assert settings.resolver.node_name == "/arg/other"
+    assert settings.master_uri == "http://10.0.0.8:2/"
+    assert settings.host == "10.0.0.3"
+
+
+def test_a_host_that_others_can_reach_is_served_on_all_interfaces() -> None:
+    settings = gather(environ={"ROS_HOSTNAME": "robot.local", "ROS_IP": "10.0.0.2"})
+    assert settings.host == "robot.local"
+    assert settings.bind == "0.0.0.0"
+    assert gather(environ={"ROS_HOSTNAME": "localhost"}).bind == "127.0.0.1"
+
+
+def test_private_parameters_are_yaml() -> None:
+    assert gather(("_a:=1", "_b:=[1, x]", "_c:=true", "_d:=")).parameters == {
+        "a": 1,
+        "b": [1, "x"],
+        "c": True,
+        "d": "",
+    }
+    assert parse_value("{broken") == "{broken"
+
+
+def test_anonymous_names_are_names() -> None:
+    assert is_base_name(anonymous_name("node"))
+
+
+@given(st.lists(st.integers(0, 50)), st.integers(1, 5), st.integers(1, 100))
+def test_the_newest_items_stay(sizes: list[int], items: int, size: int) -> None:
+    queue: DropOldest[int] = DropOldest(items, size)
+    for number, length in enumerate(sizes):
+        queue.put(number, length)
+    kept = [queue.take() for _ in range(len(queue))]
+    assert kept == list(range(len(sizes)))[len(sizes) - len(kept) :]
+    assert len(kept) <= items
+    assert queue.dropped + len(kept) == len(sizes)
+    assert sum(sizes[number] for number in kept) <= size or len(kept) == 1
+
+
+def test_a_queue_without_room_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least one"):
+        DropOldest(0)
