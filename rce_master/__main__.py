@@ -14,25 +14,25 @@ import uvloop
 
 from rce.config.exceptions import ConfigError, RunDirError, SecretError
 from rce.config.secret import load_secret
+from rce.config.settings import load_settings
 from rce_master.exceptions import MasterError
 from rce_master.master import Master, RunningMaster
-from rce_master.settings import CONTROL_PORT, EVERYWHERE, HTTP_PORT, LOOPBACK, MasterSettings
+from rce_master.settings import MasterSettings
 from rce_master.state.settings import StateSettings
 from rce_master.store import SqliteStore
 
 if TYPE_CHECKING:
     from rce.config.secret import Secret
 
-_DEFAULTS = StateSettings()
-
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
 @app.command()
 def command(
-    bind: Annotated[str, typer.Option(help="Address to listen on; all by default.")] = "",
-    http_port: Annotated[int, typer.Option(help="For clients, REST and metrics.")] = HTTP_PORT,
-    control_port: Annotated[int, typer.Option(help="For task sets.")] = CONTROL_PORT,
+    config: Annotated[Path | None, typer.Option(help="Engine settings (YAML); options win.")] = None,
+    bind: Annotated[str | None, typer.Option(help="Address to listen on [all].")] = None,
+    http_port: Annotated[int | None, typer.Option(help="For clients, REST, metrics [9000].")] = None,
+    control_port: Annotated[int | None, typer.Option(help="For task sets [8080].")] = None,
     state_dir: Annotated[Path | None, typer.Option(help="Where users and desired state are kept.")] = None,
     secret_file: Annotated[Path | None, typer.Option(help="File with the secret of the task sets.")] = None,
     dev: Annotated[bool, typer.Option("--dev", help="Loopback only, user testUser/testUser.")] = False,
@@ -42,30 +42,40 @@ def command(
         list[str] | None, typer.Option(help="Let pages of this origin use the server; may be repeated.")
     ] = None,
     robot_grace: Annotated[
-        float, typer.Option(help="Seconds that a robot's interfaces outlive its connection.")
-    ] = _DEFAULTS.robot_grace,
+        float | None, typer.Option(help="Seconds that a robot's interfaces outlive its connection [60].")
+    ] = None,
     container_grace: Annotated[
-        float, typer.Option(help="Seconds until the containers of a machine that is away are moved.")
-    ] = _DEFAULTS.container_grace,
+        float | None, typer.Option(help="Seconds until containers of a machine that is away move [30].")
+    ] = None,
     log_level: Annotated[str, typer.Option(help="debug, info, warning or error.")] = "info",
 ) -> None:
     """Run the Master Task Set: HTTP for clients on 9000, control of task sets on 8080."""
     logging.basicConfig(level=log_level.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    given = {} if state_dir is None else {"state_dir": state_dir}
-    settings = MasterSettings(
-        bind=bind or (LOOPBACK if dev else EVERYWHERE),
-        http_port=http_port,
-        control_port=control_port,
-        dev=dev,
-        tls_cert=tls_cert,
-        tls_key=tls_key,
-        allowed_origins=tuple(allow_origin or ()),
-        state=StateSettings(robot_grace=robot_grace, container_grace=container_grace),
-        **given,
-    )
+    given = {
+        "bind": bind,
+        "http_port": http_port,
+        "control_port": control_port,
+        "robot_grace": robot_grace,
+        "container_grace": container_grace,
+    }
     faults: tuple[BaseException, ...] = ()
     try:
-        secret = load_secret(secret_file, dev=dev)
+        engine = load_settings(config)
+        engine = engine.for_development() if dev else engine
+        chosen = engine.master.model_copy(update={k: v for k, v in given.items() if v is not None})
+        settings = MasterSettings(
+            bind=chosen.bind,
+            http_port=chosen.http_port,
+            control_port=chosen.control_port,
+            state_dir=state_dir or engine.state_dir / "master",
+            dev=engine.dev,
+            tls_cert=tls_cert,
+            tls_key=tls_key,
+            allowed_origins=tuple(allow_origin or ()),
+            token_lifetime=chosen.token_lifetime,
+            state=StateSettings(robot_grace=chosen.robot_grace, container_grace=chosen.container_grace),
+        )
+        secret = load_secret(secret_file or engine.secret_file, dev=engine.dev)
         with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
             runner.run(_run(settings, secret))
     except* (MasterError, ConfigError, SecretError, RunDirError) as group:

@@ -121,11 +121,11 @@ class Authenticator:
         return user
 
     @staticmethod
-    def new_token(user: str, label: str, now: float) -> tuple[str, Token]:
+    def new_token(user: str, label: str, now: float, lifetime: float = TOKEN_LIFETIME_S) -> tuple[str, Token]:
         """Make a bearer token: what the user gets, and what is kept of it."""
         token = TOKEN_PREFIX + secrets.token_urlsafe(32)
         record = Token(
-            digest=token_digest(token), user=user, label=label, created=now, expires=now + TOKEN_LIFETIME_S
+            digest=token_digest(token), user=user, label=label, created=now, expires=now + lifetime
         )
         return token, record
 

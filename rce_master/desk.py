@@ -7,8 +7,7 @@ import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rce.control.messages import ClientReply, ClientRequest, Left, Login, LoginReply, Status
-from rce.control.model import EndpointState
+from rce.control.messages import ClientReply, ClientRequest, Left, Login, LoginReply
 from rce_master import requests
 from rce_master.exceptions import MasterError, Refused, TooManyFailures, WrongCredentials
 from rce_master.state import commands
@@ -116,15 +115,10 @@ class Desk:
 
     def _note_leaving(self, process: str, message: ToMaster) -> None:
         """A robot may go before its login is done; its session must not stay connected for ever then."""
-        match message:
-            case Left():
-                id_ = message.id
-            case Status() if message.status.state is EndpointState.ABSENT:
-                id_ = message.status.id
-            case _:
-                return
+        if not isinstance(message, Left):
+            return
         for visit in self._visits:
-            if (visit.process, visit.id) == (process, id_):
+            if (visit.process, visit.id) == (process, message.id):
                 visit.left = True
 
     # Requests

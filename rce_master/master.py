@@ -86,7 +86,8 @@ class Master:
         reconciler = Reconciler(realm)
         authenticator = Authenticator(realm.tables, hasher=self._hasher)
         desk = Desk(realm, reconciler, authenticator)
-        services = Services(realm, reconciler, authenticator, events, time.time)
+        lifetime = self._settings.token_lifetime
+        services = Services(realm, reconciler, authenticator, events, time.time, lifetime)
         try:
             async with asyncio.TaskGroup() as group:
                 workers = [group.create_task(work) for work in (realm.run(), desk.run(), _tick(realm))]

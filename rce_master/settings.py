@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rce.config.folders import default_state_dir
+from rce.config.settings import ANYWHERE
+from rce_master.auth import TOKEN_LIFETIME_S
 from rce_master.exceptions import MasterError
 from rce_master.state.settings import StateSettings
 
@@ -15,15 +17,13 @@ if TYPE_CHECKING:
 
 HTTP_PORT = 9000
 CONTROL_PORT = 8080
-LOOPBACK = "127.0.0.1"
-EVERYWHERE = "0.0.0.0"  # noqa: S104 - what a server for other machines is for
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MasterSettings:
     """Everything that can be set on a master. Port 0 takes a free one."""
 
-    bind: str = EVERYWHERE
+    bind: str = ANYWHERE
     http_port: int = HTTP_PORT
     control_port: int = CONTROL_PORT
     state_dir: Path = field(default_factory=lambda: default_state_dir() / "master")
@@ -32,6 +32,8 @@ class MasterSettings:
     tls_cert: Path | None = None
     tls_key: Path | None = None
     allowed_origins: tuple[str, ...] = ()
+    token_lifetime: float = TOKEN_LIFETIME_S
+    """Seconds."""
     state: StateSettings = field(default_factory=StateSettings)
 
     def ssl_context(self) -> ssl.SSLContext | None:

@@ -19,7 +19,7 @@ async def log_in(call: Call) -> models.TokenOut:
     body = call.read(models.LoginIn)
     services = call.services
     user = await services.authenticator.verify(body.userID, client_digest(body.password))
-    token, record = Authenticator.new_token(user.name, body.label, services.clock())
+    token, record = Authenticator.new_token(user.name, body.label, services.clock(), services.token_lifetime)
     await services.realm.submit(commands.AddToken(token=record))
     return models.TokenOut(token=token, userID=user.name, role=user.role.value, expires=record.expires)
 

@@ -34,6 +34,8 @@ class Services:
     events: EventLog
     clock: Callable[[], float]
     """Seconds since 1970."""
+    token_lifetime: float
+    """Seconds."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -88,17 +88,23 @@ def reported(tx: Transaction, robot: Robot, status: EndpointStatus) -> None:
     if status.state is EndpointState.RUNNING and live.session is RobotSession.ABSENT:
         live = replace(live, session=next_session(live.session, RobotEvent.LOGIN), since=tx.now)
         tx.happen("robot_connected", robot.id, f"still at {robot.task_set}")
-    elif status.state is EndpointState.ABSENT:
+    elif status.state is EndpointState.ABSENT and live.session is RobotSession.CONNECTED:
+        if live.status is None:
+            # It was let in a moment ago, and its task set has not heard of it yet.
+            return
         leave(tx, robot, status.detail)
         live = tx.tables.robot_live(robot.id)
     tx.put(replace(live, status=status))
 
 
 def expire(tx: Transaction) -> None:
-    """Remove the robots whose grace time is over."""
+    """Remove the robots whose grace time is over, and give up those that were let in and never came."""
     for robot in tx.tables.robots():
         live = tx.tables.robot_live(robot.id)
-        if live.session is RobotSession.ABSENT and tx.now - live.since >= tx.settings.robot_grace:
+        waited = tx.now - live.since
+        if live.session is RobotSession.ABSENT and waited >= tx.settings.robot_grace:
             next_session(live.session, RobotEvent.EXPIRE)
             endpoints.remove(tx, robot.id, "the robot stayed away")
             tx.happen("robot_gone", robot.id, "its interfaces and connections were removed")
+        elif live.status is None and waited >= tx.settings.login_patience:
+            leave(tx, robot, "it was let in and never came")

@@ -15,6 +15,8 @@ class StateSettings:
     """How long a container task set may be away until its containers are placed elsewhere."""
     placement_patience: float = 10.0
     """How long a container waits for a machine until its user is told."""
+    login_patience: float = 15.0
+    """How long a robot that was let in may take until its task set reports it; then it counts as away."""
     max_robots: int = 2000
     """Of one user."""
     max_containers: int = 1000

@@ -73,8 +73,15 @@ class World:
     def leave(self, process: str) -> Changes:
         return self.do(commands.TaskSetLeft(process=process))
 
-    def login(self, robot: str = "rob", process: str = "r1", user: str = "anna") -> Changes:
-        return self.do(commands.RobotLogin(process=process, id=f"{user}/{robot}"))
+    def login(
+        self, robot: str = "rob", process: str = "r1", user: str = "anna", *, arrives: bool = True
+    ) -> Changes:
+        """A robot logs in, and its task set reports that it is there."""
+        id_ = f"{user}/{robot}"
+        changes = self.do(commands.RobotLogin(process=process, id=id_))
+        if arrives:
+            self.report(process, EndpointStatus(id=id_, revision=1, state=EndpointState.RUNNING))
+        return changes
 
     def container(self, tag: str = "c", user: str = "anna", **resources: Any) -> Changes:
         return self.do(commands.CreateContainer(user=user, tag=tag, resources=Resources(**resources)))

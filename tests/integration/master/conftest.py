@@ -11,6 +11,7 @@ import pytest
 from argon2 import PasswordHasher
 
 from rce.config.secret import Secret
+from rce.config.settings import LOOPBACK
 from rce.control.channel import TaskSetChannel
 from rce.control.messages import (
     CONTROL_VERSION,
@@ -25,7 +26,7 @@ from rce.control.messages import (
 )
 from rce.control.model import EndpointStatus
 from rce_master.master import Master, RunningMaster
-from rce_master.settings import LOOPBACK, MasterSettings
+from rce_master.settings import MasterSettings
 from rce_master.store import MemoryStore, Store
 
 SECRET = Secret("a secret for the tests")
@@ -137,8 +138,9 @@ async def running_site(store: Store | None = None, **options: Any) -> AsyncItera
     master = Master(settings, SECRET, store or MemoryStore(), hasher=HASHER)
     task = asyncio.create_task(master.run(ready.set_result))
     try:
-        await asyncio.wait([task, ready], return_when=asyncio.FIRST_COMPLETED)
-        if task.done():
+        task.add_done_callback(lambda _: ready.done() or ready.cancel())
+        await asyncio.wait([ready])
+        if ready.cancelled():
             await task
         async with aiohttp.ClientSession() as session:
             site = Site(ready.result(), session)

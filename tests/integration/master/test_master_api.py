@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import io
 import json
 from typing import TYPE_CHECKING, Any
 
@@ -56,7 +57,7 @@ async def test_bad_requests_say_what_is_wrong(site: Site) -> None:
         assert raw.status == 422
     async with site.session.post(
         f"{site.url}api/v1/containers",
-        data=b" " * (2 << 20),
+        data=io.BytesIO(b" " * (2 << 20)),
         headers={"Authorization": f"Bearer {site.token}"},
     ) as raw:
         assert raw.status == 413
@@ -86,7 +87,7 @@ async def test_everybody_sees_their_own(site: Site) -> None:
     await site.api("POST", "/containers", {"tag": "mine"}, token=anna, status=204)
     await site.api("POST", "/containers", {"tag": "theirs"}, status=204)
 
-    async def tags(token: str, **query: str) -> list[str]:
+    async def tags(token: str, **query: Any) -> list[str]:
         return [c["tag"] for c in (await site.api("GET", "/containers", token=token, **query))["containers"]]
 
     assert await tags(anna) == ["mine"]
@@ -137,9 +138,9 @@ async def test_control_reaches_task_sets_and_their_reports_are_shown(site: Site)
             names = ("containers", "nodes", "parameters", "interfaces", "connections", "robots", "machines")
             return {name: (await site.api("GET", f"/{name}"))[name] for name in names}
 
+        while not (await shown())["connections"][0]["established"]:
+            await asyncio.sleep(0)
         found = await shown()
-        while not found["connections"][0]["established"]:
-            found = await shown()
         assert (found["containers"][0]["state"], found["containers"][0]["machine"]) == ("running", "machine")
         assert (found["nodes"][0]["state"], found["nodes"][0]["pid"]) == ("running", 7)
         assert found["parameters"] == [

@@ -95,11 +95,14 @@ async def test_what_was_accepted_survives_kill_9(tmp_path: Path) -> None:
             for number in range(20):
                 async with session.post(f"{url}api/v1/containers", json={"tag": f"c{number}"}) as reply:
                     assert reply.status == 204
-    async with master(tmp_path, "--dev", end=signal.SIGINT) as url, aiohttp.ClientSession() as session:
-        # The token is in the store too: nobody has to log in again.
-        async with session.get(f"{url}api/v1/containers", headers=headers) as reply:
-            found = (await reply.json())["containers"]
-    assert [c["tag"] for c in found] == [f"c{number}" for number in range(20)]
+    # The token is in the store too: nobody has to log in again.
+    async with (
+        master(tmp_path, "--dev", end=signal.SIGINT) as url,
+        aiohttp.ClientSession(headers=headers) as session,
+        session.get(f"{url}api/v1/containers") as reply,
+    ):
+        found = (await reply.json())["containers"]
+    assert {c["tag"] for c in found} == {f"c{number}" for number in range(20)}
 
 
 async def test_users_in_the_state_folder_and_over_the_api(tmp_path: Path) -> None:

@@ -233,11 +233,27 @@ def test_a_robot_that_its_task_set_lost_meanwhile_is_absent(world: World) -> Non
     world.leave("r1")
     world.robot_set()
     assert world.session() == "absent"
-    world.login()
+    world.login(arrives=False)
+    world.report("r1", status("rob", EndpointState.ABSENT))
+    assert world.session() == "connected", "its task set has not heard of it yet"
+    world.report("r1", status("rob"))
+    world.tick(60)
+    assert world.session() == "connected"
     world.report("r1", status("rob", EndpointState.ABSENT))
     assert world.session() == "absent"
     world.report("r1", status("rob"))
     assert world.session() == "connected"
+
+
+def test_a_robot_that_was_let_in_and_never_came_can_log_in_again(world: World) -> None:
+    world.robot_set()
+    world.login(arrives=False)
+    world.tick(14)
+    with pytest.raises(Conflict):
+        world.login()
+    world.tick(1)
+    assert world.session() == "absent"
+    world.login()
 
 
 # Container task sets that go
