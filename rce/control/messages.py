@@ -8,7 +8,7 @@ Messages with a ``request`` number are answered by the reply with the same numbe
 from __future__ import annotations
 
 from enum import Enum
-from typing import Any, Union
+from typing import Any
 
 import msgspec
 from msgspec import Struct
@@ -51,13 +51,13 @@ class _Message(Struct, frozen=True, kw_only=True, omit_defaults=True, tag_field=
 # Task set to master
 
 
-class Hello(_Message):
+class Hello(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """First message of a task set."""
 
     version: int
     kind: TaskSetKind
     process: str
-    """Names the task set; a container task set keeps its name over a restart, so that it finds its containers again."""
+    """Names the task set; one of containers keeps it over a restart, to find its containers again."""
     machine: MachineInfo
     url: str = ""
     """Robot task sets: the WebSocket URL that clients are sent to."""
@@ -67,20 +67,20 @@ class Hello(_Message):
     """All that is there now."""
 
 
-class Status(_Message):
+class Status(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """An endpoint changed."""
 
     status: EndpointStatus
 
 
-class Gone(_Message):
+class Gone(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """A dropped endpoint is gone with all that belonged to it."""
 
     id: str
     revision: int
 
 
-class Fault(_Message):
+class Fault(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """Something failed that the endpoint's user must know of; becomes an ``ER`` and an event."""
 
     id: str
@@ -89,7 +89,7 @@ class Fault(_Message):
     """Endpoint id of the robot to tell; all robots of the user if empty."""
 
 
-class Usage(_Message):
+class Usage(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """Periodic counters of a task set."""
 
     cpu_s: float
@@ -97,7 +97,7 @@ class Usage(_Message):
     endpoints: dict[str, EndpointUsage]
 
 
-class Login(_Message):
+class Login(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """A robot wants to connect. Answered by :class:`LoginReply`."""
 
     request: int
@@ -107,14 +107,14 @@ class Login(_Message):
     """SHA-256 of the password, in hex, as the client sent it."""
 
 
-class Left(_Message):
+class Left(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """A robot's connection ended."""
 
     id: str
     reason: str
 
 
-class ClientRequest(_Message):
+class ClientRequest(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """A client's CC, DC, CN or CX. Answered by :class:`ClientReply`."""
 
     request: int
@@ -124,7 +124,7 @@ class ClientRequest(_Message):
     data: Any
 
 
-class LogChunk(_Message):
+class LogChunk(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """Answer to :class:`ReadLog`."""
 
     request: int
@@ -137,32 +137,32 @@ class LogChunk(_Message):
 # Master to task set
 
 
-class Welcome(_Message):
+class Welcome(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """The master took the task set."""
 
     version: int
     master: str
 
 
-class Refused(_Message):
+class Refused(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """The master does not take the task set; the channel is closed after it."""
 
     reason: str
 
 
-class Sync(_Message):
+class Sync(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """All that is desired at this task set; what else is there is to be removed."""
 
     endpoints: tuple[EndpointSpec, ...]
 
 
-class Put(_Message):
+class Put(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """One endpoint is desired like this. An older revision than the one applied is ignored."""
 
     endpoint: EndpointSpec
 
 
-class Drop(_Message):
+class Drop(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """One endpoint is no longer desired here. Answered by :class:`Gone`."""
 
     id: str
@@ -170,14 +170,14 @@ class Drop(_Message):
     reason: str = ""
 
 
-class Notify(_Message):
+class Notify(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """Send an ``ER`` to a robot, or to all connected robots of a user if ``id`` holds no slash."""
 
     id: str
     text: str
 
 
-class LoginReply(_Message):
+class LoginReply(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """Answer to :class:`Login`."""
 
     request: int
@@ -188,14 +188,14 @@ class LoginReply(_Message):
     reason: str = ""
 
 
-class ClientReply(_Message):
+class ClientReply(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """Answer to :class:`ClientRequest`: the texts of the ``ER`` messages to send, empty if all was done."""
 
     request: int
     errors: tuple[str, ...] = ()
 
 
-class ReadLog(_Message):
+class ReadLog(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """Read a node's log. Answered by :class:`LogChunk`."""
 
     request: int
@@ -207,12 +207,12 @@ class ReadLog(_Message):
     limit: int = 65536
 
 
-ToMaster = Union[Hello, Status, Gone, Fault, Usage, Login, Left, ClientRequest, LogChunk]
-ToTaskSet = Union[Welcome, Refused, Sync, Put, Drop, Notify, LoginReply, ClientReply, ReadLog]
+ToMaster = Hello | Status | Gone | Fault | Usage | Login | Left | ClientRequest | LogChunk
+ToTaskSet = Welcome | Refused | Sync | Put | Drop | Notify | LoginReply | ClientReply | ReadLog
 
 _encoder = msgspec.json.Encoder()
-_to_master = msgspec.json.Decoder(ToMaster)
-_to_task_set = msgspec.json.Decoder(ToTaskSet)
+_to_master: msgspec.json.Decoder[ToMaster] = msgspec.json.Decoder(ToMaster)
+_to_task_set: msgspec.json.Decoder[ToTaskSet] = msgspec.json.Decoder(ToTaskSet)
 
 
 def encode(message: ToMaster | ToTaskSet) -> str:

@@ -8,11 +8,10 @@ what is there and makes up the difference. Applying the same spec twice changes 
 from __future__ import annotations
 
 from enum import Enum
-from typing import Union
 
 from msgspec import Struct
 
-ParameterValue = Union[bool, int, float, str, list[Union[bool, int, float, str]]]
+ParameterValue = bool | int | float | str | list[bool | int | float | str]
 """A parameter's value on the wire."""
 
 
@@ -35,7 +34,7 @@ class NodeSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
     pkg: str
     exe: str
     args: str = ""
-    """Arguments, split as a POSIX shell splits words, never given to a shell. May hold ``$(find PKG)``, ``$(env VAR)``."""
+    """Split as a POSIX shell splits, never given to one. May hold ``$(find PKG)`` and ``$(env VAR)``."""
     name: str = ""
     namespace: str = ""
 

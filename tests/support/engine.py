@@ -199,21 +199,25 @@ class Engine:
 
     def processes_of(self, needle: str) -> list[psutil.Process]:
         """Processes of this engine whose command line or environment holds ``needle``."""
-        return [process for process in engine_processes(self.folder) if needle in " ".join(process.cmdline())]
+        found = []
+        for process in engine_processes(self.folder):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                if needle in " ".join(process.cmdline()):
+                    found.append(process)
+        return found
 
 
 def engine_processes(folder: Path) -> list[psutil.Process]:
-    """All processes that an engine with this folder started, whoever their parent is now."""
-    found = []
+    """All processes that an engine with this folder started, whoever their parent is, and their children."""
+    found: dict[int, psutil.Process] = {}
     for process in psutil.process_iter():
         try:
-            if str(folder) in " ".join(process.cmdline()) or process.environ().get("XDG_RUNTIME_DIR") == str(
-                folder
-            ):
-                found.append(process)
+            mine = str(folder) in " ".join(process.cmdline())
+            if mine or process.environ().get("XDG_RUNTIME_DIR") == str(folder):
+                found |= {child.pid: child for child in (process, *process.children(recursive=True))}
         except (psutil.NoSuchProcess, psutil.AccessDenied, psutil.ZombieProcess):
             continue
-    return found
+    return list(found.values())
 
 
 @contextlib.asynccontextmanager
