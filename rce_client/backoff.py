@@ -61,7 +61,7 @@ def judge(error: Exception) -> ClientError:
         body = bytes(response.body or b"").decode(errors="replace").strip()
         return judge_status(response.status_code, body or response.reason_phrase)
     if isinstance(error, ssl.SSLCertVerificationError):
-        return RefusedError(0, f"the engine's certificate is not trusted: {error.verify_message}")
+        return RefusedError(0, f"the engine's certificate is not trusted: {error}")
     if isinstance(error, TimeoutError):
         return UnavailableError("no answer in time")
     if isinstance(error, (OSError, EOFError, InvalidHandshake, WebSocketException)):

@@ -23,7 +23,7 @@ class RefusedError(ClientError):
     """The engine refuses this client.
 
     Attributes:
-        status: HTTP status.
+        status: HTTP status, 0 if there was no answer.
         reason: What the engine said.
     """
 
@@ -33,7 +33,7 @@ class RefusedError(ClientError):
         self.reason = reason
 
     def __str__(self) -> str:
-        return f"refused ({self.status}): {self.reason}"
+        return f"refused ({self.status}): {self.reason}" if self.status else self.reason
 
 
 class UnavailableError(ClientError):

@@ -1,0 +1,79 @@
+"""When to try again, and whether to."""
+
+from __future__ import annotations
+
+import itertools
+import random
+import ssl
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from websockets.datastructures import Headers
+from websockets.exceptions import InvalidMessage, InvalidStatus
+from websockets.http11 import Response
+
+from rce_client.backoff import Backoff, judge, judge_status
+from rce_client.exceptions import CallError, RefusedError, UnavailableError
+
+
+@given(seed=st.integers(), count=st.integers(1, 40))
+def test_delays_are_random_below_a_bound_that_doubles_up_to_a_cap(seed: int, count: int) -> None:
+    delays = list(itertools.islice(Backoff(first=0.5, factor=2, cap=8).delays(random.Random(seed)), count))
+    for number, delay in enumerate(delays):
+        assert 0 <= delay <= min(8, 0.5 * 2**number)
+
+
+def test_delays_use_the_whole_range() -> None:
+    delays = list(itertools.islice(Backoff(first=1, factor=1, cap=1).delays(random.Random(1)), 1000))
+    assert min(delays) < 0.05
+    assert max(delays) > 0.95
+
+
+@pytest.mark.parametrize("status", [409, 429, 500, 503, 504])
+def test_statuses_that_may_pass(status: int) -> None:
+    error = judge_status(status, "later")
+    assert isinstance(error, UnavailableError)
+    assert str(error) == f"unavailable ({status}): later"
+
+
+@pytest.mark.parametrize("status", [400, 401, 403, 404, 410, 501])
+def test_statuses_that_stay(status: int) -> None:
+    error = judge_status(status, "never")
+    assert isinstance(error, RefusedError)
+    assert (error.status, error.reason) == (status, "never")
+
+
+@pytest.mark.parametrize(
+    "raised",
+    [
+        ConnectionRefusedError("refused"),
+        ConnectionResetError(),
+        TimeoutError(),
+        EOFError(),
+        OSError(113, "no route"),
+        InvalidMessage("did not receive a valid HTTP response"),
+    ],
+)
+def test_failures_of_the_network_may_pass(raised: Exception) -> None:
+    error = judge(raised)
+    assert isinstance(error, UnavailableError)
+    assert str(error)
+
+
+def test_a_handshakes_answer_is_read() -> None:
+    body = b"Robot r is already connected.\n"
+    error = judge(InvalidStatus(Response(409, "Conflict", Headers(), body)))
+    assert isinstance(error, UnavailableError)
+    assert error.reason == "Robot r is already connected."
+    assert isinstance(judge(InvalidStatus(Response(401, "Unauthorized", Headers(), b""))), RefusedError)
+
+
+def test_what_will_not_pass() -> None:
+    assert isinstance(judge(ValueError("bad URL")), RefusedError)
+    assert isinstance(judge(ssl.SSLCertVerificationError("self-signed")), RefusedError)
+
+
+def test_own_errors_are_left_alone() -> None:
+    error = CallError("x")
+    assert judge(error) is error

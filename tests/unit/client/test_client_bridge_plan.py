@@ -1,0 +1,86 @@
+"""What rce-ros makes of a config."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from rce.config.client import ClientConfig, loads
+from rce.config.exceptions import ConfigError
+from rce.protocol.messages import ConfigureComponents, ConfigureConnections, CreateContainer
+from rce.protocol.names import Role
+from rce.ros.types import TypeRegistry
+from rce_client.ros_bridge.plan import check, make_plan
+
+STRING = "std_msgs/String"
+
+
+def own(tag: str, type_: str, addr: str = "", cls: str = STRING) -> dict[str, Any]:
+    return {"eTag": "robot", "iTag": tag, "iType": type_, "iCls": cls} | ({"addr": addr} if addr else {})
+
+
+def config(*interfaces: dict[str, Any], **parts: Any) -> ClientConfig:
+    base = {"url": "http://m/", "userID": "u", "password": "p", "robotID": "robot"}
+    return loads(json.dumps({**base, "interfaces": list(interfaces), **parts}))
+
+
+def test_converters_become_forwarders() -> None:
+    plan = make_plan(config(own("a", "SubscriberConverter", "/a"), own("b", "PublisherForwarder", "/b")))
+    assert [(span.tag, span.role, span.addr, span.type) for span in plan.spans] == [
+        ("a", Role.SUBSCRIBER, "/a", "SubscriberForwarder"),
+        ("b", Role.PUBLISHER, "/b", "PublisherForwarder"),
+    ]
+
+
+def test_containers_come_first_and_own_interfaces_are_left_to_the_spans() -> None:
+    other = own("in", "PublisherInterface", "/in") | {"eTag": "c1"}
+    read = config(
+        own("a", "SubscriberConverter", "/a"),
+        other,
+        containers=[{"cTag": "c1"}],
+        connections=[{"tagA": "robot/a", "tagB": "c1/in"}],
+    )
+    plan = make_plan(read)
+    first, second, third = plan.requests
+    assert plan.first == 1
+    assert isinstance(first, CreateContainer)
+    assert isinstance(second, ConfigureComponents)
+    assert [item.interface_tag for item in second.add_interfaces] == ["in"]
+    assert isinstance(third, ConfigureConnections)
+    assert plan.awaited == {"a"}
+
+
+def test_interfaces_without_addr_are_made_as_they_are() -> None:
+    plan = make_plan(config(own("a", "SubscriberConverter")))
+    assert plan.spans == ()
+    assert plan.unbridged == ("a",)
+    (request,) = plan.requests
+    assert isinstance(request, ConfigureComponents)
+    assert request.add_interfaces[0].interface_type == "SubscriberConverter"
+
+
+def test_every_fault_is_found() -> None:
+    read = config(
+        own("a", "SubscriberConverter", "/x"),
+        own("b", "PublisherConverter", "x"),
+        own("c", "PublisherConverter", "/y", "none/Such"),
+        own("d", "ServiceProviderConverter", "/z", "none/Service"),
+        own("e", "PublisherConverter", cls="none/NotBridged"),
+    )
+    with pytest.raises(ConfigError) as caught:
+        check(read, TypeRegistry(), "file")
+    assert [fault.place for fault in caught.value.faults] == [
+        "interfaces[1].addr",
+        "interfaces[2].iCls",
+        "interfaces[3].iCls",
+    ]
+
+
+def test_a_good_file_has_no_fault() -> None:
+    check(
+        config(own("a", "SubscriberConverter", "/x"), own("b", "SubscriberConverter", "/x")),
+        TypeRegistry(),
+        "f",
+    )

@@ -1,0 +1,63 @@
+"""The fleet's configs, as made and as shipped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rce.config.client import ClientConfig, load, loads
+from rce.protocol.names import Role
+from rce_client.fleet_config import Account, as_text, fleet_config, robot_config
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_shipped_robot_files_are_what_is_made(number: int) -> None:
+    assert (CONFIGS / f"robot{number}.config").read_text() == as_text(robot_config(number))
+
+
+def test_the_shipped_operator_file_is_what_is_made() -> None:
+    assert (CONFIGS / "fleet.config").read_text() == as_text(fleet_config())
+
+
+@pytest.mark.parametrize("name", ["test", "robot1", "robot2", "robot3", "fleet"])
+def test_shipped_files_are_valid(name: str) -> None:
+    load(CONFIGS / f"{name}.config")
+
+
+def made(number: int) -> ClientConfig:
+    return loads(as_text(robot_config(number, Account(url="http://cloud:1/", user="u"))))
+
+
+@pytest.mark.parametrize("number", [1, 12, 100])
+def test_any_number_of_robots(number: int) -> None:
+    config = made(number)
+    assert config.robot == f"testRobot_{number}"
+    assert config.nodes[0].namespace == f"Robot{number}"
+    assert {item.addr for item in config.interfaces if item.endpoint == "cTag_fleet"} == {
+        "/map",
+        *(
+            f"/Robot{number}/{topic}"
+            for topic in ("amcl_pose", "blockedCells", "goalNodesList", "cancelGoal", "moveClient/status")
+        ),
+    }
+
+
+def test_robots_do_not_get_in_each_others_way() -> None:
+    one, two = made(1), made(2)
+    assert not {item.tag for item in one.containers} & {item.tag for item in two.containers}
+    assert not {item.path for item in one.interfaces} & {item.path for item in two.interfaces}
+
+
+def test_every_interface_is_connected_with_its_complement() -> None:
+    config = made(1)
+    interfaces = {item.path: item for item in config.interfaces}
+    used = set()
+    for link in config.connections:
+        a, b = interfaces[link.a], interfaces[link.b]
+        assert (a.kind.role, b.kind.role) == (Role.SUBSCRIBER, Role.PUBLISHER)
+        assert a.cls == b.cls
+        used |= {link.a, link.b}
+    assert used == set(interfaces)
