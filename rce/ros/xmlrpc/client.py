@@ -37,6 +37,7 @@ class RpcClient:
 
     def __init__(self) -> None:
         self._idle: dict[tuple[str, int], list[_Connection]] = {}
+        self._open: set[_Connection] = set()
         self._closed = False
 
     async def __aenter__(self) -> Self:
@@ -46,10 +47,9 @@ class RpcClient:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._closed = True
-        for connections in self._idle.values():
-            for connection in connections:
-                await connection.closed()
         self._idle.clear()
+        for connection in list(self._open):
+            await self._discard(connection)
 
     async def call(
         self, uri: str, method: str, arguments: Sequence[Any], *, timeout: float = DEFAULT_TIMEOUT
@@ -88,23 +88,29 @@ class RpcClient:
             except (ConnectionError, EOFError, h11.RemoteProtocolError) as error:
                 # The server closed the idle connection, as it may at any time. ROS calls may be repeated.
                 _log.debug("reconnecting to %s: %s", uri, error)
-        return await self._post(await _Connection.open(*address), document)
+        connection = await _Connection.open(*address)
+        self._open.add(connection)
+        return await self._post(connection, document)
 
     async def _post(self, connection: _Connection, document: bytes) -> bytes:
         try:
             answer = await connection.post(document)
         except BaseException:
-            connection.close()
+            await self._discard(connection)
             raise
-        self._give_back(connection)
+        await self._give_back(connection)
         return answer
 
-    def _give_back(self, connection: _Connection) -> None:
+    async def _give_back(self, connection: _Connection) -> None:
         idle = self._idle.setdefault(connection.address, [])
         if self._closed or not connection.reusable or len(idle) >= MAX_IDLE:
-            connection.close()
+            await self._discard(connection)
         else:
             idle.append(connection)
+
+    async def _discard(self, connection: _Connection) -> None:
+        self._open.discard(connection)
+        await connection.close()
 
 
 class _Connection:
@@ -128,12 +134,9 @@ class _Connection:
         """Whether another call may follow."""
         return self._http.our_state is h11.IDLE and not self._reader.at_eof()
 
-    def close(self) -> None:
-        self._writer.close()
-
-    async def closed(self) -> None:
-        """Close and wait until it is."""
-        self._writer.close()
+    async def close(self) -> None:
+        """Close at once and wait until it is."""
+        self._writer.transport.abort()
         with contextlib.suppress(OSError):  # it may have been lost already: as good as closed
             await self._writer.wait_closed()
 

@@ -1,0 +1,195 @@
+"""The core as nodes and its host see it: parameters, watching, nodes that die or come twice."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable
+
+import pytest
+
+from rce.ros.core import Change, Core, GraphEvent
+from rce.ros.errors import MasterRefused, ParameterMissing, RemoteFault
+from rce.ros.node import Node
+from rce.ros.xmlrpc import RpcClient
+
+MakeNode = Callable[..., Node]
+STRING = "std_msgs/String"
+
+
+async def test_parameters(core: Core, make_node: MakeNode) -> None:
+    async with make_node("a", namespace="ns", argv=["_gain:=2.5"]) as a:
+        assert await a.get_param("~gain") == 2.5
+        await a.set_param("rel", {"list": [1, 2.5, "x", True], "deep": {"text": "ä <&> \r\n"}})
+        assert await a.get_param("/ns/rel/deep/text") == "ä <&> \r\n"
+        assert await a.get_param("rel/list") == [1, 2.5, "x", True]
+        assert await a.has_param("rel/deep")
+        assert await a.search_param("rel/list") == "/ns/rel/list"
+        await a.delete_param("rel/list")
+        assert not await a.has_param("rel/list")
+        assert await a.get_param("rel/list", "default") == "default"
+        with pytest.raises(ParameterMissing, match="/ns/rel/list"):
+            await a.get_param("rel/list")
+        with pytest.raises(ParameterMissing):
+            await a.delete_param("rel/list")
+        assert set(await a.get_param_names()) == {
+            "/rosdistro", "/rosversion", "/run_id", "/ns/a/gain", "/ns/rel/deep/text",
+        }  # fmt: skip
+        assert core.get_param("/ns/a/gain") == 2.5
+        core.set_param("/host", 1)
+        assert await a.get_param("/host") == 1
+        assert core.delete_param("/host")
+        assert not core.delete_param("/host")
+        with pytest.raises(ParameterMissing):
+            core.get_param("/host")
+
+
+async def test_parameter_changes_are_told(make_node: MakeNode) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+        told: asyncio.Queue[tuple[str, object]] = asyncio.Queue()
+        assert await a.watch_param("/x", lambda name, value: told.put_nowait((name, value))) == {}
+        await b.set_param("/x", 1)
+        assert await asyncio.wait_for(told.get(), 10) == ("/x", 1)
+        await b.set_param("/x/y", 2)
+        assert await asyncio.wait_for(told.get(), 10) == ("/x/y", 2)
+
+
+async def test_the_host_watches_the_graph(core: Core, make_node: MakeNode) -> None:
+    with core.watch() as events:
+        async with make_node("a") as a:
+            await a.advertise("t", STRING)
+            await core.wait_until(lambda graph: "/t" in graph.topic_types, timeout=10)
+        found: list[GraphEvent] = []
+        async with asyncio.timeout(10):
+            async for event in events:
+                found.append(event)
+                if event.change is Change.NODE_VANISHED:
+                    break
+        assert found[0] == GraphEvent(Change.NODE_APPEARED, "/a")
+        assert GraphEvent(Change.PUBLISHER_ADDED, "/a", "/t") in found
+        assert GraphEvent(Change.PUBLISHER_REMOVED, "/a", "/t") in found
+    with pytest.raises(TimeoutError):
+        await core.wait_until(lambda graph: "/a" in graph.nodes, timeout=0.05)
+
+
+async def test_of_two_nodes_of_one_name_the_older_stops(core: Core, make_node: MakeNode) -> None:
+    async with make_node("same") as older:
+        subscriber = await older.subscribe("t", STRING)
+        async with make_node("same") as newer:
+            await asyncio.wait_for(older.spin(), 10)
+            assert older.is_shutdown
+            assert [message async for message in subscriber] == []
+            assert core.graph.nodes == {"/same": newer.uri}
+            assert not newer.is_shutdown
+            assert await newer.sleep(0)
+        assert not await older.sleep(60)
+
+
+async def test_a_dead_node_stalls_nobody(core: Core, make_node: MakeNode) -> None:
+    silent = socket.create_server(("127.0.0.1", 0))
+    port = silent.getsockname()[1]
+    async with RpcClient() as rpc, make_node("b") as b, make_node("a") as a:
+        for number, uri in enumerate((f"http://127.0.0.1:{port}/", "http://127.0.0.1:1/")):
+            await rpc.call(core.uri, "registerSubscriber", (f"/dead{number}", "/t", STRING, uri))
+        subscriber = await b.subscribe("t", STRING)
+        publisher = await a.advertise("t", STRING)
+        await publisher.wait_for_subscribers(timeout=3)
+        assert subscriber.connections == 1
+        assert core.forget_uri("http://127.0.0.1:1/")
+        assert not core.forget_uri("http://127.0.0.1:1/")
+        assert core.forget_node("/dead0")
+        assert core.graph.subscribers("/t") == {"/b": b.uri}
+    silent.close()
+
+
+async def test_a_killed_process_is_forgotten_when_the_host_says_so(core: Core, make_node: MakeNode) -> None:
+    program = """
+import asyncio, sys
+from rce.ros.node import Node
+async def main():
+    async with Node("victim", argv=[], master_uri=sys.argv[1]) as node:
+        await node.advertise_service("s", "std_srvs/Empty", lambda request: None)
+        publisher = await node.advertise("t", "std_msgs/String", latch=True)
+        publisher.publish(data="alive")
+        await node.spin()
+asyncio.run(main())
+"""
+    async with make_node("b") as b:
+        subscriber = await b.subscribe("t", STRING)
+        victim = await asyncio.create_subprocess_exec(sys.executable, "-c", program, core.uri)
+        try:
+            async with asyncio.timeout(20):
+                assert (await anext(aiter(subscriber))).data == "alive"
+            victim.send_signal(signal.SIGKILL)
+        finally:
+            await victim.wait()
+        assert "/victim" in core.graph.nodes
+        assert core.forget_node("/victim")
+        async with asyncio.timeout(10):
+            while b._topics.inputs["/t"]._following:
+                await asyncio.sleep(0.01)
+        assert core.graph.service("/s") is None
+
+
+async def test_a_node_registers_again_at_a_core_that_was_restarted(make_node: MakeNode) -> None:
+    async with Core(port=0) as first:
+        port = int(first.uri.rstrip("/").rpartition(":")[2])
+        uri = first.uri
+    async with Core(port=port) as core, Node("a", argv=[], master_uri=uri) as a:
+        await a.advertise("t", STRING)
+        await a.subscribe("u", STRING)
+        await a.advertise_service("s", "std_srvs/Empty", lambda request: None)
+        before = core.graph.system_state()
+        core.forget_node("/a")
+        assert core.graph.nodes == {}
+        await a.reregister()
+        assert core.graph.system_state() == before
+
+
+async def test_questions_to_the_core(core: Core, make_node: MakeNode) -> None:
+    async with make_node("a", namespace="ns") as a:
+        await a.advertise("t", STRING)
+        ask = a._running.master.call
+        assert await ask("getUri") == core.uri
+        assert await ask("getPid") == os.getpid()
+        assert await ask("lookupNode", "/ns/a") == a.uri
+        assert await ask("getPublishedTopics", "") == [["/rosout", "rosgraph_msgs/Log"], ["/ns/t", STRING]]
+        assert await ask("getPublishedTopics", "/ns") == [["/ns/t", STRING]]
+        assert await ask("unregisterPublisher", "/ns/t", "http://other:1/") == 0
+        with pytest.raises(MasterRefused, match="unknown node"):
+            await ask("lookupNode", "/nobody")
+
+
+async def test_http_is_spoken_as_clients_do(core: Core) -> None:
+    host, _, port = core.uri.removeprefix("http://").rstrip("/").partition(":")
+    body = b"<methodCall><methodName>getPid</methodName><params><param><value>/x</value></param></params></methodCall>"
+    post = b"POST /RPC2 HTTP/1.%d\r\nHost: x\r\nContent-Type: text/xml\r\nContent-length: %d\r\n%s\r\n"
+    reader, writer = await asyncio.open_connection(host, int(port))
+    writer.write((post % (1, len(body), b"") + body) * 2 + post % (1, len(body), b"Expect: 100-continue\r\n"))
+    async with asyncio.timeout(10):
+        for _ in range(2):
+            head = await reader.readuntil(b"\r\n\r\n")
+            assert head.startswith(b"HTTP/1.1 200 OK\r\n")
+            length = int(head.partition(b"Content-length: ")[2].split(b"\r\n")[0])
+            assert str(os.getpid()).encode() in await reader.readexactly(length)
+        assert b"100" in await reader.readuntil(b"\r\n\r\n")
+        writer.write(body)
+        assert b"200 OK" in await reader.readuntil(b"\r\n\r\n")
+        writer.close()
+        await writer.wait_closed()
+        for request in (post % (0, len(body), b"") + body, b"GET / HTTP/1.1\r\nHost: x\r\n\r\n", b"garbage\r\n\r\n"):
+            reader, writer = await asyncio.open_connection(host, int(port))
+            writer.write(request)
+            assert (await reader.read()).startswith(b"HTTP/1.1 ")
+            writer.close()
+            await writer.wait_closed()
+
+
+async def test_unknown_methods_are_faults(core: Core) -> None:
+    async with RpcClient() as rpc:
+        with pytest.raises(RemoteFault):
+            await rpc.call(core.uri, "noSuchThing", ("/x",))
+        assert "registerPublisher" in await rpc.call(core.uri, "system.listMethods", ())

@@ -1,0 +1,169 @@
+"""Services between our nodes through our core."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from rce.ros.core import Core
+from rce.ros.errors import ServiceFault, ServiceLost, ServiceNotFound, ServiceTimeout, TypeMismatch
+from rce.ros.node import Node
+from rce.ros.types import SerializationError
+
+MakeNode = Callable[..., Node]
+SET_BOOL = "std_srvs/SetBool"
+
+
+def switch(request: Any) -> dict[str, Any]:
+    return {"success": request.data, "message": "on" if request.data else "off"}
+
+
+@pytest.mark.parametrize("persistent", [True, False])
+async def test_calls(make_node: MakeNode, persistent: bool) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+        service = await a.advertise_service("switch", SET_BOOL, switch)
+        client = b.service_client("switch", SET_BOOL, persistent=persistent)
+        for position, text in ((True, "on"), (False, "off")):
+            response = await client(data=position)
+            assert (response.success, response.message) == (position, text)
+        assert service.calls == 2
+
+
+async def test_requests_and_responses_of_any_size(make_node: MakeNode) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+
+        async def mirror(payload: bytes) -> bytes:
+            return payload
+
+        await a.advertise_service_serialized("mirror", SET_BOOL, mirror)
+        client = b.service_client("mirror", SET_BOOL)
+        for size in (0, 1, 65535, 131_072, 10_000_000):
+            assert await client.call_serialized(bytes(size), timeout=20) == bytes(size)
+
+
+async def test_calls_run_side_by_side(make_node: MakeNode) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+        waiting = 0
+        all_there = asyncio.Event()
+
+        async def meet(request: Any) -> dict[str, Any]:
+            nonlocal waiting
+            waiting += 1
+            if waiting == 20:
+                all_there.set()
+            await all_there.wait()
+            return switch(request)
+
+        await a.advertise_service("meet", SET_BOOL, meet)
+        client = b.service_client("meet", SET_BOOL)
+        async with asyncio.timeout(10):
+            answers = await asyncio.gather(*(client(data=number % 2 == 0) for number in range(20)))
+        assert [answer.success for answer in answers] == [number % 2 == 0 for number in range(20)]
+
+
+async def test_each_call_has_its_own_time_limit(make_node: MakeNode) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+
+        async def maybe(request: Any) -> dict[str, Any]:
+            if request.data:
+                await asyncio.Event().wait()
+            return switch(request)
+
+        await a.advertise_service("maybe", SET_BOOL, maybe)
+        client = b.service_client("maybe", SET_BOOL)
+        stuck = asyncio.create_task(client.call({"data": True}, timeout=0.3))
+        assert (await client.call({"data": False}, timeout=10)).message == "off"
+        with pytest.raises(ServiceTimeout):
+            await stuck
+        assert (await client.call({"data": False}, timeout=10)).message == "off"
+
+
+@pytest.mark.parametrize("is_async", [True, False])
+async def test_a_handler_that_fails_answers_with_an_error(
+    make_node: MakeNode, is_async: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    def handle(request: Any) -> dict[str, Any]:
+        if request.data:
+            raise ServiceFault("/f", "not today")
+        raise ZeroDivisionError("oops")
+
+    async def handle_later(request: Any) -> dict[str, Any]:
+        await asyncio.sleep(0)
+        return handle(request)
+
+    async with make_node("a") as a, make_node("b") as b:
+        await a.advertise_service("f", SET_BOOL, handle_later if is_async else handle)
+        client = b.service_client("f", SET_BOOL)
+        with pytest.raises(ServiceFault, match="not today"):
+            await client(data=True)
+        assert "not today" not in caplog.text
+        with pytest.raises(ServiceFault, match="oops"):
+            await client(data=False)
+        assert "ZeroDivisionError" in caplog.text
+
+
+async def test_a_provider_that_dies_ends_its_calls_and_may_come_back(make_node: MakeNode) -> None:
+    async with make_node("b") as b:
+        client = b.service_client("s", SET_BOOL)
+        with pytest.raises(ServiceNotFound):
+            await client(data=True)
+        called = asyncio.Event()
+
+        async def hang(request: Any) -> None:
+            called.set()
+            await asyncio.Event().wait()
+
+        async with make_node("a") as a:
+            await a.advertise_service("s", SET_BOOL, hang)
+            call = asyncio.create_task(client(data=True))
+            await asyncio.wait_for(called.wait(), 10)
+        with pytest.raises(ServiceLost):
+            await call
+        async with make_node("a") as a:
+            await a.advertise_service("s", SET_BOOL, switch)
+            assert (await client(data=True)).message == "on"
+        with pytest.raises(ServiceNotFound):
+            await client(data=True)
+
+
+async def test_a_dead_registration_is_reported_as_lost(core: Core, make_node: MakeNode) -> None:
+    async with make_node("b") as b:
+        await b._running.master.call("registerService", "/s", "rosrpc://127.0.0.1:1", "http://127.0.0.1:1/")
+        with pytest.raises(ServiceLost):
+            await b.service_client("s", SET_BOOL)(data=True)
+        with pytest.raises(TimeoutError):
+            await b.wait_for_service("s", timeout=0.3)
+        core.forget_node("/b")
+
+
+async def test_types_must_agree(make_node: MakeNode) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+        await a.advertise_service("s", SET_BOOL, switch)
+        with pytest.raises(ServiceFault, match="md5 sum"):
+            await b.service_client("s", "std_srvs/Trigger")()
+        with pytest.raises(TypeMismatch):
+            await a.advertise_service("s", SET_BOOL, switch)
+        with pytest.raises(SerializationError):
+            await b.service_client("s", SET_BOOL)(data="x")
+
+
+async def test_waits_for_a_service(make_node: MakeNode) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+        waiting = asyncio.create_task(b.wait_for_service("s", timeout=10))
+        await a.advertise_service("s", SET_BOOL, switch)
+        await waiting
+
+
+async def test_a_closed_service_is_gone(make_node: MakeNode) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+        service = await a.advertise_service("s", SET_BOOL, switch)
+        client = b.service_client("s", SET_BOOL)
+        await client(data=True)
+        kept = next(iter(client._open)).connection
+        await service.close()
+        await asyncio.wait_for(kept.gone.wait(), 10)
+        with pytest.raises(ServiceNotFound):
+            await client(data=True)
