@@ -29,15 +29,13 @@ class RunningEngine:
 
     def processes(self) -> list[psutil.Process]:
         """Every process of the engine: task sets, environments, nodes."""
-        found = []
+        found: dict[int, psutil.Process] = {}
         for process in psutil.process_iter():
             with contextlib.suppress(psutil.Error):
-                if (
-                    process.environ().get("XDG_RUNTIME_DIR") == str(self.folder)
-                    or str(self.folder) in process.cmdline()
-                ):
-                    found.append(process)
-        return found
+                mine = str(self.folder) in " ".join(process.cmdline())
+                if mine or process.environ().get("XDG_RUNTIME_DIR") == str(self.folder):
+                    found |= {child.pid: child for child in (process, *process.children(recursive=True))}
+        return list(found.values())
 
     def named(self, needle: str) -> list[psutil.Process]:
         """Its Python processes whose command line holds ``needle``."""

@@ -23,7 +23,7 @@ async def run(running: RunningEngine, *, clients: int, rate: float, seconds: flo
             await stack.enter_async_context(robot(running.url, f"listener{n}")) for n in range(clients)
         ]
         await _wire(source, listeners)
-        process = running.named("rce-robot")[0]
+        process = running.named("rce_robot")[0]
         latencies: list[float] = []
         tasks = [asyncio.create_task(_listen(listener, latencies)) for listener in listeners]
         cpu, start, sent = sum(process.cpu_times()[:2]), perf_counter(), 0

@@ -18,9 +18,9 @@ async def run(running: RunningEngine, *, seconds: float) -> list[dict[str, Any]]
     rows = []
     for form in ("Forwarder", "Converter"):
         async with robot(running.url, f"rate{form}") as client:
-            await wire_echo(client, form, f"rate{form}")
+            await wire_echo(client, form, f"box{form}")
             rate = await _rate(client, form, seconds)
-            await client.send("DC", {"containerTag": f"rate{form}"})
+            await client.send("DC", {"containerTag": f"box{form}"})
         rows.append({"path": form.lower(), "bytes": SIZE, "in flight": IN_FLIGHT, "messages/s": round(rate)})
     return rows
 
