@@ -298,6 +298,8 @@ class MoveClient:
         The goal of this client must be listed so. Of what was lost or is of an earlier life nothing can be
         known, except that nothing has been under way for a while: what comes later the stop's stamp catches.
         """
+        if self._sent_at == float("-inf"):
+            return self.tick(now)
         if any(not state.over for state in states.values()):
             self._quiet_since = None
             return []

@@ -57,6 +57,7 @@ class FleetPlanner:
         self.books = FleetBooks(grid)
         self.settings = settings or FleetSettings()
         self._first_revision = first_revision
+        self._deaf_until: dict[str, float] = {}
         self._outdated = False
         self._partial = False
         self._attempt = 0
@@ -104,7 +105,7 @@ class FleetPlanner:
     # -- what robots say ------------------------------------------------------------------------------
 
     def _take_pose(self, event: PoseSeen) -> None:
-        if not (isfinite(event.x) and isfinite(event.y) and isfinite(event.yaw)):
+        if not (isfinite(event.x) and isfinite(event.y) and isfinite(event.yaw)) or self._gone(event.robot):
             return
         record = self._record(event.robot)
         record.see(event.x, event.y, event.yaw, self._now, self.settings)
@@ -114,6 +115,8 @@ class FleetPlanner:
             self._watch_newcomer(record)
 
     def _take_report(self, event: ReportSeen) -> None:
+        if self._gone(event.robot):
+            return
         record = self._record(event.robot)
         known, report = record.report, event.report
         record.take(report, self._now)
@@ -200,20 +203,27 @@ class FleetPlanner:
 
     def _block_cell(self, event: CellBlocked) -> Reply:
         cell = event.cell
-        if cell not in self.books.grid:
-            return Reply(False, f"cell {cell} is not on the map of {len(self.books.grid)} cells")
-        if cell in self.books.grid.blocked:
-            return Reply(False, f"cell {cell} is a wall")
+        refusal = self._refuse_cell(cell)
+        if refusal:
+            return Reply(False, refusal)
         self._shut(cell)
         owner = self.books.ledger.owner(cell)
         if owner is None:
             return Reply(True, f"cell {cell} is blocked")
         return Reply(True, f"cell {cell} will be blocked when {owner} has left it")
 
+    def _refuse_cell(self, cell: int) -> str:
+        if cell not in self.books.grid:
+            return f"cell {cell} is not on the map of {len(self.books.grid)} cells"
+        return f"cell {cell} is a wall" if cell in self.books.grid.blocked else ""
+
     def _free_cell(self, event: CellFreed) -> Reply:
         cell = event.cell
+        refusal = self._refuse_cell(cell)
+        if refusal:
+            return Reply(False, refusal)
         if cell not in self.books.blocked | self.books.pending:
-            return Reply(cell in self.books.grid.free, f"cell {cell} is not blocked")
+            return Reply(True, f"cell {cell} is not blocked")
         if cell in self.books.blocked:
             self.books.blocked.discard(cell)
             self._out.append(BlockedChanged(tuple(sorted(self.books.blocked))))
@@ -224,6 +234,8 @@ class FleetPlanner:
     def _remove_robot(self, event: RobotRemoved) -> Reply:
         if self.books.robots.pop(event.robot, None) is None:
             return Reply(False, f"there is no robot {event.robot}")
+        # Messages that are under way must not bring it back.
+        self._deaf_until[event.robot] = self._now + self.settings.silence_timeout
         self.books.ledger.remove(event.robot)
         self._outdated = self._changed = True
         return Reply(True, f"{event.robot} is gone")
@@ -369,6 +381,10 @@ class FleetPlanner:
         self._changed = True
 
     # -- small things -----------------------------------------------------------------------------------
+
+    def _gone(self, robot: str) -> bool:
+        """Whether a robot was removed just now."""
+        return self._now < self._deaf_until.get(robot, self._now)
 
     def _record(self, robot: str) -> RobotRecord:
         record = self.books.robots.get(robot)

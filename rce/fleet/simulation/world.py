@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rce.fleet.grid import GridMap
 
 _ROBOT, _BOX, _WALL = 1, 2, 3
-_WALL_THICKNESS = 0.05
+_WALL_THICKNESS = 0.1
 
 
 @dataclass(slots=True)
@@ -234,12 +234,16 @@ class World:
         (left, low), size = grid.origin, grid.cell_size
         right, high = left + grid.columns * size, low + grid.rows * size
         corners = [(left, low), (right, low), (right, high), (left, high), (left, low)]
-        edges = []
-        for a, b in pairwise(corners):
-            wall = pymunk.Segment(self._space.static_body, a, b, _WALL_THICKNESS / 2)
-            wall.collision_type = _WALL
-            self._space.add(wall)
-            edges.append((*a, *b))
+        edges: list[tuple[float, float, float, float]] = []
+        thick = _WALL_THICKNESS
+        for sides in (
+            (left - thick, low - thick, left, high + thick),
+            (right, low - thick, right + thick, high + thick),
+            (left, low - thick, right, low),
+            (left, high, right, high + thick),
+        ):
+            self._space.add(self._block(*sides, _WALL))
+        edges += [(*a, *b) for a, b in pairwise(corners)]
         for row, first, last in _runs(grid):
             x, y = left + first * size, low + row * size
             block = self._block(x, y, left + (last + 1) * size, y + size, _WALL)

@@ -1,4 +1,4 @@
-"""A fleet on one ROS core, without the engine: nodes as processes, simulated robots, a cell blocked midway."""
+"""A fleet on one ROS core, without the engine: nodes as processes, simulated robots, a cell blocked."""
 
 from __future__ import annotations
 

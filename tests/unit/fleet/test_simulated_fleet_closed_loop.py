@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from rce.fleet.coordination.events import (
     BlockedChanged,
     CellBlocked,
@@ -21,10 +22,9 @@ from rce.fleet.coordination.events import (
 )
 from rce.fleet.coordination.planner import FleetPlanner
 from rce.fleet.coordination.snapshot import RobotState
-from rce.fleet.exceptions import OccupiedError
+from rce.fleet.grid import GridMap
 from rce.fleet.move_client import MoveClient, SendGoal, SendStop
 from rce.fleet.scenario import Scenario, make_scenario, midway_cell
-from rce.fleet.grid import GridMap
 from rce.fleet.simulation.move_base import SimulatedMoveBase
 from rce.fleet.simulation.obstacles import hit_points
 from rce.fleet.simulation.world import World
@@ -125,8 +125,7 @@ class SimulatedFleet:
 @pytest.mark.parametrize(("robots", "seed"), [(1, 0), (3, 1), (8, 2), (8, 3)])
 def test_nobody_touches_anything_on_the_way_to_the_goals(robots: int, seed: int) -> None:
     fleet = SimulatedFleet(make_scenario(GridMap(), robots, seed=seed), seed)
-    took=fleet.run()
-    print(took, fleet.world.min_separation)
+    fleet.run()
     assert fleet.world.collisions.total == 0
     assert fleet.world.min_separation > 0.1
     for robot, goal in zip(fleet.scenario.robots, fleet.scenario.goals, strict=True):

@@ -1,0 +1,80 @@
+"""Scenarios drawn from a seed."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rce.fleet.dijkstra import shortest_path
+from rce.fleet.exceptions import ScenarioError
+from rce.fleet.grid import GridMap
+from rce.fleet.scenario import given_scenario, make_scenario, midway_cell
+
+
+@settings(max_examples=80, deadline=None)
+@given(seed=st.integers(0, 2**32), robots=st.integers(1, 12))
+def test_everybody_can_get_to_the_goal(seed: int, robots: int) -> None:
+    scenario = make_scenario(GridMap(), robots, seed=seed)
+    assert len(scenario.known_boxes) == 2
+    assert len(scenario.hidden_boxes) == 1
+    assert len(set(scenario.starts)) == len(set(scenario.goals)) == len(scenario.robots) == robots
+    assert scenario.boxes.isdisjoint((*scenario.starts, *scenario.goals))
+    assert all(start != goal for start, goal in zip(scenario.starts, scenario.goals, strict=True))
+    assert GridMap().with_blocked(scenario.boxes).connected()
+    assert scenario == make_scenario(GridMap(), robots, seed=seed)
+
+
+def test_a_hidden_box_stands_in_somebodys_way() -> None:
+    found = 0
+    for seed in range(20):
+        scenario = make_scenario(GridMap(), 3, seed=seed)
+        told = GridMap().with_blocked(scenario.known_boxes)
+        for start, goal in zip(scenario.starts, scenario.goals, strict=True):
+            found += scenario.hidden_boxes[0] in (shortest_path(told, start, goal) or ())
+    assert found >= 18
+
+
+def test_a_map_in_parts_is_used_in_its_largest_part_only() -> None:
+    grid = GridMap(5, 8, blocked=frozenset(range(8, 16)))
+    scenario = make_scenario(grid, 3, seed=1)
+    assert min(*scenario.starts, *scenario.goals, *scenario.boxes) >= 16
+
+
+@pytest.mark.parametrize("robots", [0, 31, 100])
+def test_too_many_robots_are_refused(robots: int) -> None:
+    with pytest.raises(ScenarioError):
+        make_scenario(GridMap(), robots)
+
+
+def test_given_pairs_are_checked() -> None:
+    grid = GridMap(1, 3, blocked=frozenset({1}))
+    assert given_scenario(GridMap(), [(0, 63), (63, 0)]).goals == (63, 0)
+    with pytest.raises(ScenarioError, match="no way"):
+        given_scenario(grid, [(0, 2)])
+    with pytest.raises(ScenarioError, match="same"):
+        given_scenario(GridMap(), [(0, 5), (0, 6)])
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32))
+def test_a_cell_blocked_midway_cuts_nobody_off(seed: int) -> None:
+    scenario = make_scenario(GridMap(), 3, seed=seed)
+    grid = GridMap().with_blocked(scenario.boxes)
+    goals = dict(zip(scenario.robots, scenario.goals, strict=True))
+    plans = {
+        robot: shortest_path(grid, start, goals[robot]) or []
+        for robot, start in zip(scenario.robots, scenario.starts, strict=True)
+    }
+    cell = midway_cell(grid, plans, goals, avoid={20})
+    if cell is None:
+        assert max(map(len, plans.values())) <= 4
+        return
+    assert cell not in {20, *scenario.goals, *scenario.starts}
+    assert any(cell in plan for plan in plans.values())
+    assert all(grid.with_blocked(grid.blocked | {cell}).connected((plans[r][0], goals[r])) for r in goals)
+
+
+def test_a_corridor_has_no_cell_to_block() -> None:
+    grid = GridMap(1, 6)
+    assert midway_cell(grid, {"R": [0, 1, 2, 3, 4, 5]}, {"R": 5}) is None

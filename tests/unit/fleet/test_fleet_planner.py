@@ -1,0 +1,313 @@
+"""What the planner does in each case, with obedient robots."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rce.fleet.coordination.events import (
+    BlockedChanged,
+    CellBlocked,
+    CellFreed,
+    GoalSet,
+    ObstacleSeen,
+    PoseSeen,
+    ReportSeen,
+    RobotRemoved,
+    SendCancel,
+    SendCells,
+    Tick,
+)
+from rce.fleet.coordination.planner import FleetPlanner
+from rce.fleet.coordination.robot import TRANSITIONS, Cause, Phase, RobotRecord
+from rce.fleet.coordination.snapshot import RobotSnapshot, RobotState
+from rce.fleet.exceptions import TransitionError
+from rce.fleet.grid import GridMap
+from rce.fleet.move_client import ClientReport, ClientState
+
+
+def robot(fleet: Any, number: int = 1) -> RobotSnapshot:
+    found: RobotSnapshot = fleet.planner.snapshot().robots[number - 1]
+    return found
+
+
+@pytest.fixture
+def make(make_fleet: Any) -> Any:
+    """Makes a fleet whose robots have joined, on a network that loses nothing."""
+
+    def of(grid: GridMap, starts: list[int], goals: list[int] | None = None) -> Any:
+        fleet = make_fleet(FleetPlanner(grid), starts, 1, loss=0.0)
+        fleet.send(goals or [])
+        return fleet
+
+    return of
+
+
+def test_a_robot_joins_where_it_stands_and_is_not_moved(make: Any) -> None:
+    fleet = make(GridMap(), [27])
+    assert (robot(fleet).cell, robot(fleet).plan, robot(fleet).state) == (27, (27,), RobotState.IDLE)
+
+
+def test_a_robot_drives_to_its_goal_in_granted_cells(make: Any) -> None:
+    fleet = make(GridMap(), [0], [63])
+    assert len(robot(fleet).plan) == 15
+    assert len(robot(fleet).granted) == 5
+    fleet.run(fleet.all_arrived)
+    assert robot(fleet).replans == 0
+
+
+def test_a_robot_without_goal_steps_aside_and_comes_back(make: Any) -> None:
+    # A corridor of one row with a bay beside cell 2, where the idle robot stands.
+    grid = GridMap(2, 5, blocked=frozenset({5, 6, 8, 9}))
+    fleet = make(grid, [2, 0])
+    assert fleet.ask(GoalSet("Robot2", 4)).ok
+    fleet.run(lambda: robot(fleet, 2).state is RobotState.ARRIVED and robot(fleet).cell == 7)
+    fleet.run(lambda: robot(fleet).cell == 2)
+    assert robot(fleet).state is RobotState.IDLE
+
+
+def test_a_robot_whose_cell_is_anothers_goal_makes_room_for_good(make: Any) -> None:
+    fleet = make(GridMap(), [27, 0])
+    assert fleet.ask(GoalSet("Robot2", 27)).ok
+    fleet.run(lambda: robot(fleet, 2).state is RobotState.ARRIVED)
+    assert robot(fleet).cell in GridMap().neighbours[27]
+
+
+def test_blocking_a_cell_of_a_path_cancels_it_and_brings_another(make: Any) -> None:
+    fleet = make(GridMap(), [24], [31])
+    cell = robot(fleet).plan[5]
+    out = fleet.planner.handle(CellBlocked(cell), fleet.now)
+    assert SendCancel("Robot1") in out
+    assert BlockedChanged((cell,)) in out
+    fleet.blocked = {cell}
+    assert robot(fleet).state is RobotState.STOPPING
+    fleet.run(lambda: len(robot(fleet).plan) > 1)
+    assert cell not in robot(fleet).plan
+    assert robot(fleet).replans == 1
+    fleet.run(fleet.all_arrived)
+
+
+def test_a_cell_that_robots_do_not_use_is_blocked_without_disturbing_them(make: Any) -> None:
+    fleet = make(GridMap(), [0], [7])
+    out = fleet.planner.handle(CellBlocked(60), fleet.now)
+    assert not [done for done in out if isinstance(done, SendCancel)]
+    fleet.run(fleet.all_arrived)
+    assert robot(fleet).replans == 0
+
+
+def test_an_occupied_cell_is_blocked_when_its_robot_has_left(make: Any) -> None:
+    fleet = make(GridMap(), [27])
+    reply = fleet.ask(CellBlocked(27))
+    assert reply.ok
+    assert "Robot1" in reply.message
+    assert fleet.planner.snapshot().pending == (27,)
+    assert fleet.planner.snapshot().blocked == ()
+    fleet.run(lambda: fleet.planner.snapshot().blocked == (27,))
+    assert robot(fleet).cell != 27
+
+
+def test_a_granted_cell_is_blocked_when_its_robot_has_stopped(make: Any) -> None:
+    fleet = make(GridMap(), [24], [31])
+    ahead = robot(fleet).granted[4]
+    assert fleet.ask(CellBlocked(ahead)).ok
+    assert fleet.planner.snapshot().pending == (ahead,)
+    fleet.run(lambda: fleet.planner.snapshot().blocked == (ahead,))
+    fleet.run(fleet.all_arrived)
+
+
+def test_a_pending_cell_can_be_freed(make: Any) -> None:
+    fleet = make(GridMap(1, 1), [0])
+    fleet.ask(CellBlocked(0))
+    assert fleet.ask(CellFreed(0)).ok
+    assert fleet.planner.snapshot().pending == ()
+
+
+def test_a_goal_that_is_cut_off_is_reported_and_reached_once_the_way_is_free(make: Any) -> None:
+    fleet = make(GridMap(1, 5), [0, 4])
+    assert fleet.ask(CellBlocked(2)).ok
+    assert fleet.ask(GoalSet("Robot1", 3)).ok
+    fleet.step()
+    assert robot(fleet).state is RobotState.UNREACHABLE
+    assert fleet.ask(CellFreed(2)).ok
+    fleet.blocked = set()
+    fleet.run(lambda: robot(fleet).state is RobotState.ARRIVED)
+
+
+def test_one_that_is_cut_off_does_not_keep_the_others(make: Any) -> None:
+    grid = GridMap(3, 3, blocked=frozenset({1}))
+    fleet = make(grid, [0, 8])
+    fleet.ask(CellBlocked(3))
+    fleet.ask(GoalSet("Robot1", 2))
+    fleet.ask(GoalSet("Robot2", 6))
+    fleet.run(lambda: robot(fleet, 2).state is RobotState.ARRIVED)
+    assert robot(fleet).state is RobotState.UNREACHABLE
+
+
+def test_what_a_sensor_finds_is_blocked(make: Any) -> None:
+    fleet = make(GridMap(), [24])
+    fleet.hidden = {28}
+    fleet.ask(GoalSet("Robot1", 31))
+    fleet.run(fleet.all_arrived)
+    assert fleet.planner.snapshot().blocked == (28,)
+    assert robot(fleet).replans == 1
+
+
+def test_what_a_sensor_finds_in_another_robots_cell_was_a_robot(make: Any) -> None:
+    fleet = make(GridMap(), [0, 1])
+    fleet.planner.handle(ObstacleSeen("Robot1", (1, 0, 999)), fleet.now)
+    assert fleet.planner.snapshot().blocked == ()
+    assert fleet.planner.snapshot().pending == ()
+
+
+def test_a_silent_robot_keeps_its_cells_and_the_others_drive_around(make: Any) -> None:
+    fleet = make(GridMap(3, 5), [7, 5])
+    fleet.silent = {"Robot1"}
+    fleet.run(lambda: robot(fleet).state is RobotState.SILENT)
+    assert "not heard" in robot(fleet).reason
+    fleet.ask(GoalSet("Robot2", 9))
+    fleet.run(lambda: robot(fleet, 2).state is RobotState.ARRIVED)
+    assert robot(fleet).granted == (7,)
+    fleet.silent = set()
+    fleet.run(lambda: robot(fleet).state is RobotState.IDLE)
+
+
+def test_a_robot_that_falls_silent_under_way_goes_on_when_it_is_back(make: Any) -> None:
+    fleet = make(GridMap(), [0], [63])
+    fleet.silent = {"Robot1"}
+    fleet.run(lambda: robot(fleet).state is RobotState.SILENT)
+    fleet.silent = set()
+    fleet.run(fleet.all_arrived)
+
+
+def test_a_new_robot_on_the_way_is_driven_around(make: Any) -> None:
+    fleet = make(GridMap(3, 8), [8], [15])
+    fleet.add_robot("Robot2", 14)
+    fleet.run(lambda: fleet.states() == [RobotState.ARRIVED, RobotState.IDLE])
+    assert robot(fleet, 2).cell == 14
+
+
+def test_a_robot_in_a_blocked_cell_says_why_it_cannot_join(make_fleet: Any) -> None:
+    fleet = make_fleet(FleetPlanner(GridMap()), [], 1, loss=0.0)
+    fleet.ask(CellBlocked(9))
+    fleet.blocked = set()
+    fleet.add_robot("Robot1", 9)
+    fleet.run(lambda: bool(fleet.states()) and robot(fleet).reason == "it stands in a blocked cell")
+    fleet.ask(CellFreed(9))
+    fleet.run(lambda: robot(fleet).state is RobotState.IDLE)
+
+
+def test_a_restarted_planner_takes_over_where_robots_are(make: Any) -> None:
+    fleet = make(GridMap(), [0], [63])
+    for _ in range(30):
+        fleet.step()
+    fleet.planner = FleetPlanner(GridMap())
+    fleet.run(lambda: fleet.states() == [RobotState.IDLE])
+    fleet.ask(GoalSet("Robot1", 7))
+    fleet.run(fleet.all_arrived)
+
+
+def test_a_restarted_move_client_is_given_cells_anew(make: Any) -> None:
+    fleet = make(GridMap(), [0], [63])
+    for _ in range(30):
+        fleet.step()
+    fleet.restart_client("Robot1")
+    fleet.run(fleet.all_arrived)
+
+
+def test_a_new_goal_replaces_the_old_one(make: Any) -> None:
+    fleet = make(GridMap(), [0], [63])
+    for _ in range(20):
+        fleet.step()
+    assert fleet.ask(GoalSet("Robot1", 56)).ok
+    fleet.run(fleet.all_arrived)
+    assert robot(fleet).cell == 56
+    assert robot(fleet).replans == 0, "a new goal is no blocked path"
+
+
+def test_a_robot_without_its_goal_stays(make: Any) -> None:
+    fleet = make(GridMap(), [0], [63])
+    for _ in range(40):
+        fleet.step()
+    assert fleet.ask(GoalSet("Robot1", None)).ok
+    fleet.run(lambda: robot(fleet).state is RobotState.IDLE)
+    assert robot(fleet).cell not in (0, 63)
+
+
+def test_a_robot_that_left_its_path_is_stopped_and_placed_anew(make: Any) -> None:
+    fleet = make(GridMap(), [0])
+    fleet.run(lambda: fleet.clients["Robot1"].report.reached == 0)
+    fleet.check = lambda: None  # The robot is where it must not be: that is the point.
+    fleet.robots["Robot1"].x, fleet.robots["Robot1"].y = 5.5, 5.5
+    fleet.planner.handle(PoseSeen("Robot1", 5.5, 5.5, 0.0), fleet.now)
+    assert robot(fleet).state is RobotState.STOPPING
+    assert robot(fleet).reason == "it left its path"
+    fleet.run(lambda: robot(fleet).state is RobotState.IDLE)
+    assert robot(fleet).cell == 45
+
+
+def test_a_removed_robot_leaves_its_cells(make: Any) -> None:
+    fleet = make(GridMap(1, 3), [0, 1])
+    fleet.ask(GoalSet("Robot1", 2))
+    fleet.robots.pop("Robot2")
+    assert fleet.ask(RobotRemoved("Robot2")).ok
+    fleet.run(fleet.all_arrived)
+
+
+@pytest.mark.parametrize(
+    ("event", "words"),
+    [
+        (GoalSet("Nobody", 3), "no robot Nobody"),
+        (GoalSet("Robot1", 64), "not on the map"),
+        (GoalSet("Robot1", 10), "is blocked"),
+        (GoalSet("Robot1", 12), "is blocked"),
+        (GoalSet("Robot1", 63), "goal of Robot2"),
+        (CellBlocked(-1), "not on the map"),
+        (CellBlocked(10), "is a wall"),
+        (CellFreed(10), "is a wall"),
+        (CellFreed(99), "not on the map"),
+        (RobotRemoved("Nobody"), "no robot Nobody"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_with_words(make: Any, event: Any, words: str) -> None:
+    fleet = make(GridMap(blocked=frozenset({10})), [0, 1])
+    fleet.ask(CellBlocked(12))
+    fleet.ask(GoalSet("Robot2", 63))
+    before = fleet.planner.snapshot()
+    reply = fleet.ask(event)
+    assert not reply.ok
+    assert words in reply.message
+    assert fleet.planner.snapshot() == before
+
+
+def test_freeing_a_free_cell_is_no_fault(make: Any) -> None:
+    assert make(GridMap(), [0]).ask(CellFreed(5)).ok
+
+
+def test_poses_that_are_no_numbers_are_ignored() -> None:
+    planner = FleetPlanner(GridMap())
+    assert planner.handle(PoseSeen("Robot1", float("nan"), 0.0, 0.0), 0.0) == []
+    assert planner.snapshot().robots == ()
+
+
+def test_lists_are_said_again_until_the_client_has_them() -> None:
+    planner = FleetPlanner(GridMap(), first_revision=40)
+    assert SendCells("R", 41, ()) in planner.handle(PoseSeen("R", 0.5, 0.5, 0.0), 0.0)
+    assert SendCells("R", 41, ()) not in planner.handle(Tick(), 0.5)
+    again = planner.handle(Tick(), 1.0)
+    assert again[:2] == [SendCancel("R"), SendCells("R", 41, ())]
+    planner.handle(ReportSeen("R", ClientReport(revision=41, state=ClientState.IDLE)), 1.1)
+    assert not [done for done in planner.handle(Tick(), 2.5) if isinstance(done, SendCells)]
+
+
+def test_the_life_cycle_refuses_what_is_not_in_its_table() -> None:
+    for phase in Phase:
+        for cause in Cause:
+            record = RobotRecord("R", 0, phase=phase)
+            if (phase, cause) in TRANSITIONS:
+                record.change(cause)
+                assert record.phase is TRANSITIONS[phase, cause]
+            else:
+                with pytest.raises(TransitionError):
+                    record.change(cause)
+                assert record.phase is phase
