@@ -15,6 +15,7 @@ from rce_robot.outbox import Outgoing
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from rce.ros.types import MessageType
     from rce_robot.converters import Converter
     from rce_robot.outbox import Buffer
 
@@ -90,6 +91,7 @@ class ConverterForm:
     def __init__(self, converter: Converter) -> None:
         self._converter = converter
         self.costly = converter.is_costly
+        self._is_plain = not (self.costly or _holds_bytes(converter.kind))
 
     def read(self, msg: Any, warn: Callable[[str], None]) -> Buffer:
         """Serialize the object; fields that the message does not have are ignored with a warning."""
@@ -104,6 +106,15 @@ class ConverterForm:
 
     def pack(self, tag: str, cls: str, msg_id: str, msg: Any) -> Outgoing:
         """Write the object as JSON."""
+        if self._is_plain:  # no search for binary values, and no way through a str
+            head = b'{"type":"DM","data":{"iTag":"%b","type":"%b","msgID":%b,"msg":'
+            names = (tag.encode(), cls.encode(), _json(msg_id))
+            return Outgoing(b"".join((head % names, _json(msg), b"}}")))
         text, *binaries = encode_data(tag, cls, msg, msg_id)
         assert isinstance(text, str)
         return Outgoing(text.encode(), tuple((b"", frame) for frame in binaries if isinstance(frame, bytes)))
+
+
+def _holds_bytes(kind: MessageType) -> bool:
+    """Tell whether a message may hold byte arrays, which leave as binary values."""
+    return any(field.is_bytes for part in (kind, *kind.dependencies) for field in part.fields)
