@@ -7,7 +7,6 @@ import contextlib
 import hmac
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any
 
 from aiohttp import WSMsgType, hdrs, web
 from pydantic import BaseModel, ValidationError
@@ -63,7 +62,12 @@ class Station:
             description="Steers a fleet of robots: goals and blocked cells. For an ERP and for the page.",
             error=Problem,
         )
-        app.router.add_get(f"{PREFIX}/openapi.json", lambda _: _reply_async(document))
+
+        async def describe(request: web.Request) -> web.StreamResponse:
+            del request
+            return web.json_response(document)
+
+        app.router.add_get(f"{PREFIX}/openapi.json", describe)
         app.router.add_get(f"{PREFIX}/live", self.live)
         app.router.add_get("/", self.page)
         app.router.add_static("/static", STATIC)
@@ -221,10 +225,6 @@ async def _problems(request: web.Request, handler: Handler) -> web.StreamRespons
 
 def _reply(model: BaseModel) -> web.Response:
     return web.Response(text=model.model_dump_json(), content_type="application/json")
-
-
-async def _reply_async(document: dict[str, Any]) -> web.StreamResponse:
-    return web.json_response(document)
 
 
 def _problem(status: int, text: str) -> web.Response:

@@ -1,0 +1,166 @@
+"""The station's HTTP: the API for an ERP, who may use it, what the page gets."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import AsyncIterator
+
+import pytest
+from aiohttp.test_utils import TestClient, TestServer
+
+from rce_client.station.fleet_link import FleetError, FleetLink, PlannerAwayError
+from rce_client.station.live import Broadcast
+from rce_client.station.server import Station
+from rce_client.station.view import FleetView
+
+
+class RecordingFleet(FleetLink):
+    """Takes wishes in place of the planner."""
+
+    def __init__(self) -> None:
+        self.wishes: list[tuple[object, ...]] = []
+        self.fault: FleetError | None = None
+
+    async def set_goal(self, robot: str, cell: int | None) -> str:
+        return self._note("goal", robot, cell)
+
+    async def block_cell(self, cell: int, *, blocked: bool) -> str:
+        return self._note("cell", cell, blocked)
+
+    def _note(self, *wish: object) -> str:
+        if self.fault is not None:
+            raise self.fault
+        self.wishes.append(wish)
+        return "done"
+
+
+class House:
+    """A station with its parts at hand."""
+
+    def __init__(self) -> None:
+        self.view, self.fleet, self.pages = FleetView(), RecordingFleet(), Broadcast()
+        self.client: TestClient
+
+    async def start(self, token: str = "") -> None:
+        app = Station(self.view, self.fleet, self.pages, token=token).make_app()
+        self.client = TestClient(TestServer(app))
+        await self.client.start_server()
+
+
+@pytest.fixture
+async def house() -> AsyncIterator[House]:
+    made = House()
+    yield made
+    await made.client.close()
+
+
+STATE = {
+    "rows": 2,
+    "columns": 2,
+    "cell_size": 1.0,
+    "origin_x": 0.0,
+    "origin_y": 0.0,
+    "blocked": [3],
+    "pending": [1],
+    "robots": [
+        {
+            "id": "Robot1",
+            "state": "moving",
+            "cell": 0,
+            "goal": 2,
+            "plan": [0, 2],
+            "granted": [0, 2],
+            "replans": 1,
+        }
+    ],
+}
+
+
+async def test_reads_the_fleet(house: House) -> None:
+    await house.start()
+    house.view.on_state(STATE)
+    fleet = await (await house.client.get("/api/v1/fleet")).json()
+    assert fleet["map"]["rows"] == 2
+    assert (fleet["blocked"], fleet["pending"]) == ([3], [1])
+    robot = await (await house.client.get("/api/v1/robots/Robot1")).json()
+    assert (robot["goal"], robot["plan"], robot["pose"]) == (2, [0, 2], None)
+    missing = await house.client.get("/api/v1/robots/Robot9")
+    assert missing.status == 404
+    assert "Robot1" in (await missing.json())["error"]
+
+
+async def test_sets_goals_and_blocks_cells(house: House) -> None:
+    await house.start()
+    assert (await house.client.put("/api/v1/robots/Robot1/goal", json={"cell": 5})).status == 200
+    assert (await house.client.put("/api/v1/robots/Robot1/goal", json={"cell": None})).status == 200
+    assert (await house.client.put("/api/v1/cells/7", json={"blocked": True})).status == 200
+    assert house.fleet.wishes == [("goal", "Robot1", 5), ("goal", "Robot1", None), ("cell", 7, True)]
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "words"),
+    [
+        ("/api/v1/robots/Robot1/goal", '{"cell": "far"}', "cell"),
+        ("/api/v1/robots/Robot1/goal", '{"cell": -4}', "cell"),
+        ("/api/v1/cells/7", '{"blocked": true, "colour": "red"}', "colour"),
+        ("/api/v1/cells/7", "no json", "JSON"),
+        ("/api/v1/cells/seven", '{"blocked": true}', "seven"),
+    ],
+)
+async def test_bad_input_names_the_place(house: House, path: str, body: str, words: str) -> None:
+    await house.start()
+    reply = await house.client.put(path, data=body)
+    assert reply.status in (400, 404)
+    assert words in (await reply.json())["error"]
+    assert house.fleet.wishes == []
+
+
+@pytest.mark.parametrize(
+    ("fault", "status"), [(FleetError("cell 7 is a wall"), 409), (PlannerAwayError("away"), 503)]
+)
+async def test_says_what_the_planner_says(house: House, fault: FleetError, status: int) -> None:
+    await house.start()
+    house.fleet.fault = fault
+    reply = await house.client.put("/api/v1/cells/7", json={"blocked": True})
+    assert (reply.status, (await reply.json())["error"]) == (status, str(fault))
+
+
+async def test_pages_of_other_sites_are_refused(house: House) -> None:
+    await house.start()
+    evil = {"Origin": "http://evil.example"}
+    assert (await house.client.put("/api/v1/cells/7", json={"blocked": True}, headers=evil)).status == 403
+    own = {"Origin": str(house.client.make_url("/").origin())}
+    assert (await house.client.put("/api/v1/cells/7", json={"blocked": True}, headers=own)).status == 200
+
+
+async def test_a_token_is_asked_for_where_one_is_set(house: House) -> None:
+    await house.start(token="open sesame")
+    assert (await house.client.get("/api/v1/fleet")).status == 401
+    bearer = {"Authorization": "Bearer open sesame"}
+    assert (await house.client.get("/api/v1/fleet", headers=bearer)).status == 200
+    assert (await house.client.get("/?token=wrong")).status == 401
+    assert (await house.client.get("/", params={"token": "open sesame"})).status == 200
+    assert (await house.client.get("/static/main.js")).status == 200, "the page's cookie lets its parts in"
+
+
+async def test_the_live_socket_tells_news(house: House) -> None:
+    await house.start()
+    house.pages.send("state", json.dumps({"type": "state"}))
+    async with house.client.ws_connect("/api/v1/live") as socket:
+        assert (await socket.receive_json())["type"] == "state"
+        house.pages.send_event(json.dumps({"type": "event", "text": "news"}))
+        assert (await socket.receive_json())["text"] == "news"
+    assert (await house.client.get("/")).status == 200
+
+
+async def test_the_document_describes_every_route(house: House) -> None:
+    await house.start()
+    document = await (await house.client.get("/api/v1/openapi.json")).json()
+    assert document["openapi"].startswith("3.1")
+    assert set(document["paths"]) == {
+        "/api/v1/fleet",
+        "/api/v1/robots/{robot}",
+        "/api/v1/robots/{robot}/goal",
+        "/api/v1/cells/{cell}",
+    }
+    assert "GoalRequest" in document["components"]["schemas"]
