@@ -82,7 +82,16 @@ class Desk:
 
     async def _spawn(self, work: Coroutine[None, None, None]) -> None:
         await self._pending.acquire()
-        self._group.create_task(work).add_done_callback(lambda _: self._pending.release())
+        self._group.create_task(self._guard(work))
+
+    async def _guard(self, work: Coroutine[None, None, None]) -> None:
+        try:
+            await work
+        except Exception:
+            # A fault of ours in one answer; its asker runs into a timeout, everybody else goes on.
+            logger.exception("could not answer")
+        finally:
+            self._pending.release()
 
     # Logins
 

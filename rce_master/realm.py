@@ -127,23 +127,35 @@ class Realm:
         done: list[Changes] = []
         for job in jobs:
             job.outcomes = [self._apply(command, done) for command in job.commands]
-        # Of a key that several commands wrote, every row holds the newest record.
-        rows = [row for changes in done for row in changes.rows()]
         try:
-            if rows:
-                await self._store.save(rows)
-        except BaseException as error:
-            for changes in reversed(done):
-                changes.revert()
-            if not isinstance(error, StoreError):
-                raise
-            logger.error("%s", error)  # noqa: TRY400 - the text says it all
-            self._answer(jobs, error)
+            await self._save(done)
+        except StoreError as error:
+            await self._stand_alone(jobs, error)
             return
         for changes in done:
             for listener in self.listeners:
                 listener(changes)
         self._answer(jobs, None)
+
+    async def _save(self, done: list[Changes]) -> None:
+        # Of a key that several commands wrote, every row holds the newest record.
+        rows = [row for changes in done for row in changes.rows()]
+        try:
+            if rows:
+                await self._store.save(rows)
+        except BaseException:
+            for changes in reversed(done):
+                changes.revert()
+            raise
+
+    async def _stand_alone(self, jobs: list[_Job], error: StoreError) -> None:
+        """Do jobs one by one after their common transaction failed: reports need no store and must get through."""
+        if len(jobs) == 1:
+            logger.error("%s", error)
+            self._answer(jobs, error)
+            return
+        for job in jobs:
+            await self._work([job])
 
     def _apply(self, command: Command, done: list[Changes]) -> Outcome:
         try:

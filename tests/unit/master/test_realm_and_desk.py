@@ -211,6 +211,26 @@ async def test_nothing_changes_if_it_cannot_be_stored(cloud: Cloud) -> None:
     assert len(heard) == 1
 
 
+async def test_reports_do_not_suffer_from_a_broken_store(cloud: Cloud) -> None:
+    robots = cloud.robots()
+    await robots.hello()
+    cloud.store.broken = True
+    cloud.store.free.clear()
+    creating = asyncio.ensure_future(cloud.realm.submit(commands.CreateContainer(user="anna", tag="a")))
+    await asyncio.sleep(0)
+    more = asyncio.ensure_future(cloud.realm.submit(commands.CreateContainer(user="anna", tag="b")))
+    leaving = asyncio.ensure_future(cloud.desk.on_gone(robots))
+    await asyncio.sleep(0)
+    cloud.store.free.set()
+    await leaving
+    assert not cloud.realm.tables.is_connected("r1")
+    for refused in (creating, more):
+        with pytest.raises(StoreError, match="disk full"):
+            await refused
+    assert len(cloud.realm.tables.endpoints) == 0
+    cloud.store.broken = False
+
+
 async def test_changes_are_stored_before_anybody_hears_of_them(cloud: Cloud) -> None:
     stored: list[bool] = []
     cloud.realm.listeners.append(lambda _: stored.append("anna/c" in cloud.store.tables["endpoints"]))

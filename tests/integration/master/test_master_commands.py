@@ -1,0 +1,85 @@
+"""The commands' client and tables against a real master."""
+
+from __future__ import annotations
+
+import io
+from typing import TYPE_CHECKING
+
+import pytest
+from rich.console import Console
+
+from rce.control.messages import Put, Usage
+from rce.control.model import EndpointUsage
+from rce_master.cli import follow, show
+from rce_master.cli.client import ApiClient
+from rce_master.cli.credentials import FILE_VARIABLE, Credentials, load, save
+from rce_master.cli.exceptions import ApiError, CliError, NotLoggedIn
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from conftest import Site
+
+
+def printed(renderable: object) -> str:
+    console = Console(file=io.StringIO(), width=160)
+    console.print(renderable)
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+async def test_the_client_says_what_the_master_said(site: Site) -> None:
+    async with ApiClient(site.url, site.token) as client:
+        with pytest.raises(ApiError, match="there is no container 'c'") as caught:
+            await client.call("DELETE", "/containers/c")
+        assert caught.value.status == 404
+    async with ApiClient("http://127.0.0.1:1/", "x") as client:
+        with pytest.raises(CliError, match="cannot use the master"):
+            await client.call("GET", "/user")
+
+
+async def test_events_go_on_where_they_were(site: Site) -> None:
+    async with ApiClient(site.url, site.token) as client:
+        await client.call("POST", "/containers", {"tag": "c"})
+        events = client.events(since=0)
+        kinds = [(await anext(events)).kind for _ in range(2)]
+        await client.call("DELETE", "/containers/c")
+        kinds.append((await anext(events)).kind)
+        await events.aclose()  # type: ignore[attr-defined]
+    assert kinds == ["user_added", "container_requested", "container_destroyed"]
+
+
+async def test_top_and_ps_show_what_there_is(site: Site) -> None:
+    async with site.containers() as containers, ApiClient(site.url, site.token) as client:
+        await client.call("POST", "/containers", {"tag": "c"})
+        await client.call("POST", "/containers/c/nodes", {"tag": "n", "pkg": "Test", "exe": "x.py"})
+        await containers.get(Put)
+        names = ("machines", "containers", "robots", "interfaces", "nodes", "connections")
+        before = await show.fetch(client, *names)
+        usage = {"testUser/c": EndpointUsage(cpu_s=0.5, memory=5 << 20)}
+        containers.channel.send(Usage(cpu_s=1.0, memory=7 << 20, endpoints=usage))
+        now = await show.fetch(client, *names)
+        while not now["machines"][0]["memory_used"]:
+            now = await show.fetch(client, *names)
+    text = printed(show.consumption(now, before, interval=1.0))
+    assert "50 %" in text
+    assert "100 %" in text
+    assert "5 MiB" in text
+    text = printed(show._overview(now))
+    assert "testUser/c" in text
+    assert "Test/x.py" in text
+
+
+async def test_logs_are_printed_whole(
+    site: Site, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(FILE_VARIABLE, str(tmp_path / "deep" / "login.json"))
+    with pytest.raises(NotLoggedIn):
+        load()
+    save(Credentials(url=site.url, user="testUser", token=site.token, expires=0.0))
+    assert site.token not in repr(load())
+    async with site.containers() as containers:
+        containers.log = b"0123456789" * 20_000
+        await site.api("POST", "/containers", {"tag": "c"}, status=204)
+        await follow._logs("c", follow=False, offset=0, user="")
+    assert capsys.readouterr().out == "0123456789" * 20_000
