@@ -153,6 +153,7 @@ class StateFolder:
         self._run.mkdir(mode=0o700, parents=True, exist_ok=True)
         longest = len(os.fsencode(self._run / ("0" * 12) / "control.sock"))
         if longest > _MAX_SOCKET_PATH:
+            self.__exit__()
             raise StateError(
                 f"the path {self._run} is too long for sockets; set XDG_RUNTIME_DIR to a shorter one"
             )

@@ -1,0 +1,211 @@
+"""What the manager decides."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rce.control.messages import Fault, Gone, Status
+from rce.control.model import EndpointKind, EndpointSpec, EndpointState, EndpointStatus, LinkAddress
+from rce_container import core
+from rce_container.core import ManagerCore
+from rce_container.life import NEXT, Phase
+
+ID = "user/box"
+ADDRESS = LinkAddress(machine="m", unix="/run/x")
+
+
+def spec(revision: int = 1, id_: str = ID) -> EndpointSpec:
+    return EndpointSpec(id=id_, kind=EndpointKind.CONTAINER, revision=revision)
+
+
+def status(revision: int = 1, id_: str = ID) -> EndpointStatus:
+    return EndpointStatus(id=id_, revision=revision, state=EndpointState.RUNNING)
+
+
+def running(mark: str = "one", revision: int = 1) -> ManagerCore:
+    manager = ManagerCore()
+    manager.handle(core.Put(spec(revision)), 0.0)
+    manager.handle(core.Made(ID, mark, ADDRESS), 0.0)
+    manager.handle(core.Reported(ID, mark, status(revision)), 0.0)
+    return manager
+
+
+def told(out: list[core.Instruction], kind: type) -> list:
+    return [one.message for one in out if isinstance(one, core.Tell) and isinstance(one.message, kind)]
+
+
+def test_put_starts_a_container_and_gives_it_its_spec() -> None:
+    manager = ManagerCore()
+    assert manager.handle(core.Put(spec()), 0.0) == [core.Start(ID)]
+    out = manager.handle(core.Made(ID, "one", ADDRESS), 0.0)
+    assert out[0] == core.Apply(ID, "one", spec())
+    assert told(out, Status)[0].status.state is EndpointState.STARTING
+    out = manager.handle(core.Reported(ID, "one", status()), 0.1)
+    reported = told(out, Status)[0].status
+    assert (reported.state, reported.incarnation, reported.address) == (EndpointState.RUNNING, "one", ADDRESS)
+
+
+def test_put_of_an_older_revision_is_ignored() -> None:
+    manager = running(revision=5)
+    assert manager.handle(core.Put(spec(4)), 1.0) == []
+    assert manager.handle(core.Put(spec(6)), 1.0) == [core.Apply(ID, "one", spec(6))]
+
+
+def test_drop_stops_and_says_gone_when_nothing_is_left() -> None:
+    manager = running()
+    out = manager.handle(core.Drop(ID, 7), 1.0)
+    assert core.Stop(ID, "one") in out
+    assert told(out, Status)[0].status.state is EndpointState.STOPPING
+    assert not told(out, Gone)
+    manager.handle(core.Lost(ID, "one", "its environment ended"), 1.1)
+    out = manager.handle(core.Removed(ID, "one"), 1.2)
+    assert told(out, Gone) == [Gone(id=ID, revision=7)]
+    assert not told(out, Fault)
+    assert not manager.containers
+
+
+def test_drop_of_what_is_not_there_says_gone_at_once() -> None:
+    assert told(ManagerCore().handle(core.Drop(ID, 3), 0.0), Gone) == [Gone(id=ID, revision=3)]
+
+
+def test_put_while_it_stops_starts_it_anew_and_never_says_gone() -> None:
+    manager = running()
+    manager.handle(core.Drop(ID, 7), 1.0)
+    assert manager.handle(core.Put(spec(8)), 1.1) == []
+    out = manager.handle(core.Removed(ID, "one"), 1.2)
+    assert out == [core.Start(ID)]
+
+
+def test_an_unexpected_end_is_told_and_mended_with_growing_pauses() -> None:
+    manager = running()
+    pauses = []
+    faults = []
+    for number, mark in enumerate(("one", "two", "three", "four")):
+        out = manager.handle(core.Lost(ID, mark, "killed"), number + 1.0)
+        faults += told(out, Fault)
+        assert told(out, Status)[-1].status.state is EndpointState.FAILED
+        out = manager.handle(core.Removed(ID, mark), number + 1.0)
+        (wait,) = (one for one in out if isinstance(one, core.Wait))
+        pauses.append(wait.delay)
+        assert manager.handle(core.Due(ID, wait.ticket - 1), 2.0) == []
+        assert manager.handle(core.Due(ID, wait.ticket), 2.0) == [core.Start(ID)]
+        following = ("one", "two", "three", "four", "five")[number + 1]
+        manager.handle(core.Made(ID, following, ADDRESS), 2.0)
+        manager.handle(core.Reported(ID, following, status()), 2.0)
+    assert pauses == [0.0, 0.5, 1.0, 2.0]
+    assert len(faults) == 1, "the user hears of the same failure once"
+    assert "killed" in faults[0].text
+
+
+def test_a_stable_container_is_mended_at_once_again() -> None:
+    manager = running()
+    for mark, now in (("one", 1.0), ("two", 2.0 + core.STABLE_S)):
+        manager.handle(core.Lost(ID, mark, "killed"), now)
+        out = manager.handle(core.Removed(ID, mark), now)
+        (wait,) = (one for one in out if isinstance(one, core.Wait))
+        assert wait.delay == 0.0
+        manager.handle(core.Due(ID, wait.ticket), now)
+        manager.handle(core.Made(ID, "two", ADDRESS), now)
+        manager.handle(core.Reported(ID, "two", status()), now)
+
+
+def test_a_container_that_cannot_be_started_is_tried_again() -> None:
+    manager = ManagerCore()
+    manager.handle(core.Put(spec()), 0.0)
+    out = manager.handle(core.Lost(ID, "", "the disk is full"), 0.0)
+    assert "the disk is full" in told(out, Fault)[0].text
+    assert any(isinstance(one, core.Wait) for one in out)
+    assert manager.containers[ID].phase is Phase.WAITING
+
+
+def test_events_of_an_older_life_are_ignored() -> None:
+    manager = running("two")
+    before = manager.statuses
+    for event in (
+        core.Reported(ID, "one", status(9)),
+        core.Lost(ID, "one", "killed"),
+        core.Removed(ID, "one"),
+        core.Faulted(ID, "one", "x"),
+    ):
+        assert manager.handle(event, 1.0) == []
+    assert manager.statuses == before
+
+
+def test_sync_removes_what_is_not_desired_and_keeps_adopted_ones() -> None:
+    manager = ManagerCore()
+    for tag in ("kept", "other"):
+        manager.handle(core.Adopted(tag, status(4, f"user/{tag}"), ADDRESS), 0.0)
+    out = manager.handle(core.Sync((spec(5, "user/kept"), spec(1, "user/new"))), 1.0)
+    assert core.Stop("user/other", "other") in out
+    assert core.Apply("user/kept", "kept", spec(5, "user/kept")) in out
+    assert core.Start("user/new") in out
+    out = manager.handle(core.Removed("user/other", "other"), 1.0)
+    assert told(out, Gone) == [Gone(id="user/other", revision=4)]
+
+
+def test_quit_stops_all_starts_nothing_and_drops_nothing() -> None:
+    manager = running()
+    assert core.Stop(ID, "one") in manager.handle(core.Quit(), 1.0)
+    assert manager.handle(core.Put(spec(9)), 1.0) == []
+    assert told(manager.handle(core.Removed(ID, "one"), 1.0), Gone) == []
+    assert not manager.containers
+
+
+def test_every_phase_can_end() -> None:
+    """From every phase there is a way to nothing being left."""
+    for phase in Phase:
+        reached, edge = {phase}, [phase]
+        while edge:
+            new = {after for after in NEXT[edge.pop()].values() if after not in reached}
+            reached |= new
+            edge += new
+        assert Phase.GONE in reached
+
+
+EVENTS = st.one_of(
+    st.builds(lambda r: ("put", r), st.integers(1, 5)),
+    st.sampled_from([("drop", 9), ("sync", 0), ("sync", 3), ("report", 0), ("lost", 0), ("removed", 0)]),
+    st.sampled_from([("due", 0), ("fail", 0)]),
+)
+
+
+@given(st.lists(EVENTS, max_size=40))
+def test_any_order_of_events_keeps_the_invariants(steps: list[tuple[str, int]]) -> None:
+    """A machine that answers every instruction at some time, in the order in which hypothesis likes it."""
+    manager = ManagerCore()
+    alive: str | None = None
+    ended = False
+    tickets: list[int] = []
+    for now, (name, number) in enumerate(steps):
+        event: core.Event
+        match name:
+            case "put":
+                event = core.Put(spec(number))
+            case "drop":
+                event = core.Drop(ID, number)
+            case "sync":
+                event = core.Sync((spec(number),) if number else ())
+            case "report" if alive and not ended:
+                event = core.Reported(ID, alive, status())
+            case "lost" if alive and not ended:
+                event, ended = core.Lost(ID, alive, "killed"), True
+            case "removed" if alive and ended:
+                event, alive = core.Removed(ID, alive), None
+            case "due" if tickets:
+                event = core.Due(ID, tickets.pop())
+            case _:
+                continue
+        out = manager.handle(event, float(now))
+        while out:
+            one = out.pop(0)
+            if isinstance(one, core.Start):
+                assert alive is None, "two lives at once"
+                if name == "due" and number:
+                    out += manager.handle(core.Lost(ID, "", "no"), float(now))
+                else:
+                    alive, ended = f"life {now}", False
+                    out += manager.handle(core.Made(ID, alive, ADDRESS), float(now))
+            elif isinstance(one, core.Wait):
+                tickets.append(one.ticket)
+        manager.validate()

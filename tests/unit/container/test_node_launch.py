@@ -1,0 +1,71 @@
+"""How a node's command line and environment are made."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from rce.control.model import NodeSpec
+from rce.ros.packages import PackageIndex
+from rce_container.environment.exceptions import NodeError
+from rce_container.environment.launch import NODE_MARK, prepare
+from rce_container.environment.nodes import describe_exit
+
+
+@pytest.fixture
+def packages(tmp_path: Path) -> PackageIndex:
+    folder = tmp_path / "with space" / "maps"
+    folder.mkdir(parents=True)
+    (folder / "package.yaml").write_text("name: maps\n")
+    (folder / "serve.py").write_text("")
+    return PackageIndex([folder.parent])
+
+
+def test_arguments_name_and_namespace(packages: PackageIndex) -> None:
+    spec = NodeSpec(
+        tag="n",
+        pkg="maps",
+        exe="serve.py",
+        args="""'two words' $(find maps)/x.yaml; rm -rf $HOME "a\\"b" """,
+        name="server",
+        namespace="Robot1",
+    )
+    launch = prepare(spec, packages, {"HOME": "/h"}, "mark")
+    folder = packages.find("maps").path
+    assert launch.argv[:2] == [sys.executable, str(folder / "serve.py")]
+    assert launch.argv[2:] == [
+        *("two words", f"{folder}/x.yaml;", "rm", "-rf", "$HOME", 'a"b'),
+        *("__name:=server", "__ns:=/Robot1"),
+    ]
+    assert launch.env == {"HOME": "/h", NODE_MARK: "mark", "ROS_NAMESPACE": "/Robot1"}
+    assert launch.ros_name == "/Robot1/server"
+
+
+def test_a_node_may_choose_its_name(packages: PackageIndex) -> None:
+    launch = prepare(NodeSpec(tag="n", pkg="maps", exe="serve.py"), packages, {}, "mark")
+    assert launch.ros_name == ""
+    assert not any("__" in word for word in launch.argv)
+
+
+@pytest.mark.parametrize(
+    ("spec", "text"),
+    [
+        (NodeSpec(tag="n", pkg="nowhere", exe="x"), "no package 'nowhere'"),
+        (NodeSpec(tag="n", pkg="maps", exe="missing.py"), "no executable 'missing.py'"),
+        (NodeSpec(tag="n", pkg="maps", exe="../../etc/passwd"), "not a file inside"),
+        (NodeSpec(tag="n", pkg="maps", exe="serve.py", args="'open"), "quotation"),
+        (NodeSpec(tag="n", pkg="maps", exe="serve.py", args="$(env NOT_SET)"), "NOT_SET"),
+    ],
+)
+def test_faults_say_what_is_wrong(packages: PackageIndex, spec: NodeSpec, text: str) -> None:
+    with pytest.raises(NodeError, match=text):
+        prepare(spec, packages, {}, "mark")
+
+
+def test_exits_in_words() -> None:
+    assert describe_exit(3) == "exit code 3"
+    assert describe_exit(-signal.SIGSEGV) == "killed by SIGSEGV"
+    assert "out of memory" in describe_exit(-signal.SIGKILL)

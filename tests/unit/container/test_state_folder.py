@@ -1,0 +1,61 @@
+"""The state directory: a name that is kept, a lock, folders that are removed whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rce_container.exceptions import StateError
+from rce_container.folder import Record, StateFolder
+
+
+def test_the_name_is_kept(tmp_path: Path) -> None:
+    with StateFolder(tmp_path / "state", tmp_path / "run") as state:
+        name = state.name("")
+        assert state.name("") == name
+    with StateFolder(tmp_path / "state", tmp_path / "run") as state:
+        assert state.name("") == name
+        assert state.name("mine") == "mine"
+        assert state.name("") == "mine"
+        with pytest.raises(StateError, match="cannot name a task set"):
+            state.name("a b")
+
+
+def test_one_task_set_at_a_time(tmp_path: Path) -> None:
+    with (
+        StateFolder(tmp_path / "state", tmp_path / "run"),
+        pytest.raises(StateError, match="another rce-container"),
+        StateFolder(tmp_path / "state", tmp_path / "run"),
+    ):
+        pass
+
+
+def test_a_run_folder_that_is_too_long(tmp_path: Path) -> None:
+    with (
+        pytest.raises(StateError, match="XDG_RUNTIME_DIR"),
+        StateFolder(tmp_path / "state", tmp_path / ("x" * 90)),
+    ):
+        pass
+
+
+def test_records_and_removal(tmp_path: Path) -> None:
+    with StateFolder(tmp_path / "state", tmp_path / "run") as state:
+        folder = state.create()
+        assert folder.read_record() is None
+        record = Record(id="user/box", mark=folder.mark, runtime="process", pid=1, start=2)
+        folder.write_record(record)
+        (found,) = state.existing()
+        assert found.read_record() == record
+        outside = tmp_path / "outside"
+        outside.mkdir()
+        (outside / "file").touch()
+        locked = folder.home / "locked"
+        locked.mkdir()
+        (locked / "file").touch()
+        (locked / "link").symlink_to(outside)
+        locked.chmod(0)
+        found.remove()
+        assert list(state.existing()) == []
+        assert (outside / "file").exists()
+    assert not list((tmp_path / "run").iterdir())
