@@ -149,7 +149,7 @@ class Realm:
             raise
 
     async def _stand_alone(self, jobs: list[_Job], error: StoreError) -> None:
-        """Do jobs one by one after their common transaction failed: reports need no store and must get through."""
+        """Do jobs one by one after their common transaction failed: reports need no store."""
         if len(jobs) == 1:
             logger.error("%s", error)
             self._answer(jobs, error)
