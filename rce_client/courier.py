@@ -196,7 +196,7 @@ class Courier:
         self.connected = True
         error = LostError("the connection was closed")
         try:
-            async with socket, asyncio.TaskGroup() as tasks:
+            async with asyncio.TaskGroup() as tasks:
                 writer = tasks.create_task(self._write(socket))
                 self._listener.on_connected()
                 error = await self._read(socket)
@@ -205,6 +205,7 @@ class Courier:
             self.connected = False
             self._queue.clear()
             self._idle.set()
+            await socket.close()
         return error
 
     async def _read(self, socket: ClientConnection) -> LostError:

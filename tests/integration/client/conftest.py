@@ -14,7 +14,7 @@ from rce_client.backoff import Backoff
 from rce_client.connection import Connection
 from rce_client.courier import Timing
 from rce_robot.websocket import RobotSocket
-from tests.support.cloud import PASSWORD, Cloud, running_cloud
+from support.cloud import PASSWORD, Cloud, running_cloud
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

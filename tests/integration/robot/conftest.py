@@ -10,7 +10,7 @@ from urllib.parse import urlencode
 import pytest
 from websockets.asyncio.client import connect
 
-from tests.support.cloud import DIGEST, Cloud, running_cloud
+from support.cloud import DIGEST, Cloud, running_cloud
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -12,7 +12,7 @@ from rce.link import PeerFault
 
 if TYPE_CHECKING:
     from tests.integration.robot.conftest import Robot
-    from tests.support.cloud import Cloud
+    from support.cloud import Cloud
 
 STRING = "std_msgs/String"
 ECHO = "Test/StringEcho"

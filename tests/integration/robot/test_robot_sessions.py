@@ -11,11 +11,11 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from rce.control.model import EndpointState
 from rce_robot.outbox import OutboxLimits
 from rce_robot.settings import SessionSettings
-from tests.support.cloud import DIGEST, running_cloud
+from support.cloud import DIGEST, running_cloud
 
 if TYPE_CHECKING:
     from rce.control.messages import ClientRequest
-    from tests.support.cloud import Cloud
+    from support.cloud import Cloud
 
 STRING = "std_msgs/String"
 ROBOT = "testUser/testRobot"
