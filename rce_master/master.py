@@ -10,12 +10,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rce.control.server import ControlServer
+from rce.web.server import HttpServer
 from rce_master.auth import Authenticator, client_digest
 from rce_master.desk import Desk
 from rce_master.events import EventLog
 from rce_master.exceptions import MasterError
 from rce_master.http.routes import Services
-from rce_master.http.server import HttpServer, make_app
+from rce_master.http.server import make_app
 from rce_master.realm import Realm
 from rce_master.reconciler import Reconciler
 from rce_master.state import commands

@@ -13,10 +13,10 @@ from typing import Annotated, Any
 
 import typer
 import uvloop
-from aiohttp import web
 
 from rce.config.client import ClientConfig, load
 from rce.config.exceptions import ConfigError
+from rce.web.server import HttpServer
 from rce_client.exceptions import RefusedError
 from rce_client.station.engine_watch import EngineWatch
 from rce_client.station.fleet_link import FleetLink
@@ -25,7 +25,6 @@ from rce_client.station.server import Station
 from rce_client.station.view import FleetView
 
 PORT = 9080
-SHUTDOWN_S = 0.5
 
 
 def ui(
@@ -108,20 +107,12 @@ async def serve(config: ClientConfig, bind: str, port: int, token: str) -> None:
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    runner = web.AppRunner(
-        Station(view, fleet, pages, token=token).make_app(), shutdown_timeout=SHUTDOWN_S, access_log=None
-    )
-    await runner.setup()
-    try:
-        site = web.TCPSite(runner, bind, port)
-        await site.start()
+    async with HttpServer(Station(view, fleet, pages, token=token).make_app(), bind, port) as server:
 
         async def announce() -> None:
-            typer.echo(f"rce ui ready: http://{bind}:{runner.addresses[0][1]}/")
+            typer.echo(f"rce ui ready: {server.url}")
 
         await _until(stop.wait, lambda: fleet.run(announce), watch.run)
-    finally:
-        await runner.cleanup()
 
 
 async def _until(done: Callable[[], Any], *work: Callable[[], Any]) -> None:

@@ -46,6 +46,7 @@ class RobotModel(_Model):
 
     id: str
     state: str
+    reason: str = Field(description="Why it is joining, stopping or silent; else empty.")
     cell: int | None = Field(description="Where it stands, or what it is entering.")
     goal: int | None
     plan: list[int] = Field(description="All cells of its planned path, beginning with the present one.")

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from rce.web.openapi import Query
 from rce_master import requests
 from rce_master.exceptions import Invalid
 from rce_master.http import models
-from rce_master.http.routes import OF_USER, Call, Query, RouteTable
+from rce_master.http.routes import OF_USER, Call, RouteTable
 
 if TYPE_CHECKING:
     from pydantic import BaseModel

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 import msgspec
 from aiohttp import web
 
+from rce.web.openapi import Query
 from rce_master.exceptions import Invalid
 from rce_master.http import models
-from rce_master.http.routes import OF_USER, Call, Query, RouteTable
+from rce_master.http.routes import OF_USER, Call, RouteTable
 
 if TYPE_CHECKING:
     from rce_master.events import Event

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from rce.web.openapi import Operation, Query
 from rce_master.exceptions import Forbidden, Invalid, NotFound
 from rce_master.state.records import UserRole
 
@@ -117,16 +118,6 @@ Handler = Callable[[Call], Awaitable["BaseModel | StreamResponse | None"]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Query:
-    """A query parameter, for the document."""
-
-    name: str
-    description: str
-    required: bool = False
-    type: str = "string"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Route:
     """A method of a path."""
 
@@ -145,6 +136,23 @@ class Route:
     open: bool = False
     """Whether it can be used without a token."""
     query: tuple[Query, ...] = ()
+
+    @property
+    def operation(self) -> Operation:
+        """What the OpenAPI document tells of it."""
+        return Operation(
+            name=getattr(self.handler, "__name__", self.summary),
+            method=self.method,
+            path=self.path,
+            summary=self.summary + (" (administrators only)" if self.admin else ""),
+            group=self.group,
+            body=self.body,
+            reply=self.reply,
+            media=self.media,
+            status=self.status,
+            open=self.open,
+            query=self.query,
+        )
 
 
 @dataclass(slots=True)

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from aiohttp import hdrs, web
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
-from yarl import URL
 
+from rce.web.openapi import PREFIX, build_document
+from rce.web.origin import is_foreign
 from rce_master.exceptions import (
     AuthError,
     Forbidden,
@@ -25,14 +26,12 @@ from rce_master.exceptions import (
 from rce_master.http import api_account, api_control, api_read, api_stream
 from rce_master.http.entry import Entry
 from rce_master.http.metrics import make_registry
-from rce_master.http.openapi import PREFIX, build_document
+from rce_master.http.models import Error
 from rce_master.http.routes import Call, Route, Services, read_body
 from rce_master.state.records import UserRole
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
-    from ssl import SSLContext
-    from typing import Self
 
     from rce_master.state.records import User
 
@@ -41,7 +40,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 MAX_BODY = 1 << 20
-SHUTDOWN_S = 0.5
 
 ROUTES: list[Route] = [
     *api_account.routes,
@@ -70,36 +68,6 @@ def make_app(services: Services, *, allowed_origins: Iterable[str] = ()) -> web.
     for route in ROUTES:
         app.router.add_route(route.method, PREFIX + route.path, _adapt(route, services))
     return app
-
-
-class HttpServer:
-    """Serves an application. Use it as an asynchronous context manager.
-
-    Attributes:
-        url: Where it listens, once it does.
-    """
-
-    def __init__(self, app: web.Application, host: str, port: int, ssl: SSLContext | None = None) -> None:
-        self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=SHUTDOWN_S)
-        self._host = host
-        self._port = port
-        self._ssl = ssl
-        self.url = ""
-
-    async def __aenter__(self) -> Self:
-        await self._runner.setup()
-        try:
-            await web.TCPSite(self._runner, self._host, self._port, ssl_context=self._ssl).start()
-        except BaseException:
-            await self._runner.cleanup()
-            raise
-        port = self._runner.addresses[0][1]
-        host = "127.0.0.1" if self._host in ("", "0.0.0.0", "::") else self._host  # noqa: S104 - compared, not bound
-        self.url = str(URL.build(scheme="https" if self._ssl else "http", host=host, port=port, path="/"))
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self._runner.cleanup()
 
 
 # Routes
@@ -165,7 +133,13 @@ def _is_local(request: web.Request) -> bool:
 
 
 def _document() -> Handler:
-    text = json.dumps(build_document(ROUTES))
+    document = build_document(
+        [route.operation for route in ROUTES],
+        title="RCE master",
+        description="Control of a robotics cloud.",
+        error=Error,
+    )
+    text = json.dumps(document)
 
     async def handle(_: web.Request) -> web.Response:
         return web.Response(text=text, content_type="application/json")
@@ -181,7 +155,7 @@ def _origin_guard(allowed: frozenset[str]) -> Any:
     async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
         """Refuse pages of other sites: a browser would send them with the user's network position."""
         origin = request.headers.get(hdrs.ORIGIN)
-        if origin is not None and origin not in allowed and not _is_same_site(origin, request):
+        if is_foreign(origin, request.headers.get(hdrs.HOST, ""), allowed):
             return _error(403, f"origin {origin} may not use this server")
         response = await handler(request)
         if origin in allowed and not response.prepared:
@@ -189,13 +163,6 @@ def _origin_guard(allowed: frozenset[str]) -> Any:
         return response
 
     return guard
-
-
-def _is_same_site(origin: str, request: web.Request) -> bool:
-    try:
-        return URL(origin).authority == request.headers.get(hdrs.HOST, "")
-    except ValueError:
-        return False
 
 
 @web.middleware
