@@ -171,8 +171,17 @@ class Graph:
             self._tell_subscribers(name, outcome)
         if kind in (Kind.PUBLISHER, Kind.SUBSCRIBER) and not self._is_used(name):
             self._types.pop(name, None)
+        if kind is not Kind.PARAMETER:
+            self._drop_parameter_subscriptions(node)
         if node not in self._registrations.nodes:
             outcome.events.append(GraphEvent(Change.NODE_VANISHED, node))
+
+    def _drop_parameter_subscriptions(self, node: str) -> None:
+        """Forget them with a node's last topic or service: rospy does not take them back when it leaves."""
+        entry = self._registrations.nodes.get(node)
+        if entry is not None and all(kind is Kind.PARAMETER for kind, _ in entry.held):
+            for kind, name in list(entry.held):
+                self._registrations.remove(kind, name, node)
 
     def _is_used(self, topic: str) -> bool:
         return any(self._registrations.of(kind, topic) for kind in (Kind.PUBLISHER, Kind.SUBSCRIBER))

@@ -155,7 +155,8 @@ class Subscriber:
         kind: MessageType | None,
         sink: Sink,
         release: Callable[[Subscriber], Awaitable[None]],
-        connections: Callable[[], int],
+        connected: Callable[[], int],
+        changed: asyncio.Event,
     ) -> None:
         self.topic = topic
         """The topic's global name."""
@@ -163,7 +164,8 @@ class Subscriber:
         """Takes what arrives."""
         self._kind = kind
         self._release = release
-        self._connections = connections
+        self._connected = connected
+        self._changed = changed
         self._closed = False
 
     @property
@@ -174,7 +176,18 @@ class Subscriber:
     @property
     def connections(self) -> int:
         """How many publishers are connected."""
-        return self._connections()
+        return self._connected()
+
+    async def wait_for_publishers(self, count: int = 1, *, timeout: float | None = None) -> None:
+        """Wait until at least ``count`` publishers are connected.
+
+        Raises:
+            TimeoutError: They did not come within ``timeout`` seconds.
+        """
+        async with asyncio.timeout(timeout):
+            while self._connected() < count:
+                self._changed.clear()
+                await self._changed.wait()
 
     def __aiter__(self) -> AsyncIterator[Message]:
         return self

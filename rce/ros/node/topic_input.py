@@ -31,6 +31,7 @@ class TopicInput:
         self.md5sum = md5sum
         self.subscribers: list[Subscriber] = []
         self.links: list[InputLink] = []
+        self.changed = asyncio.Event()
         self._runtime = runtime
         self._following: dict[str, asyncio.Task[None]] = {}
 
@@ -45,6 +46,10 @@ class TopicInput:
         if self.md5sum != ANY:
             raise TypeMismatch(f"{self.topic} is subscribed to as {self.kind_name} already, not {kind_name}")
         self.kind_name, self.md5sum = kind_name, md5sum
+
+    def connected(self) -> int:
+        """Tell how many publishers have accepted the subscription."""
+        return sum(link.is_greeted for link in self.links)
 
     def deliver(self, payload: bytes, latched: bool) -> None:
         """Give a message to all subscribers."""
@@ -132,7 +137,8 @@ class InputLink:
         self.publisher = ""
         """The publishing node's name, once it said so."""
         self._target = target
-        self._greeted = False
+        self.is_greeted = False
+        """Whether the publisher has answered."""
         self._latched = False
 
     def connection_made(self, connection: Connection) -> None:
@@ -140,12 +146,12 @@ class InputLink:
 
     def frame_received(self, connection: Connection, payload: bytes) -> None:
         """Take the publisher's header, then messages."""
-        if self._greeted:
+        if self.is_greeted:
             self.messages += 1
             self.bytes_in += len(payload)
             self._target.deliver(payload, self._latched)
             return
-        self._greeted = True
+        self.is_greeted = True
         try:
             self._greet(decode_header(payload))
         except TcprosError as error:
@@ -153,6 +159,7 @@ class InputLink:
             connection.abort()
         else:
             connection.header_done()
+            self._target.changed.set()
 
     def connection_lost(self, connection: Connection, error: Exception | None) -> None:
         """Let who waits for the end go on."""

@@ -91,7 +91,7 @@ class Topics:
                 source.close()
                 await runtime.master.unregister_subscriber(topic)
 
-        subscriber = Subscriber(topic, kind, sink, release, lambda: len(source.links))
+        subscriber = Subscriber(topic, kind, sink, release, source.connected, source.changed)
         source.subscribers = [*source.subscribers, subscriber]  # a new list: one may be in use by a delivery
         if is_first:
             try:

@@ -89,6 +89,15 @@ def test_a_node_that_died_is_forgotten_whole() -> None:
     assert graph.nodes == {}
 
 
+def test_the_last_topic_takes_parameter_subscriptions_along() -> None:
+    graph = Graph()
+    graph.register_publisher("/t", "a/B", "/n", uri("/n"))
+    graph.subscribe_parameter("/p", "/n", uri("/n"))
+    _, outcome = graph.unregister(Kind.PUBLISHER, "/t", "/n", uri("/n"))
+    assert outcome.events[-1] == GraphEvent(Change.NODE_VANISHED, "/n")
+    assert graph.nodes == {}
+
+
 @pytest.mark.parametrize(
     ("subscribed", "changed", "value", "told"),
     [

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rce.ros.names import is_base_name
 from rce.ros.node.queue import DropOldest
 from rce.ros.node.settings import NodeSettings, anonymous_name, parse_value
-from rce.ros.names import is_base_name
 
 
 def gather(
