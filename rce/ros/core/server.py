@@ -103,6 +103,7 @@ class Core:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         await self._stack.aclose()
+        self._notifier = None
 
     # ------------------------------------------------------------------ for the hosting process
 

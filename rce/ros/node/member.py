@@ -201,6 +201,8 @@ class GraphMember:
 
     async def _leave_graph(self) -> None:
         """Unregister everything, as far as there is still a master that listens."""
+        for service in self._services.values():
+            service.disconnect()
         try:
             async with asyncio.timeout(GOODBYE_TIMEOUT):
                 for service in list(self._services.values()):

@@ -109,9 +109,13 @@ class Service:
         """Stop providing the service: unregister it and disconnect its clients."""
         if not self._closed:
             self._closed = True
+            self.disconnect()
             await self._release(self)
-            for session in self._sessions:
-                session.connection.close()
+
+    def disconnect(self) -> None:
+        """Disconnect the clients; calls under way are not answered."""
+        for session in self._sessions:
+            session.connection.close()
 
     async def _finish(self, response: Awaitable[bytes]) -> Chunks:
         try:
