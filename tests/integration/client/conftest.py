@@ -9,12 +9,12 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from support.cloud import PASSWORD, Cloud, running_cloud
 
 from rce_client.backoff import Backoff
 from rce_client.connection import Connection
 from rce_client.courier import Timing
 from rce_robot.websocket import RobotSocket
-from support.cloud import PASSWORD, Cloud, running_cloud
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
