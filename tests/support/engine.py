@@ -115,7 +115,10 @@ class Program:
 class Engine:
     """Master, robot and container task sets on ports of their own."""
 
-    def __init__(self, folder: Path, *, runtime: str = "process", robots: int = 1) -> None:
+    def __init__(
+        self, folder: Path, *, runtime: str = "process", robots: int = 1, apart: bool = False
+    ) -> None:
+        """``apart``: every task set takes itself to be on a machine of its own, so that links go over TCP."""
         self.folder = folder
         self.http_port, self.control_port, *rest = free_ports(3 + 2 * robots)
         self.runtime = runtime
@@ -137,6 +140,7 @@ class Engine:
                 "rce-robot",
                 "127.0.0.1",
                 *("--control-port", self.control_port, "--ws-port", ws, "--link-port", link, "--dev"),
+                *(("--machine", f"robots{number}") if apart else ()),
                 name=f"rce-robot-{number}",
             )
             for number, (ws, link) in enumerate(self.robot_ports)
@@ -146,6 +150,7 @@ class Engine:
             "127.0.0.1",
             *("--control-port", self.control_port, "--link-port", self.container_link_port),
             *("--state-dir", folder / "container", "--runtime", runtime, "--dev"),
+            *(("--machine", "containers") if apart else ()),
         )
 
     def _program(self, program: str, *args: object, name: str = "") -> Program:

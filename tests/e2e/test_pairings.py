@@ -1,0 +1,143 @@
+"""Every pairing of endpoints through a real engine: unix sockets and TCP, topics and services, both ways."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+
+import pytest
+from support.engine import Engine, running_engine, until
+from support.stranger import Stranger, stranger
+
+pytestmark = [pytest.mark.e2e, pytest.mark.timeout(120)]
+
+STRING = "std_msgs/String"
+ECHO = "Test/StringEcho"
+
+
+def interface(endpoint: str, tag: str, kind: str, cls: str = STRING, addr: str = "") -> dict[str, str]:
+    made = {"endpointTag": endpoint, "interfaceTag": tag, "interfaceType": kind, "className": cls}
+    return made | ({"addr": addr} if addr else {})
+
+
+@contextlib.asynccontextmanager
+async def two_robots(engine: Engine) -> AsyncIterator[tuple[Stranger, Stranger]]:
+    """Two robots, at different robot processes if there are two."""
+    async with stranger(engine.url, robot="first") as first, stranger(engine.url, robot="second") as second:
+        ports = {robot.socket.get_extra_info("peername")[1] for robot in (first, second)}
+        assert len(ports) == len(engine.robots), "the robots were not spread over the processes"
+        yield first, second
+
+
+async def wire_robots(first: Stranger, second: Stranger) -> None:
+    await first.send(
+        "CN",
+        {
+            "addInterfaces": [
+                interface("first", "out", "SubscriberConverter"),
+                interface("second", "in", "PublisherConverter"),
+                interface("first", "ask", "ServiceProviderConverter", ECHO),
+                interface("second", "answer", "ServiceClientConverter", ECHO),
+            ]
+        },
+    )
+    pairs = [("first/out", "second/in"), ("second/answer", "first/ask")]
+    await first.send("CX", {"connect": [{"tagA": a, "tagB": b} for a, b in pairs]})
+    await first.wait_status({"out": True, "ask": True})
+    await second.wait_status({"in": True, "answer": True})
+
+
+async def answer_calls(robot: Stranger, count: int) -> None:
+    """Answer service calls, the last one first: each must find its caller all the same."""
+    calls = [await robot.queue("answer").get() for _ in range(count)]
+    for call in reversed(calls):
+        text = call["msg"]["data"]
+        reply = {"iTag": "answer", "type": ECHO, "msgID": call["msgID"], "msg": {"data": f"re: {text}"}}
+        await robot.send("DM", reply)
+
+
+async def check_robots(first: Stranger, second: Stranger) -> None:
+    for size in (0, 100, 3_000_000):
+        await first.publish("out", STRING, {"data": "x" * size})
+        assert len((await second.receive("in"))["data"]) == size
+    texts = [f"question {number}" for number in range(5)]
+    answering = asyncio.create_task(answer_calls(second, len(texts)))
+    for number, text in enumerate(texts):
+        await first.send("DM", {"iTag": "ask", "type": ECHO, "msgID": f"n{number}", "msg": {"data": text}})
+    answers = [await first.queue("ask").get() for _ in texts]
+    await answering
+    assert {a["msgID"]: a["msg"]["data"] for a in answers} == {
+        f"n{n}": f"re: {t}" for n, t in enumerate(texts)
+    }
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+@pytest.mark.parametrize("machines", ["one machine", "two machines"])
+async def test_robot_with_robot(processes: int, machines: str) -> None:
+    async with (
+        running_engine(robots=processes, apart=machines == "two machines") as engine,
+        two_robots(engine) as (first, second),
+    ):
+        await wire_robots(first, second)
+        await check_robots(first, second)
+
+
+async def test_provider_that_dies_answers_its_callers_with_an_error() -> None:
+    async with running_engine(robots=2) as engine, stranger(engine.url, robot="first") as first:
+        async with stranger(engine.url, robot="second") as second:
+            await wire_robots(first, second)
+            await first.send("DM", {"iTag": "ask", "type": ECHO, "msgID": "n1", "msg": {"data": "anybody?"}})
+            await second.queue("answer").get()
+        await first.wait_error("n1")
+
+
+@pytest.mark.parametrize("runtime", ["process", pytest.param("namespace", marks=pytest.mark.needs("bwrap"))])
+@pytest.mark.parametrize("machines", ["one machine", "two machines"])
+async def test_container_with_container_and_with_robot(runtime: str, machines: str) -> None:
+    """The robot's words go to container a, on to the echo node of container b, and back through a."""
+    async with (
+        running_engine(runtime=runtime, apart=machines == "two machines") as engine,
+        stranger(engine.url) as robot,
+    ):
+        for tag in ("a", "b"):
+            await robot.send("CC", {"containerTag": tag})
+        node = {"containerTag": "b", "nodeTag": "echo", "pkg": "Test", "exe": "stringEcho.py"}
+        await robot.send(
+            "CN",
+            {
+                "addNodes": [node],
+                "addInterfaces": [
+                    interface("testRobot", "say", "SubscriberConverter"),
+                    interface("a", "say", "PublisherInterface", addr="/to_b"),
+                    interface("a", "onward", "SubscriberInterface", addr="/to_b"),
+                    interface("b", "request", "PublisherInterface", addr="/stringEchoReq"),
+                    interface("b", "response", "SubscriberInterface", addr="/stringEchoResp"),
+                    interface("testRobot", "hear", "PublisherConverter"),
+                    interface("b", "service", "ServiceClientInterface", ECHO, "/stringEchoService"),
+                    interface("a", "service", "ServiceProviderInterface", ECHO, "/served_by_b"),
+                    interface("a", "local", "ServiceClientInterface", ECHO, "/served_by_b"),
+                    interface("testRobot", "ask", "ServiceProviderConverter", ECHO),
+                ],
+            },
+        )
+        pairs = [
+            ("testRobot/say", "a/say"),
+            ("a/onward", "b/request"),
+            ("b/response", "testRobot/hear"),
+            ("a/service", "b/service"),
+            ("testRobot/ask", "a/local"),
+        ]
+        await robot.send("CX", {"connect": [{"tagA": x, "tagB": y} for x, y in pairs]})
+        await robot.wait_status({"say": True, "hear": True, "ask": True})
+        # The robot's own interfaces say nothing of the connection between the containers.
+        await until(
+            lambda: all(one["established"] for one in engine.get("/api/v1/connections")["connections"]),
+            what="all connections are established",
+        )
+        assert await robot.call("ask", ECHO, {"data": "over two containers"}) == {
+            "data": "over two containers"
+        }
+        await robot.publish("say", STRING, {"data": "hello"})
+        assert await robot.receive("hear") == {"data": "hello"}
+        assert robot.errors == []

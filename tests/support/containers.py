@@ -1,0 +1,413 @@
+"""A machine with a manager of containers on it, and peers of the containers; for tests of one task set."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import time
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rce.config.resources import examples_dir
+from rce.control.messages import (
+    Drop,
+    Fault,
+    Gone,
+    LogChunk,
+    MachineInfo,
+    Put,
+    ReadLog,
+    ToMaster,
+    Usage,
+)
+from rce.control.model import (
+    ConnectionSpec,
+    EndpointKind,
+    EndpointSpec,
+    EndpointStatus,
+    InterfaceSpec,
+    LinkAddress,
+    LinkSpec,
+    NodeSpec,
+    NodeState,
+)
+from rce.link import Buffer, Endpoint, Interface, LinkHub, Port
+from rce.link.handover import Doorman
+from rce.protocol.names import EndpointId
+from rce_container.environment import proc
+from rce_container.folder import StateFolder
+from rce_container.manager import Manager
+from rce_container.runtimes.base import Runtime
+from rce_container.runtimes.namespace import NamespaceRuntime
+from rce_container.runtimes.process import ProcessRuntime
+from rce_container.settings import ContainerSettings
+
+MACHINE = "testmachine"
+RUNTIMES = ["process", pytest.param("namespace", marks=pytest.mark.needs("bwrap"))]
+ECHO = NodeSpec(tag="echo", pkg="Test", exe="stringEcho.py")
+
+NODES = {
+    "talk.py": "import os, sys, time\nprint('hello', *sys.argv[1:], flush=True)\ntime.sleep(600)\n",
+    "fail.py": "import sys\nprint('it is broken', flush=True)\nsys.exit(3)\n",
+    "end.py": "print('done')\n",
+    "stubborn.py": (
+        "import signal, time\n"
+        "for number in (signal.SIGINT, signal.SIGTERM):\n"
+        "    signal.signal(number, lambda *_: print('no', number, flush=True))\n"
+        "print('ready', flush=True)\n"
+        "while True:\n    time.sleep(1)\n"
+    ),
+    "daemon.py": (
+        "import os, time\n"
+        "if os.fork() == 0:\n"
+        "    os.setsid()\n"
+        "    if os.fork() == 0:\n"
+        "        print('daemon', flush=True)\n"
+        "        time.sleep(600)\n"
+        "    os._exit(0)\n"
+        "os.wait()\n"
+        "time.sleep(600)\n"
+    ),
+    "flood.py": "import sys\nwhile True:\n    sys.stdout.write('x' * 99 + chr(10))\n",
+    "look.py": (
+        "import json, os, socket\n"
+        "def can(path):\n"
+        "    try:\n        open(path, 'w').close()\n"
+        "    except OSError:\n        return False\n"
+        "    os.unlink(path)\n    return True\n"
+        "def net(address):\n"
+        "    try:\n        socket.create_connection(address, 2).close()\n"
+        "    except OSError:\n        return False\n"
+        "    return True\n"
+        "def spy():\n"
+        "    for act in (lambda: open('/proc/1/mem'), lambda: os.readlink('/proc/1/fd/0')):\n"
+        "        try:\n            act()\n"
+        "        except OSError:\n            continue\n"
+        "        return True\n"
+        "    return False\n"
+        "import sys\n"
+        "host, port, secret = sys.argv[1], int(sys.argv[2]), sys.argv[3]\n"
+        "print(json.dumps({\n"
+        "    'env': dict(os.environ), 'root': sorted(os.listdir('/')), 'uid': os.getuid(),\n"
+        "    'pids': sorted(int(p) for p in os.listdir('/proc') if p.isdigit()),\n"
+        "    'host': socket.gethostname(), 'home': can('home.txt'), 'tmp': can('/tmp/x'),\n"
+        "    'usr': can('/usr/x'), 'slash': can('/x'), 'package': can(__file__ + 'x'),\n"
+        "    'loopback': net((host, port)), 'secret': os.path.exists(secret),\n"
+        "    'environment': spy(),\n"
+        "    'caps': next(l for l in open('/proc/self/status') if l.startswith('CapEff')).split()[1],\n"
+        "    'nnp': next(l for l in open('/proc/self/status') if l.startswith('NoNewPrivs')).split()[1],\n"
+        "}), flush=True)\n"
+    ),
+}
+
+
+async def until(
+    condition: Callable[[], Any], *, timeout: float = 20.0, what: str | Callable[[], object] = "condition"
+) -> Any:
+    """Wait until ``condition`` gives something true, and return it."""
+    deadline = time.monotonic() + timeout
+    while not (found := condition()):
+        assert time.monotonic() < deadline, f"{what() if callable(what) else what}: not within {timeout} s"
+        await asyncio.sleep(0.01)
+    return found
+
+
+class Machine:
+    """A machine's disk, and the managers that run on it one after the other."""
+
+    def __init__(self, folder: Path, runtime: str) -> None:
+        self.folder = folder
+        self.runtimes: dict[str, Runtime] = {one.name: one for one in (NamespaceRuntime(), ProcessRuntime())}
+        self.runtime = self.runtimes[runtime]
+        self.runtime.probe()
+        self.packages = folder / "packages"
+        nodes = self.packages / "own" / "nodes"
+        nodes.mkdir(parents=True)
+        (self.packages / "own" / "package.yaml").write_text("name: own\n")
+        for name, text in NODES.items():
+            (nodes / name).write_text(text)
+        self.told: list[ToMaster] = []
+        self.manager: Manager
+        self.marks: set[str] = set()
+        self.pids: dict[int, int] = {}
+
+    @contextlib.asynccontextmanager
+    async def managed(self, **options: Any) -> AsyncIterator[Manager]:
+        """Run a manager; it dies at the end of the block without a word to its containers."""
+        settings = ContainerSettings(
+            machine=MACHINE,
+            packages=(self.packages, examples_dir()),
+            **{"usage_interval": 0.2, "interrupt_timeout": 5.0, **options},
+        )
+        doorman = Doorman()
+        port = await doorman.listen("127.0.0.1", 0)
+        with StateFolder(self.folder / "state", self.folder / "run") as state:
+            self.manager = Manager(
+                name=state.name(""),
+                info=MachineInfo(name=MACHINE),
+                settings=settings,
+                runtimes=self.runtimes,
+                runtime=self.runtime,
+                state=state,
+                doorman=doorman,
+                links=("127.0.0.1", port),
+            )
+            self.manager.send = self._tell
+            ready, self.quit = asyncio.Event(), asyncio.Event()
+            task = asyncio.create_task(self.manager.run(ready.set, self.quit))
+            waiting = asyncio.create_task(ready.wait())
+            await asyncio.wait((waiting, task), return_when=asyncio.FIRST_COMPLETED)
+            try:
+                yield self.manager
+                if self.quit.is_set():
+                    await task
+            finally:
+                self.note_processes()
+                task.cancel()
+                waiting.cancel()
+                await asyncio.gather(task, waiting, return_exceptions=True)
+                await doorman.close()
+
+    @contextlib.asynccontextmanager
+    async def engine(self, **options: Any) -> AsyncIterator[Manager]:
+        """Run a manager that ends properly, and check that nothing is left."""
+        async with self.managed(**options) as manager:
+            yield manager
+            self.note_processes()
+            self.quit.set()
+        self.check_clean()
+
+    def _tell(self, message: ToMaster) -> None:
+        self.told.append(message)
+
+    # What it says
+
+    def status(self, id_: str) -> EndpointStatus | None:
+        return next((status for status in self.manager.statuses if status.id == id_), None)
+
+    def node(self, id_: str, tag: str) -> Any:
+        status = self.status(id_)
+        return next((node for node in status.nodes if node.tag == tag), None) if status else None
+
+    def of(self, kind: type) -> list[Any]:
+        return [message for message in self.told if isinstance(message, kind)]
+
+    @property
+    def faults(self) -> list[str]:
+        return [message.text for message in self.of(Fault)]
+
+    @property
+    def usage(self) -> list[Usage]:
+        return self.of(Usage)
+
+    # What it is told
+
+    async def put(self, id_: str, revision: int = 1, **parts: Any) -> None:
+        await self.manager.handle(Put(endpoint=container(id_, revision, **parts)))
+
+    async def drop(self, id_: str, revision: int = 100) -> None:
+        self.note_processes()
+        await self.manager.handle(Drop(id=id_, revision=revision))
+        await until(lambda: any(m.id == id_ for m in self.of(Gone)), what=f"{id_} is gone")
+
+    async def node_is(self, id_: str, tag: str, state: NodeState) -> Any:
+        def found() -> Any:
+            node = self.node(id_, tag)
+            return node if node and node.state is state else None
+
+        return await until(found, what=f"{id_}/{tag} is {state.value} (faults: {self.faults})")
+
+    async def log(self, id_: str, node: str, offset: int = 0) -> str:
+        await self.manager.handle(ReadLog(request=1, id=id_, node=node, offset=offset, limit=1 << 20))
+        chunk = self.told.pop()
+        assert isinstance(chunk, LogChunk)
+        return chunk.text
+
+    async def log_holds(self, id_: str, node: str, text: str) -> str:
+        deadline = time.monotonic() + 20
+        while text not in (found := await self.log(id_, node)):
+            assert time.monotonic() < deadline, f"{text!r} not in the log: {found!r}"
+            await asyncio.sleep(0.02)
+        return found
+
+    # What is there
+
+    def shims(self) -> list[proc.Process]:
+        """The outermost processes of this machine's containers."""
+        found = []
+        for process in proc.table().values():
+            with contextlib.suppress(OSError):
+                words = Path(f"/proc/{process.pid}/cmdline").read_bytes().split(b"\0")
+                if b"rce-container-shim" in words and any(
+                    word.startswith(bytes(self.folder)) for word in words
+                ):
+                    found.append(process)
+        return found
+
+    def processes(self) -> list[proc.Process]:
+        """All processes of this machine's containers that hang together with a shim."""
+        processes = proc.table()
+        return [one for shim in self.shims() for one in proc.descendants(shim.pid, processes)]
+
+    def environment(self) -> proc.Process:
+        """The environment of the only container."""
+        for process in self.processes():
+            words = Path(f"/proc/{process.pid}/cmdline").read_bytes().split(b"\0")
+            if b"rce_container.environment" in words and b"python" in Path(words[0].decode()).name.encode():
+                return process
+        raise AssertionError("there is no environment")
+
+    def note_processes(self) -> None:
+        """Remember what runs now, to see later that it is gone."""
+        self.pids.update((one.pid, one.start) for one in self.processes())
+        self.marks |= {path.name for path in self.containers}
+
+    def tidy(self) -> None:
+        """Kill what a failed test left, and collect the exit codes that a dead manager did not."""
+        for process in self.processes():
+            proc.kill(process)
+        for pid in self.pids:
+            with contextlib.suppress(ChildProcessError):
+                os.waitpid(pid, 0)
+
+    @property
+    def containers(self) -> list[Path]:
+        folder = self.folder / "state" / "containers"
+        return list(folder.iterdir()) if folder.is_dir() else []
+
+    def left(self) -> list[str]:
+        """All that containers left on the machine."""
+        found = [f"process {pid}" for pid, start in self.pids.items() if proc.alive(pid, start)]
+        found += [f"process {one.pid}" for one in self.processes()]
+        found += [f"process {one.pid}" for mark in self.marks for one in proc.marked(mark)]
+        found += map(str, self.containers)
+        found += [str(path) for path in (self.folder / "run").rglob("*") if path.is_socket()]
+        found += [line for line in Path("/proc/mounts").read_text().splitlines() if str(self.folder) in line]
+        return found
+
+    def check_clean(self) -> None:
+        assert self.left() == []
+
+
+def container(
+    id_: str,
+    revision: int,
+    *,
+    nodes: tuple[NodeSpec, ...] = (),
+    peer: str = "",
+    dial: LinkAddress | None = None,
+    **parts: Any,
+) -> EndpointSpec:
+    """A container's spec; with ``peer``, wired to it over one link."""
+    wires = wiring(peer, dial, [i.tag for i in parts.get("interfaces", ())]) if peer else {}
+    return EndpointSpec(
+        id=id_, kind=EndpointKind.CONTAINER, revision=revision, nodes=nodes, **{**parts, **wires}
+    )
+
+
+def wiring(peer: str, dial: LinkAddress | None, tags: list[str]) -> dict[str, Any]:
+    """The link to a peer, and a connection over it for each tag, with the interface of the same tag there."""
+    link = LinkSpec(id="link", peer=peer, token="token", dial=dial is not None, address=dial or LinkAddress())
+    connections = tuple(
+        ConnectionSpec(id=number, link="link", interface=tag, peer_interface=tag)
+        for number, tag in enumerate(tags, 1)
+    )
+    return {"links": (link,), "connections": connections}
+
+
+STRING = "std_msgs/String"
+ECHO_INTERFACES = (
+    InterfaceSpec(tag="req", type="PublisherInterface", cls=STRING, addr="stringEchoReq"),
+    InterfaceSpec(tag="resp", type="SubscriberInterface", cls=STRING, addr="stringEchoResp"),
+    InterfaceSpec(tag="srv", type="ServiceClientInterface", cls="Test/StringEcho", addr="stringEchoService"),
+)
+
+
+class PeerEnd(Interface):
+    """A peer's end of a connection, for a test to play on."""
+
+    def __init__(self, port: Port) -> None:
+        super().__init__(port)
+        self.active = asyncio.Event()
+        self.history: list[bool] = []
+        self.received: asyncio.Queue[bytes] = asyncio.Queue()
+
+    async def start(self) -> None: ...
+
+    async def close(self) -> None: ...
+
+    def on_active(self, active: bool) -> None:
+        self.history.append(active)
+        self.active.set() if active else self.active.clear()
+
+    def receive(self, payload: bytes, *, latched: bool) -> None:
+        self.received.put_nowait(payload)
+
+    async def serve(self, payload: bytes) -> Buffer:
+        return payload
+
+
+COMPLEMENT = {
+    "PublisherInterface": "SubscriberForwarder",
+    "SubscriberInterface": "PublisherForwarder",
+    "ServiceClientInterface": "ServiceProviderForwarder",
+    "ServiceProviderInterface": "ServiceClientForwarder",
+}
+
+
+class Peer:
+    """A robot that is wired to a container."""
+
+    def __init__(self, machine: str) -> None:
+        self.hub = LinkHub(machine)
+        self.ends: dict[str, PeerEnd] = {}
+        self.faults: list[str] = []
+        self.endpoint = Endpoint(
+            EndpointId.parse("user/robot"),
+            self._make,
+            self.hub,
+            on_change=lambda: None,
+            on_fault=self.faults.append,
+        )
+
+    def _make(self, port: Port) -> PeerEnd:
+        end = self.ends[port.spec.tag] = PeerEnd(port)
+        return end
+
+    async def wire(
+        self, address: LinkAddress, interfaces: tuple[InterfaceSpec, ...], revision: int = 1
+    ) -> None:
+        """Connect to a container's interfaces."""
+        own = tuple(InterfaceSpec(tag=i.tag, type=COMPLEMENT[i.type], cls=i.cls) for i in interfaces)
+        await self.endpoint.apply(
+            EndpointSpec(
+                id="user/robot",
+                kind=EndpointKind.ROBOT,
+                revision=revision,
+                interfaces=own,
+                **wiring("user/box", address, [i.tag for i in interfaces]),
+            )
+        )
+
+    async def active(self, *tags: str) -> None:
+        async with asyncio.timeout(20):
+            for tag in tags or self.ends:
+                await self.ends[tag].active.wait()
+
+    async def close(self) -> None:
+        await self.endpoint.close()
+        await self.hub.close()
+
+
+@contextlib.asynccontextmanager
+async def joined(address: LinkAddress, machine: str = MACHINE) -> AsyncIterator[Peer]:
+    peer = Peer(machine)
+    try:
+        await peer.wire(address, ECHO_INTERFACES)
+        yield peer
+    finally:
+        await peer.close()
