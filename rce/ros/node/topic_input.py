@@ -56,6 +56,12 @@ class TopicInput:
         for subscriber in self.subscribers:
             subscriber.sink.deliver(payload, latched)
 
+    def catch_up(self, subscriber: Subscriber) -> None:
+        """Give a subscriber that came later the latched messages; they come only once over a connection."""
+        for link in self.links:
+            if link.kept is not None:
+                subscriber.sink.deliver(link.kept, True)
+
     def set_publishers(self, uris: Iterable[str]) -> None:
         """Follow these publishers, given by their slave APIs, and no others."""
         wanted = set(uris)
@@ -139,6 +145,8 @@ class InputLink:
         self._target = target
         self.is_greeted = False
         """Whether the publisher has answered."""
+        self.kept: bytes | None = None
+        """The newest message of a latching publisher."""
         self._latched = False
 
     def connection_made(self, connection: Connection) -> None:
@@ -149,6 +157,8 @@ class InputLink:
         if self.is_greeted:
             self.messages += 1
             self.bytes_in += len(payload)
+            if self._latched:
+                self.kept = payload
             self._target.deliver(payload, self._latched)
             return
         self.is_greeted = True

@@ -99,6 +99,8 @@ class Topics:
             except BaseException:
                 self.inputs.pop(topic, None)
                 raise
+        else:
+            source.catch_up(subscriber)
         return subscriber
 
     def accept(self, connection: Connection, fields: dict[str, str]) -> None:

@@ -67,6 +67,14 @@ async def test_a_latched_message_reaches_later_subscribers(make_node: MakeNode) 
         assert await asyncio.wait_for(received.get(), 10) == (b"\x03\0\0\0new", True)
 
 
+async def test_a_latched_message_reaches_a_second_subscriber_of_the_same_node(make_node: MakeNode) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+        publisher = await a.advertise("t", STRING, latch=True)
+        publisher.publish(data="kept")
+        assert await collect(await b.subscribe("t", STRING), 1) == ["kept"]
+        assert await collect(await b.subscribe("t", STRING), 1) == ["kept"]
+
+
 async def test_one_message_can_be_latched(make_node: MakeNode) -> None:
     async with make_node("a") as a, make_node("b") as b:
         publisher = await a.advertise("t", STRING)
