@@ -1,0 +1,1 @@
+"""``rce demo``: engine, containers, simulated robots and operator station, all in one terminal."""

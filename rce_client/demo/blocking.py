@@ -1,0 +1,106 @@
+"""Blocks one cell on a robot's path while the robots drive, and sees that it takes effect."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from enum import Enum
+
+from rce.fleet.grid import GridMap
+from rce.fleet.scenario import midway_cell
+from rce_client.station.api import FleetModel
+
+REPLAN_TIMEOUT = 4.0
+"""Seconds after which a cell that made nobody replan is given back."""
+EFFECT_TIMEOUT = 30.0
+"""Seconds for a cell to become blocked; a robot that is in it has to leave it first."""
+NEAR = 2
+"""So many of the cells that a robot was granted, from its own on, are not put under its wheels."""
+
+
+class Step(Enum):
+    """What is to be done now."""
+
+    NOTHING = "nothing"
+    BLOCK = "block"
+    FREE = "free"
+
+
+@dataclass(slots=True)
+class _Try:
+    cell: int
+    since: float
+    replans: dict[str, int]
+
+
+class MidwayBlock:
+    """Decides which cell to block, and when. Pure: looks at states, says what to do.
+
+    Args:
+        grid: The map with its walls.
+        goals: Goal of each robot.
+
+    Attributes:
+        cell: The cell to be blocked or freed by the step that was returned last.
+        done: The cell that was blocked with effect: it has a box, and a robot got a new path for it.
+    """
+
+    def __init__(self, grid: GridMap, goals: Mapping[str, int]) -> None:
+        self.cell = -1
+        self.done: int | None = None
+        self._grid = grid
+        self._goals = goals
+        self._try: _Try | None = None
+
+    @property
+    def under_way(self) -> bool:
+        """Whether a cell was blocked that has not shown its effect yet."""
+        return self._try is not None and self.done is None
+
+    def look(self, fleet: FleetModel, boxes: Collection[int], now: float) -> Step:
+        """Look at the fleet while it drives.
+
+        Args:
+            fleet: What the planner says.
+            boxes: Cells that truly hold a box, whether the planner knows of it or not.
+            now: Seconds.
+        """
+        if self.done is not None:
+            return Step.NOTHING
+        if self._try is None:
+            return self._begin(fleet, boxes, now)
+        tried, waited = self._try, now - self._try.since
+        replanned = any(robot.replans > tried.replans.get(robot.id, 0) for robot in fleet.robots)
+        blocked = tried.cell in fleet.blocked
+        if replanned and blocked and tried.cell in boxes:
+            self.done = tried.cell
+        elif waited > EFFECT_TIMEOUT or (waited > REPLAN_TIMEOUT and not replanned):
+            self._try = None
+            return Step.FREE
+        return Step.NOTHING
+
+    def refused(self) -> None:
+        """The planner did not block the cell."""
+        self._try = None
+
+    def _begin(self, fleet: FleetModel, boxes: Collection[int], now: float) -> Step:
+        cell = self._choose(fleet, boxes)
+        if cell is None:
+            return Step.NOTHING
+        self.cell = cell
+        self._try = _Try(cell, now, {robot.id: robot.replans for robot in fleet.robots})
+        return Step.BLOCK
+
+    def _choose(self, fleet: FleetModel, boxes: Collection[int]) -> int | None:
+        """Rather a cell that nobody was granted yet; else one that is not just before a robot."""
+        shut = {*self._grid.blocked, *fleet.blocked, *fleet.pending, *boxes}
+        grid = self._grid.with_blocked(shut)
+        plans = {robot.id: robot.plan for robot in fleet.robots if robot.plan}
+        if not all(robot in plans for robot in self._goals):
+            return None
+        for reach in (None, NEAR):
+            avoid = {cell for robot in fleet.robots for cell in robot.granted[:reach]}
+            cell = midway_cell(grid, plans, self._goals, avoid)
+            if cell is not None:
+                return cell
+        return None

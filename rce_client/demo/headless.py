@@ -1,0 +1,70 @@
+"""``rce demo --headless``: one mission, and a report of it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+import aiohttp
+
+from rce_client.demo.counters import Counters, read_counters
+from rce_client.demo.exceptions import DemoError
+from rce_client.demo.mission import Mission
+from rce_client.demo.result import Result
+from rce_client.demo.stage import Play, Stage, set_stage
+from rce_client.demo.station import StationApi
+from rce_client.simulation.report import read_report
+
+
+async def run_headless(
+    play: Play, timeout: float, say: Callable[[str], None], show: Callable[[str], None]
+) -> Result:
+    """Set the stage, run a mission, and end everything again.
+
+    Args:
+        play: What is to be played.
+        timeout: Seconds for all of it.
+        say: Gets lines for people.
+        show: Gets every line that a program prints.
+    """
+    run = _Run(play, say)
+    problem = ""
+    try:
+        async with asyncio.timeout(timeout):
+            async with set_stage(play, show) as stage:
+                await stage.children.while_alive(run.perform(stage))
+    except TimeoutError:
+        problem = f"the time of {timeout:g} s is over"
+    except (DemoError, OSError) as error:
+        problem = str(error)
+    # The world's last word comes at its end: what was touched until then counts.
+    return Result(play.scenario, play.seed, run.mission, read_report(play.report), run.counters, problem)
+
+
+class _Run:
+    """What is known of a run, however it ends."""
+
+    def __init__(self, play: Play, say: Callable[[str], None]) -> None:
+        self.mission: Mission | None = None
+        self.counters: Counters | None = None
+        self._play = play
+        self._say = say
+
+    async def perform(self, stage: Stage) -> None:
+        account = self._play.account
+        async with aiohttp.ClientSession() as session:
+            station = StationApi(session, stage.page)
+            self.mission = Mission(station, self._play.scenario, stage.truth, self._say)
+            try:
+                await self.mission.run()
+            finally:
+                self.counters = await self._count(session, account.url, account.user, account.password)
+
+    async def _count(
+        self, session: aiohttp.ClientSession, master: str, user: str, password: str
+    ) -> Counters | None:
+        try:
+            return await read_counters(session, master, user, password)
+        except DemoError as error:
+            self._say(str(error))
+            return None

@@ -1,0 +1,61 @@
+"""Which TCP ports a demo uses."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+
+from rce_client.demo.exceptions import PortTakenError
+
+LOOPBACK = "127.0.0.1"
+
+
+@dataclass(frozen=True, slots=True)
+class Ports:
+    """The ports of engine and page; 0 stands for a free one that is still to be chosen."""
+
+    page: int = 9080
+    """The operator's page and the API for an ERP."""
+    http: int = 9000
+    """Clients and REST of the master."""
+    control: int = 8080
+    """Task sets."""
+    ws: int = 9010
+    """The robots' WebSockets."""
+    robot_link: int = 10030
+    """Links to robot endpoints."""
+    container_link: int = 10031
+    """Links to containers."""
+
+    def chosen(self) -> Ports:
+        """The same with every 0 replaced by a free port.
+
+        Raises:
+            PortTakenError: A port that was asked for is in use.
+        """
+        names = [field.name for field in fields(self)]
+        # All are held at once, so that none is found twice.
+        with contextlib.ExitStack() as held:
+            found = {name: held.enter_context(_hold(getattr(self, name), option_of(name))) for name in names}
+        return replace(self, **found)
+
+
+ANY = Ports(page=0, http=0, control=0, ws=0, robot_link=0, container_link=0)
+"""Free ports, so that several demos can run side by side."""
+
+
+def option_of(name: str) -> str:
+    """The option of ``rce demo`` that sets a port."""
+    return "--port" if name == "page" else f"--{name.replace('_', '-')}-port"
+
+
+@contextlib.contextmanager
+def _hold(port: int, option: str) -> Iterator[int]:
+    try:
+        server = socket.create_server((LOOPBACK, port))
+    except OSError as error:
+        raise PortTakenError(port, option) from error
+    with server:
+        yield int(server.getsockname()[1])

@@ -1,0 +1,73 @@
+"""The simulation as a program: ``python -m rce_client.simulation SCENE.json --report FILE --master URL``."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import signal
+from pathlib import Path
+from typing import Annotated
+
+import typer
+import uvloop
+
+from rce.config.exceptions import ConfigError
+from rce.ros.types import TypeRegistry
+from rce_client.exceptions import RefusedError
+from rce_client.simulation.account import Account
+from rce_client.simulation.program import Simulation
+from rce_client.simulation.scene import load_scene
+
+BAD_SCENE = 2
+FAILED = 1
+
+
+def simulate(
+    scene: Annotated[Path, typer.Argument(help="What stands where, JSON or YAML.")],
+    report: Annotated[Path | None, typer.Option(help="File to write what truly happens to.")] = None,
+    master: Annotated[
+        str, typer.Option(help="The engine whose planner blocks cells; without it, nobody does.")
+    ] = "",
+    user: Annotated[str, typer.Option(help="Whose fleet it is.")] = "testUser",
+    password: Annotated[str, typer.Option(envvar="RCE_PASSWORD", help="The user's password.")] = "testUser",  # noqa: S107 - the development user's
+    robot_id: Annotated[str, typer.Option(help="The robotID by which the world comes.")] = "world",
+    container: Annotated[str, typer.Option(help="Tag of the planner's container.")] = "cTag_fleet",
+) -> None:
+    """Simulate robots in a world, in real time; each is a ROS graph of its own."""
+    logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    try:
+        simulation = Simulation(
+            load_scene(scene),
+            TypeRegistry(),
+            typer.echo,
+            report=report,
+            account=Account(master, user, password, robot_id) if master else None,
+            container=container,
+        )
+    except ConfigError as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(BAD_SCENE) from None
+    try:
+        uvloop.run(_until_signal(simulation))
+    except* RefusedError as group:
+        typer.echo(f"simulation: the engine refused the world: {group.exceptions[0]}", err=True)
+        raise typer.Exit(FAILED) from None
+
+
+async def _until_signal(simulation: Simulation) -> None:
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop.set)
+    await simulation.run(stop)
+
+
+def main() -> None:
+    """Run the program."""
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app.command()(simulate)
+    app()
+
+
+if __name__ == "__main__":
+    main()
