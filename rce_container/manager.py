@@ -30,6 +30,7 @@ from rce_container import core
 from rce_container.environment import messages as m
 from rce_container.environment import proc
 from rce_container.environment.channel import connect
+from rce_container.environment.exceptions import ChannelError
 from rce_container.environment.process import strike_all
 from rce_container.exceptions import ContainerError, StateError
 from rce_container.folder import ContainerFolder, Record
@@ -161,7 +162,7 @@ class Manager:
         record = folder.read_record()
         process = proc.read(record.pid) if record is not None else None
         if record is None or process is None or process.start != record.start:
-            await self._prune(folder)
+            self._tasks.create_task(self._prune(folder), name=f"prune {folder.mark}")
             return
         runtime = self._runtimes.get(record.runtime, self._runtime)
         unit = self._own(record.id, folder, runtime.adopt(process, folder.mark), isolated=runtime.isolated)
@@ -177,14 +178,18 @@ class Manager:
 
     async def _prune(self, folder: ContainerFolder) -> None:
         """Remove what a dead container left."""
-        try:
+        with contextlib.suppress(OSError, ChannelError, TimeoutError):
+            # It may live, if its manager died before it could note who it is; or it may be just dying.
             channel = await connect(str(folder.control_socket))
-        except OSError:
-            await strike_all(folder.mark)
-            await asyncio.to_thread(folder.remove)
-        else:  # it lives, but its manager died before it could note who it is
-            channel.send(m.encode(m.Stop()))
-            channel.close()
+            try:
+                channel.send(m.encode(m.Stop()))
+                async with asyncio.timeout(self._settings.stop_timeout):
+                    while await channel.receive() is not None:
+                        pass
+            finally:
+                channel.close()
+        await strike_all(folder.mark)
+        await asyncio.to_thread(folder.remove)
 
     # What the core decides
 

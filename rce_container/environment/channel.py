@@ -17,7 +17,6 @@ MAX_UNSENT = 64 << 20
 """Bytes that may wait for a peer that does not read."""
 _CHUNK = 1 << 16
 _MAX_FDS = 16
-_CLOEXEC = getattr(socket, "MSG_CMSG_CLOEXEC", 0)
 
 
 class Channel:
@@ -123,12 +122,14 @@ class Channel:
     async def _fill(self) -> bool:
         while not self._closed:
             try:
-                data, fds, _, _ = socket.recv_fds(self._sock, _CHUNK, _MAX_FDS, _CLOEXEC)
+                data, fds, _, _ = socket.recv_fds(self._sock, _CHUNK, _MAX_FDS)
             except (BlockingIOError, InterruptedError):
                 await self._readable()
                 continue
             except OSError:
                 return False
+            for fd in fds:  # recv_fds of Python 3.11 does not pass MSG_CMSG_CLOEXEC on
+                os.set_inheritable(fd, False)
             self._fds.extend(fds)
             self._received += data
             return bool(data)

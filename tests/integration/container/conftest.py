@@ -1,0 +1,25 @@
+"""A machine for containers, for every runtime."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from support.containers import RUNTIMES, Machine
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    path = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
+    yield path
+    shutil.rmtree(path)
+
+
+@pytest.fixture(params=RUNTIMES)
+def machine(request: pytest.FixtureRequest, folder: Path) -> Iterator[Machine]:
+    machine = Machine(folder, request.param)
+    yield machine
+    machine.tidy()

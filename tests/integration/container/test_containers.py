@@ -1,0 +1,281 @@
+"""Containers with real processes, in every runtime that works here."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.containers import ECHO, ECHO_INTERFACES, MACHINE, Machine, joined, until
+
+from rce.control.model import EndpointState, InterfaceSpec, LinkAddress, NodeSpec, NodeState, ParameterSpec
+from rce.ros.types import TypeRegistry
+from rce_container.environment import proc
+from rce_container.runtimes.namespace import HOME
+
+BOX = "user/box"
+STRING = TypeRegistry().message("std_msgs/String")
+
+
+def own(exe: str, args: str = "", tag: str = "node") -> NodeSpec:
+    return NodeSpec(tag=tag, pkg="own", exe=exe, args=args)
+
+
+async def start_echo(machine: Machine) -> LinkAddress:
+    await machine.put(BOX, nodes=(ECHO,), interfaces=ECHO_INTERFACES, peer="user/robot")
+    status = await until(lambda: machine.status(BOX), what="a status")
+    return status.address
+
+
+async def echo(peer: Any, text: str) -> None:
+    payload = STRING.serialize(STRING.new(data=text))
+    peer.ends["req"].port.send(payload)
+    async with asyncio.timeout(10):
+        assert await peer.ends["resp"].received.get() == payload
+        assert await peer.ends["srv"].port.call(payload) == payload
+
+
+@pytest.mark.parametrize("way", ["unix", "tcp"])
+async def test_a_peer_talks_to_a_node(machine: Machine, way: str) -> None:
+    async with machine.engine():
+        address = await start_echo(machine)
+        async with joined(address, MACHINE if way == "unix" else "another") as peer:
+            await peer.active()
+            for number in range(20):
+                await echo(peer, f"number {number}")
+            status = machine.status(BOX)
+            assert status is not None
+            await until(lambda: machine.status(BOX).interfaces == {"req": True, "resp": True, "srv": True})
+            assert machine.status(BOX).connections == (1, 2, 3)
+
+            def counted() -> bool:
+                if not machine.usage:
+                    return False
+                counters = machine.usage[-1].endpoints[BOX].interfaces.get("req")
+                return counters is not None and counters.messages_in == 20
+
+            await until(counted, what="the counters")
+            usage = machine.usage[-1].endpoints[BOX]
+            assert usage.memory > 5_000_000
+            assert usage.cpu_s > 0
+            assert usage.processes >= 3
+        await until(lambda: not any(machine.status(BOX).interfaces.values()), what="inactive interfaces")
+        assert machine.faults == []
+        await machine.drop(BOX)
+        machine.check_clean()
+
+
+async def test_a_killed_environment_is_noticed_and_made_again(machine: Machine) -> None:
+    async with machine.engine():
+        address = await start_echo(machine)
+        async with joined(address) as peer:
+            await peer.active()
+            first = machine.status(BOX)
+            machine.note_processes()
+            os.kill(machine.environment().pid, signal.SIGKILL)
+            await until(lambda: machine.status(BOX).incarnation != first.incarnation, timeout=2)
+            await until(lambda: not peer.ends["req"].active.is_set(), timeout=2)
+            await until(lambda: machine.status(BOX).state is EndpointState.RUNNING)
+            assert all(not proc.alive(pid, start) for pid, start in machine.pids.items())
+            await peer.wire(machine.status(BOX).address, ECHO_INTERFACES, 2)
+            await peer.active()
+            await echo(peer, "again")
+            assert peer.ends["req"].history in ([True, False, True], [True])
+        assert any("ended unexpectedly" in text for text in machine.faults)
+
+
+async def test_every_outer_process_may_be_killed(machine: Machine) -> None:
+    async with machine.engine():
+        await machine.put(BOX, nodes=(own("talk.py"),))
+        for _ in range(2):
+            await machine.node_is(BOX, "node", NodeState.STARTING)
+            incarnation = machine.status(BOX).incarnation
+            machine.note_processes()
+            old = dict(machine.pids)
+            os.kill(machine.shims()[0].pid, signal.SIGKILL)
+            await until(lambda: machine.status(BOX).incarnation not in ("", incarnation))  # noqa: B023
+            assert not [pid for pid, start in old.items() if proc.alive(pid, start)]
+
+
+async def test_a_node_that_dies_is_told_and_not_restarted(machine: Machine) -> None:
+    async with machine.engine():
+        await machine.put(BOX, nodes=(ECHO, own("fail.py"), own("end.py", tag="end")))
+        node = await machine.node_is(BOX, "node", NodeState.FAILED)
+        assert (node.exit_code, node.pid) == (3, 0)
+        assert node.detail == "exit code 3; its last words: it is broken"
+        await machine.node_is(BOX, "end", NodeState.EXITED)
+        running = await machine.node_is(BOX, "echo", NodeState.RUNNING)
+        assert "stringEcho" in Path(f"/proc/{running.pid}/cmdline").read_text()
+        os.kill(running.pid, signal.SIGKILL)
+        assert (await machine.node_is(BOX, "echo", NodeState.FAILED)).exit_code == -signal.SIGKILL
+        assert any(
+            text.endswith("node node failed: exit code 3; its last words: it is broken")
+            for text in machine.faults
+        )
+        assert any("node echo failed: killed by SIGKILL" in text for text in machine.faults)
+        await machine.put(BOX, 2, nodes=(own("talk.py", "anew"),))
+        assert "hello anew" in await machine.log_holds(BOX, "node", "anew")
+
+
+async def test_bad_wishes_are_told_and_spoil_nothing_else(machine: Machine) -> None:
+    async with machine.engine():
+        await machine.put(
+            BOX,
+            nodes=(
+                NodeSpec(tag="a", pkg="nowhere", exe="x.py"),
+                NodeSpec(tag="b", pkg="own", exe="missing.py"),
+                own("talk.py"),
+            ),
+            interfaces=(
+                InterfaceSpec(tag="bad", type="PublisherInterface", cls="none/Such", addr="x"),
+                InterfaceSpec(tag="conv", type="PublisherConverter", cls="std_msgs/String"),
+                InterfaceSpec(tag="good", type="PublisherInterface", cls="std_msgs/String", addr="y"),
+            ),
+            parameters=(ParameterSpec(name="p", value="$(find nowhere)"),),
+        )
+        await machine.log_holds(BOX, "node", "hello")
+        await until(lambda: len(machine.faults) >= 5, what=f"faults: {machine.faults}")
+        text = "\n".join(machine.faults)
+        for part in (
+            "node a cannot be started: no package 'nowhere'",
+            "node b cannot be started: package own has no executable 'missing.py'",
+            "parameter p",
+            "none/Such",
+            "a container has no PublisherConverter",
+        ):
+            assert part in text
+        await until(lambda: "good" in machine.status(BOX).interfaces)
+        assert machine.status(BOX).revision == 1
+
+
+async def test_parameters_arguments_and_environment(machine: Machine) -> None:
+    check = NodeSpec(
+        tag="node", pkg="own", exe="talk.py", args="'a b' $(find own)", name="talker", namespace="Robot1"
+    )
+    async with machine.engine():
+        await machine.put(BOX, nodes=(check,))
+        found = await machine.log_holds(BOX, "node", "hello")
+        assert found.split("\n")[0] == f"hello a b {machine.packages}/own __name:=talker __ns:=/Robot1"
+
+
+async def test_a_stubborn_node_is_killed(machine: Machine) -> None:
+    async with machine.engine(interrupt_timeout=0.2, terminate_timeout=0.2):
+        await machine.put(BOX, nodes=(own("stubborn.py"),))
+        await machine.log_holds(BOX, "node", "ready")
+        await machine.put(BOX, 2)
+        await until(lambda: not machine.status(BOX).nodes)
+        assert "no " in await machine.log(BOX, "node")
+        assert machine.faults == []
+
+
+async def test_what_a_node_left_behind_dies_with_it(machine: Machine) -> None:
+    async with machine.engine(interrupt_timeout=0.5):
+        await machine.put(BOX, nodes=(own("daemon.py"), own("talk.py", tag="other")))
+        await machine.log_holds(BOX, "node", "daemon")
+        await machine.log_holds(BOX, "other", "hello")
+        before = {one.pid for one in machine.processes()}
+        await machine.put(BOX, 2, nodes=(own("talk.py", tag="other"),))
+        await until(lambda: not [n for n in machine.status(BOX).nodes if n.tag == "node"])
+        left = {one.pid for one in machine.processes()}
+        assert len(before) - len(left) == 2
+        assert machine.node(BOX, "other").pid in left
+
+
+async def test_a_flood_of_output_is_bounded(machine: Machine) -> None:
+    async with machine.engine():
+        await machine.put(BOX, nodes=(own("flood.py"), own("talk.py", tag="other")))
+        await machine.log_holds(BOX, "other", "hello")
+        (logs,) = (path / "logs" for path in machine.containers)
+        await until(lambda: not list(logs.glob("node.000000000000.log")), what="the first segment is dropped")
+        assert sum(path.stat().st_size for path in logs.glob("node.*")) < 3 << 20
+        assert set(await machine.log(BOX, "node", -1000)) == {"x", "\n"}
+
+
+async def test_a_new_manager_adopts_its_containers(machine: Machine) -> None:
+    async with machine.managed():
+        address = await start_echo(machine)
+        async with joined(address) as peer:
+            await peer.active()
+            before = machine.status(BOX)
+            node = await machine.node_is(BOX, "echo", NodeState.RUNNING)
+    async with machine.engine() as manager:
+        assert [status.incarnation for status in manager.hello().endpoints] == [before.incarnation]
+        assert manager.hello().endpoints[0].revision == 1
+        assert machine.node(BOX, "echo").pid == node.pid
+        await machine.put(BOX, 2, nodes=(ECHO,), interfaces=ECHO_INTERFACES, peer="user/robot")
+        async with joined(machine.status(BOX).address, "another") as peer:
+            await peer.active()
+            await echo(peer, "by tcp through the new manager")
+        assert machine.status(BOX).incarnation == before.incarnation
+        assert machine.node(BOX, "echo").pid == node.pid
+
+
+async def test_without_a_manager_a_container_ends_itself(machine: Machine) -> None:
+    async with machine.managed(grace=1.0):
+        await machine.put(BOX, nodes=(ECHO, own("daemon.py"), own("stubborn.py", tag="stubborn")))
+        await machine.node_is(BOX, "echo", NodeState.RUNNING)
+        await machine.log_holds(BOX, "node", "daemon")
+        machine.note_processes()
+    assert machine.shims()
+    await until(lambda: not machine.left(), timeout=40, what=machine.left)
+
+
+async def test_an_environment_that_dies_without_a_manager_leaves_nothing(machine: Machine) -> None:
+    async with machine.managed(grace=1.0):
+        await machine.put(BOX, nodes=(own("daemon.py"),))
+        await machine.log_holds(BOX, "node", "daemon")
+        machine.note_processes()
+    os.kill(machine.environment().pid, signal.SIGKILL)
+    await until(lambda: not machine.left(), what=machine.left)
+
+
+async def test_a_manager_removes_what_the_dead_left(machine: Machine) -> None:
+    async with machine.managed():
+        await machine.put(BOX, nodes=(own("daemon.py"),))
+        await machine.log_holds(BOX, "node", "daemon")
+        machine.note_processes()
+    for process in (*machine.shims(), machine.environment()):
+        proc.kill(process)
+    assert machine.containers
+    async with machine.engine() as manager:
+        assert manager.hello().endpoints == ()
+        await until(lambda: not machine.left(), what=machine.left)
+
+
+@pytest.mark.needs("bwrap")
+async def test_a_namespace_hides_the_machine(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not machine.runtime.isolated:
+        return
+    monkeypatch.setenv("RCE_SECRET", "the secret of the engine")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        async with machine.engine():
+            look = own("look.py", f"127.0.0.1 {port} {machine.folder}/state")
+            await machine.put("user/box", nodes=(look, own("talk.py", tag="other")))
+            seen = json.loads((await machine.log_holds(BOX, "node", "}\n")).splitlines()[-1])
+    assert not [name for name in seen["env"] if name.startswith(("RCE_SECRET", "XDG", "PYTEST"))]
+    assert seen["env"]["HOME"] == HOME
+    assert seen["host"] == "box"
+    assert len(seen["pids"]) <= 4
+    assert (seen["home"], seen["tmp"]) == (True, True)
+    assert (seen["usr"], seen["slash"], seen["package"]) == (False, False, False)
+    assert (seen["loopback"], seen["secret"], seen["environment"]) == (False, False, False)
+    assert (int(seen["caps"], 16), seen["nnp"], seen["uid"]) == (0, "1", 1000)
+
+
+async def test_containers_talk_to_each_other(machine: Machine) -> None:
+    """One dials the other, which a container without a network can do through its manager only."""
+    request = InterfaceSpec(tag="srv", type="ServiceProviderInterface", cls="Test/StringEcho", addr="far")
+    answer = InterfaceSpec(
+        tag="srv", type="ServiceClientInterface", cls="Test/StringEcho", addr="stringEchoService"
+    )
+    async with machine.engine():
+        await machine.put("user/far", nodes=(ECHO,), interfaces=(answer,), peer="user/box")
+        address = machine.status("user/far").address
+        await machine.put(BOX, interfaces=(request,), peer="user/far", dial=address)
+        await until(lambda: machine.status(BOX).interfaces == {"srv": True}, what="connected")
