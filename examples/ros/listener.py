@@ -1,8 +1,6 @@
 """Prints what is said on /chatter: ``python listener.py [chatter:=other_topic]``."""
 
-import asyncio
-
-from rce.ros.node import Node
+from rce.ros.node import Node, run
 
 
 async def main() -> None:
@@ -12,4 +10,4 @@ async def main() -> None:
             print(message.data, flush=True)
 
 
-asyncio.run(main())
+run(main())

@@ -1,8 +1,6 @@
 """Reads and writes parameters: ``python parameters.py [_gain:=2.5]``."""
 
-import asyncio
-
-from rce.ros.node import Node
+from rce.ros.node import Node, run
 
 
 async def main() -> None:
@@ -16,4 +14,4 @@ async def main() -> None:
         print("names:", [name for name in await node.get_param_names() if name.startswith("/control")])
 
 
-asyncio.run(main())
+run(main())

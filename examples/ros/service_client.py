@@ -1,8 +1,6 @@
 """Sets /switch on and off again."""
 
-import asyncio
-
-from rce.ros.node import Node
+from rce.ros.node import Node, run
 
 
 async def main() -> None:
@@ -15,4 +13,4 @@ async def main() -> None:
             print(response.message)
 
 
-asyncio.run(main())
+run(main())

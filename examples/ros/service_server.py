@@ -1,8 +1,6 @@
 """Provides /switch, which remembers what it was set to."""
 
-import asyncio
-
-from rce.ros.node import Node
+from rce.ros.node import Node, run
 from rce.ros.types import Message
 
 
@@ -20,4 +18,4 @@ async def main() -> None:
         await node.spin()
 
 
-asyncio.run(main())
+run(main())

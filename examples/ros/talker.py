@@ -1,8 +1,6 @@
 """Says something on /chatter ten times a second: ``python talker.py [chatter:=other_topic]``."""
 
-import asyncio
-
-from rce.ros.node import Node
+from rce.ros.node import Node, run
 
 
 async def main() -> None:
@@ -15,4 +13,4 @@ async def main() -> None:
             count += 1
 
 
-asyncio.run(main())
+run(main())

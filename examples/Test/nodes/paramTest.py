@@ -3,12 +3,11 @@
 
 from __future__ import annotations
 
-import asyncio
 import sys
 
 from rce.ros.errors import ParameterMissing, ServiceFault
 from rce.ros.names import parse_arguments
-from rce.ros.node import Node
+from rce.ros.node import Node, run
 
 PARAMETERS = ("int", "str", "float", "bool")
 
@@ -32,4 +31,4 @@ if __name__ == "__main__":
     own = parse_arguments(sys.argv[1:]).rest
     if len(own) != 1:
         sys.exit("usage: paramTest.py LABEL")
-    asyncio.run(main(own[0]))
+    run(main(own[0]))

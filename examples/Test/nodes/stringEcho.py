@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-import asyncio
 from typing import TYPE_CHECKING
 
-from rce.ros.node import Node
+from rce.ros.node import Node, run
 
 if TYPE_CHECKING:
     from rce.ros.types import Message
@@ -26,4 +25,4 @@ async def main() -> None:
 
 
 if __name__ == "__main__":
-    asyncio.run(main())
+    run(main())

@@ -41,7 +41,7 @@ from rce.fleet.movingai import read_map
 from rce.fleet.occupancy import occupancy
 from rce.fleet.revisions import numbered_array
 from rce.ros.errors import MasterError
-from rce.ros.node import Node
+from rce.ros.node import Node, run
 from rce.ros.node.master import MasterClient
 from rce.ros.types import Time
 from rce.ros.xmlrpc import RpcClient
@@ -286,4 +286,4 @@ async def main() -> None:
 
 
 if __name__ == "__main__":
-    asyncio.run(main())
+    run(main())

@@ -7,7 +7,6 @@ lists the topics.
 
 from __future__ import annotations
 
-import asyncio
 import time
 from typing import TYPE_CHECKING
 
@@ -15,7 +14,7 @@ from rce.fleet.angles import quaternion_z
 from rce.fleet.grid import GridMap
 from rce.fleet.move_client import ClientReport, GoalState, Instruction, MoveClient, SendGoal, SendStop
 from rce.fleet.revisions import revision_of
-from rce.ros.node import Node
+from rce.ros.node import Node, run
 from rce.ros.types import Time
 
 if TYPE_CHECKING:
@@ -147,4 +146,4 @@ async def main() -> None:
 
 
 if __name__ == "__main__":
-    asyncio.run(main())
+    run(main())
