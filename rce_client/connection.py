@@ -14,21 +14,22 @@ import asyncio
 import logging
 from collections import deque
 from enum import Enum
-from typing import TYPE_CHECKING, Any, Literal, NoReturn, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Any, NoReturn, Self, TypeVar
 
 from rce.protocol.codec import encode
 from rce.protocol.messages import DataMessage, ErrorReport, InterfaceStatus
 from rce.protocol.stream import Fault
 from rce_client.courier import Courier, Target, Timing
 from rce_client.desired import Desired
-from rce_client.ends import Publisher, ServiceClient, ServiceProvider, Subscriber, read_call_fault
+from rce_client.ends import ServiceClient, read_call_fault
 from rce_client.exceptions import InterfaceError, LostError, NotConnectedError, RefusedError
+from rce_client.own_interfaces import OwnInterfaces
 from rce_client.requests import Requests
 from rce_client.sendqueue import QueueLimits
 
 if TYPE_CHECKING:
     import ssl
-    from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+    from collections.abc import Callable, Coroutine, Mapping, Sequence
     from types import TracebackType
 
     from rce.protocol.codec import Frame
@@ -40,9 +41,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 E = TypeVar("E", bound="End")
-
-Json = dict[str, Any]
-"""A message as an object of its fields; binary values are bytes-like."""
 
 
 CONNECTING = "looking for the engine"
@@ -64,7 +62,7 @@ class State(Enum):
     """Closed by the program, or refused by the engine for good."""
 
 
-class Connection(Requests):
+class Connection(Requests, OwnInterfaces):
     """A connection that stays: it dials again when it breaks, and restores what the program had made.
 
     Requests such as :meth:`create_container` return when they were handed to the network, or were noted for
@@ -187,89 +185,6 @@ class Connection(Requests):
 
     # Own interfaces
 
-    @overload
-    async def publisher(self, tag: str, cls: str) -> Publisher[Json]: ...
-    @overload
-    async def publisher(self, tag: str, cls: str, *, raw: Literal[True]) -> Publisher[bytes]: ...
-    async def publisher(self, tag: str, cls: str, *, raw: bool = False) -> Publisher[Any]:
-        """Make an interface of this robot that sends messages.
-
-        Args:
-            tag: Interface tag.
-            cls: Message class, ``package/Type``.
-            raw: Messages are serialized ROS messages (a Forwarder) in place of objects (a Converter).
-        """
-        return await self._add_end(Publisher[Any](self, tag, cls, raw=raw))
-
-    @overload
-    async def subscriber(
-        self,
-        tag: str,
-        cls: str,
-        callback: Callable[[Json], Awaitable[None] | None] | None = None,
-        *,
-        queue_size: int = ...,
-    ) -> Subscriber[Json]: ...
-    @overload
-    async def subscriber(
-        self,
-        tag: str,
-        cls: str,
-        callback: Callable[[bytes], Awaitable[None] | None] | None = None,
-        *,
-        raw: Literal[True],
-        queue_size: int = ...,
-    ) -> Subscriber[bytes]: ...
-    async def subscriber(
-        self,
-        tag: str,
-        cls: str,
-        callback: Callable[[Any], Awaitable[None] | None] | None = None,
-        *,
-        raw: bool = False,
-        queue_size: int = 64,
-    ) -> Subscriber[Any]:
-        """Make an interface of this robot that receives messages; see :class:`rce_client.ends.Subscriber`."""
-        return await self._add_end(
-            Subscriber[Any](self, tag, cls, raw=raw, callback=callback, queue_size=queue_size)
-        )
-
-    @overload
-    async def service_client(self, tag: str, cls: str) -> ServiceClient[Json]: ...
-    @overload
-    async def service_client(self, tag: str, cls: str, *, raw: Literal[True]) -> ServiceClient[bytes]: ...
-    async def service_client(self, tag: str, cls: str, *, raw: bool = False) -> ServiceClient[Any]:
-        """Make an interface of this robot that calls a service."""
-        return await self._add_end(ServiceClient[Any](self, tag, cls, raw=raw))
-
-    @overload
-    async def service_provider(
-        self, tag: str, cls: str, handler: Callable[[Json], Awaitable[Json] | Json], *, max_calls: int = ...
-    ) -> ServiceProvider[Json]: ...
-    @overload
-    async def service_provider(
-        self,
-        tag: str,
-        cls: str,
-        handler: Callable[[bytes], Awaitable[bytes] | bytes],
-        *,
-        raw: Literal[True],
-        max_calls: int = ...,
-    ) -> ServiceProvider[bytes]: ...
-    async def service_provider(
-        self,
-        tag: str,
-        cls: str,
-        handler: Callable[[Any], Awaitable[Any] | Any],
-        *,
-        raw: bool = False,
-        max_calls: int = 64,
-    ) -> ServiceProvider[Any]:
-        """Make an interface of this robot that answers a service; what ``handler`` raises goes to callers."""
-        return await self._add_end(
-            ServiceProvider[Any](self, tag, cls, handler, raw=raw, max_calls=max_calls)
-        )
-
     async def wait_active(self, tag: str, timeout: float | None = None) -> None:
         """Wait until an own interface is joined with a peer (``ST`` true).
 
@@ -378,6 +293,10 @@ class Connection(Requests):
             for end in self._ends.values():
                 end.on_closed()
             self._set_state(State.CLOSED, str(error))
+
+    @property
+    def _way(self) -> Self:
+        return self
 
     async def _add_end(self, end: E) -> E:
         self._check_open()

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 import msgspec
 
 from rce.control.model import EndpointState, EndpointStatus, EndpointUsage
-from rce.link import Endpoint
+from rce.link import Endpoint, InterfaceError
 from rce.protocol.names import EndpointId, InterfaceType
 from rce_robot.exceptions import MisdirectedError
-from rce_robot.interfaces import RobotInterface, make_interface
+from rce_robot.interfaces import make_interface
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rce.link import Interface, LinkHub, Port
     from rce.protocol.messages import DataMessage, Request
     from rce_robot.forms import Form
+    from rce_robot.interface import RobotInterface
     from rce_robot.outbox import Overflow, Queued
     from rce_robot.session import Session
 
@@ -53,7 +54,7 @@ class Headquarters(Protocol):
 
 
 class Namespace:
-    """A robot. Implements :class:`rce_robot.interfaces.RobotSide` and :class:`rce_robot.session.Owner`.
+    """A robot. Implements :class:`rce_robot.interface.RobotSide` and :class:`rce_robot.session.Owner`.
 
     Invariants: at most one session; ``_interfaces`` holds exactly what the endpoint has made and not closed.
     """
@@ -161,7 +162,7 @@ class Namespace:
             self._changed()
             self._headquarters.robot_left(self, reason)
 
-    # rce_robot.interfaces.RobotSide
+    # rce_robot.interface.RobotSide
 
     @property
     def connected(self) -> bool:
@@ -208,7 +209,10 @@ class Namespace:
     # What the endpoint calls
 
     def _make(self, port: Port) -> Interface:
-        type_ = InterfaceType.parse(port.spec.type)
+        try:
+            type_ = InterfaceType.parse(port.spec.type)
+        except ValueError as error:
+            raise InterfaceError(f"{port.spec.tag}: {error}") from error
         form_in, form_out = self._forms.pair(port.spec, type_)
         interface = make_interface(type_.role, port, self, form_in, form_out, call_timeout=self._call_timeout)
         self._interfaces[interface.tag] = interface

@@ -29,7 +29,6 @@ from rce.control.messages import (
     TaskSetKind,
     Usage,
 )
-from rce.control.model import EndpointKind, LinkAddress
 from rce.protocol.exceptions import HandshakeError
 from rce.protocol.messages import type_of
 from rce.protocol.names import EndpointId
@@ -37,7 +36,7 @@ from rce_robot.namespace import Namespace
 
 if TYPE_CHECKING:
     from rce.control.messages import ClientReply, LoginReply, ToMaster, ToTaskSet
-    from rce.control.model import EndpointSpec
+    from rce.control.model import EndpointSpec, LinkAddress
     from rce.link import LinkHub
     from rce.protocol.http import Credentials
     from rce.protocol.messages import Request
@@ -173,8 +172,6 @@ class RobotTaskSet:
     async def settle(self, spec: EndpointSpec) -> Namespace:
         """Return the robot's namespace, made if there is none, with the spec applied."""
         id_ = EndpointId.parse(spec.id)
-        if spec.kind is not EndpointKind.ROBOT:
-            _log.warning("%s is a %s and lives elsewhere", spec.id, spec.kind.value)
         while (closing := self._closing.get(id_)) is not None:
             await closing.wait()
         namespace = self._namespaces.get(id_)

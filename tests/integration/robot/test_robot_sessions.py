@@ -6,16 +6,17 @@ import struct
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from support.cloud import DIGEST, running_cloud
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from rce.control.model import EndpointState
 from rce_robot.outbox import OutboxLimits
 from rce_robot.settings import SessionSettings
-from support.cloud import DIGEST, running_cloud
 
 if TYPE_CHECKING:
-    from rce.control.messages import ClientRequest
     from support.cloud import Cloud
+
+    from rce.control.messages import ClientRequest
 
 STRING = "std_msgs/String"
 ROBOT = "testUser/testRobot"

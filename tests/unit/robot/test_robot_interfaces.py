@@ -16,8 +16,10 @@ from rce.protocol.names import InterfaceType
 from rce.ros.types import TypeRegistry
 from rce_robot.exceptions import BusyError, MisdirectedError, UnreadableError
 from rce_robot.factory import FormFactory
-from rce_robot.interfaces import AnsweredByRobot, RobotInterface, make_interface
+from rce_robot.interface import RobotInterface
+from rce_robot.interfaces import make_interface
 from rce_robot.outbox import Outgoing, Overflow, Queued
+from rce_robot.services import AnsweredByRobot
 
 STRING = "std_msgs/String"
 SERVICE = "std_srvs/SetBool"

@@ -1,0 +1,154 @@
+"""What the four roles of a robot's interfaces have in common."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import TYPE_CHECKING, Any, Protocol
+
+from rce.link import Interface
+from rce.protocol.messages import NO_ID
+from rce_robot.exceptions import UnreadableError
+from rce_robot.outbox import Overflow
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine
+
+    from rce.link import Port
+    from rce.protocol.messages import DataMessage
+    from rce_robot.forms import Form
+    from rce_robot.outbox import Buffer, Outgoing, Queued
+
+URGENT_BELOW = 64 << 10
+"""Service messages smaller than so many bytes go in the control lane."""
+
+MAX_WARNINGS = 256
+"""Different warnings that one interface gives."""
+
+
+class RobotSide(Protocol):
+    """What an interface may do with its robot. Nothing here blocks or raises."""
+
+    @property
+    def connected(self) -> bool:
+        """Whether the robot is there."""
+
+    def send_data(self, tag: str, message: Queued, overflow: Overflow) -> bool:
+        """Send in the data lane; False if the queue refuses or the robot is away."""
+
+    def send_urgent(self, message: Queued) -> bool:
+        """Send in the control lane; False if that is full or the robot is away."""
+
+    def report(self, text: str) -> None:
+        """Send an ``ER``."""
+
+    def show_active(self, tag: str, active: bool) -> None:
+        """Send an ``ST``."""
+
+    def run(self, work: Coroutine[Any, Any, None]) -> bool:
+        """Run something until the robot leaves; False (and nothing done) if too much runs already."""
+
+    def count_dropped(self, tag: str) -> None:
+        """A message was thrown away before it was queued."""
+
+    def closed(self, interface: RobotInterface) -> None:
+        """The interface is gone."""
+
+
+class Delivery:
+    """A message on its way to the robot, converted when its turn comes."""
+
+    __slots__ = ("_interface", "_msg_id", "_payload", "size")
+
+    def __init__(self, interface: RobotInterface, payload: Buffer, msg_id: str) -> None:
+        self._interface = interface
+        self._payload = payload
+        self._msg_id = msg_id
+        self.size = len(payload)
+
+    def render(self) -> Outgoing | None:
+        """Convert the message; a failure is reported to the robot and to whoever waits for an answer."""
+        interface = self._interface
+        try:
+            return interface.pack(interface.form_out.show(self._payload), self._msg_id)
+        except UnreadableError as error:
+            interface.not_rendered(self._msg_id, str(error))
+            return None
+
+
+class RobotInterface(Interface):
+    """Base of the four roles.
+
+    Args:
+        port: The way to the peers.
+        robot: The way to the robot.
+        form_in: Reads what the robot sends here.
+        form_out: Writes what the robot gets here.
+    """
+
+    def __init__(self, port: Port, robot: RobotSide, form_in: Form, form_out: Form) -> None:
+        super().__init__(port)
+        self.robot = robot
+        self.form_in = form_in
+        self.form_out = form_out
+        self.tag = port.spec.tag
+        self.cls = port.spec.cls
+        self.active = False
+        self._warned: set[str] = set()
+
+    @abstractmethod
+    def take(self, message: DataMessage) -> None:
+        """Handle a data message of the robot.
+
+        Raises:
+            RobotError: It is refused.
+        """
+
+    def on_active(self, active: bool) -> None:
+        """Tell the robot."""
+        self.active = active
+        self.robot.show_active(self.tag, active)
+
+    def robot_joined(self) -> None:
+        """Give the robot that (again) connected what it must know."""
+        if self.active:
+            self.robot.show_active(self.tag, True)
+
+    def robot_left(self) -> None:
+        """Give up what waits for the robot."""
+
+    def not_rendered(self, msg_id: str, problem: str) -> None:
+        """Deal with a message to the robot that could not be converted."""
+        self.robot.report(f"{self._name(msg_id)}: {problem}")
+
+    def pack(self, msg: Any, msg_id: str) -> Outgoing:
+        """Return the data message that carries ``msg`` to the robot."""
+        return self.form_out.pack(self.tag, self.cls, msg_id, msg)
+
+    async def start(self) -> None:
+        """Do nothing: a robot's interface can be used as soon as it is there."""
+
+    async def close(self) -> None:
+        """Tell the robot's side that it is gone."""
+        self.robot_left()
+        self.robot.closed(self)
+
+    def _read(self, message: DataMessage, warn: Callable[[str], None]) -> Buffer:
+        try:
+            return self.form_in.read(message.msg, warn)
+        except UnreadableError as error:
+            raise UnreadableError(f"{self._name(message.msg_id)}: {error}") from error
+
+    def _warn(self, text: str) -> None:
+        """Report something that was ignored, once."""
+        if text not in self._warned and len(self._warned) < MAX_WARNINGS:
+            self._warned.add(text)
+            self.robot.report(f"{self.tag}: {text}")
+
+    def _name(self, msg_id: str) -> str:
+        return self.tag if msg_id == NO_ID else f"{self.tag}, msgID {msg_id}"
+
+    def _send_service(self, payload: Buffer, msg_id: str) -> bool:
+        delivery = Delivery(self, payload, msg_id)
+        if len(payload) < URGENT_BELOW:
+            return self.robot.send_urgent(delivery)
+        return self.robot.send_data(self.tag, delivery, Overflow.REFUSE)
