@@ -11,6 +11,7 @@ import uvloop
 
 from rce.config.exceptions import RunDirError, SecretError
 from rce.config.secret import load_secret
+from rce.ros.tcpros.allocator import keep_large_blocks
 from rce_robot.app import App
 from rce_robot.settings import RobotSettings
 
@@ -58,6 +59,7 @@ def robot(
         machine=machine,
         origins=tuple(origin or ()),
     )
+    keep_large_blocks()
     try:
         secret = load_secret(secret_file, dev=dev)
         program = App(
