@@ -56,7 +56,7 @@ def memory(running: RunningEngine) -> list[dict[str, Any]]:
     for needle in ("rce_master", "rce_robot", "rce_container"):
         for process in running.named(needle):
             if "environment" not in " ".join(process.cmdline()):
-                rows.append({"process": needle, "PSS MB": round(_own_memory(process) / 1e6, 1)})
+                rows.append({"process": needle, "PSS MB": round(_own_memory(process) / 1e6, 1)})  # noqa: PERF401
     return rows
 
 
