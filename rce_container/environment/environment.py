@@ -98,35 +98,32 @@ class Environment:
                     on_change=self._changed,
                     on_fault=self._fault,
                 )
-                services = [
-                    tasks.create_task(self._accept_managers(), name="control socket"),
-                    tasks.create_task(self._apply_for_ever(), name="endpoint"),
-                    tasks.create_task(self._watch_graph(), name="graph"),
-                ]
+                applying = tasks.create_task(self._apply_for_ever(), name="endpoint")
+                serving = tasks.create_task(self._accept_managers(), name="control socket")
+                watching = tasks.create_task(self._watch_graph(), name="graph")
                 self._wait_for_manager()
                 await self._ending.wait()
-                await self._close(services)
+                applying.cancel()
+                await self._close()
+                serving.cancel()
+                watching.cancel()
 
     def end(self, reason: str) -> None:
         """Begin to end the container, whole."""
         log.info("ending: %s", reason)
         self._ending.set()
 
-    async def _close(self, services: list[asyncio.Task[None]]) -> None:
-        services[1].cancel()
+    async def _close(self) -> None:
         await self._endpoint.close()
         await self._nodes.close()
         if not self._boot.isolated:
             await strike_all(self._boot.mark)
         self._report()
-        for service in services:
-            service.cancel()
         if self._handover is not None:
             await self._handover.close()
-        if self._grace is not None:
-            self._grace.cancel()
-        if self._report_due is not None:
-            self._report_due.cancel()
+        for timer in (self._grace, self._report_due):
+            if timer is not None:
+                timer.cancel()
         if self._channel is not None:
             self._channel.close()
 
