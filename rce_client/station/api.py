@@ -45,7 +45,9 @@ class RobotModel(_Model):
     """One robot."""
 
     id: str
-    state: str
+    state: str = Field(
+        description="joining, stopping, silent, unreachable, driving, waiting, arrived or idle."
+    )
     reason: str = Field(description="Why it is joining, stopping or silent; else empty.")
     cell: int | None = Field(description="Where it stands, or what it is entering.")
     goal: int | None
@@ -63,6 +65,7 @@ class MapModel(_Model):
     cell_size: float = Field(description="Metres.")
     origin: tuple[float, float] = Field(description="Outer corner of cell 0, metres.")
     robot_radius: float = Field(description="Metres.")
+    walls: list[int] = Field(description="Blocked cells that belong to the map and cannot be freed.")
 
 
 class FleetModel(_Model):
@@ -71,4 +74,5 @@ class FleetModel(_Model):
     map: MapModel | None
     robots: list[RobotModel]
     blocked: list[int]
+    walls: list[int] = Field(description="Blocked cells that belong to the map and cannot be freed.")
     pending: list[int] = Field(description="Cells that will be blocked as soon as a robot has left them.")

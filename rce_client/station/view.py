@@ -63,6 +63,7 @@ class FleetView:
             "cell_size": self.state["cell_size"],
             "origin": [self.state["origin_x"], self.state["origin_y"]],
             "robot_radius": ROBOT_RADIUS,
+            "walls": list(self.state["walls"]),
         }
 
     def robots(self) -> list[dict[str, Any]]:
@@ -81,6 +82,10 @@ class FleetView:
     def blocked(self) -> list[int]:
         """Cells that nothing may enter."""
         return [] if self.state is None else list(self.state["blocked"])
+
+    def walls(self) -> list[int]:
+        """Blocked cells that belong to the map."""
+        return [] if self.state is None else list(self.state["walls"])
 
     def pending(self) -> list[int]:
         """Cells that will be blocked once they are left."""

@@ -82,6 +82,8 @@ fleet.addEventListener("selected", () => {
   toolGoal.textContent = fleet.selected ? `Send ${fleet.selected}: click its goal` : "Pick a robot to send it";
 });
 
+fleet.addEventListener("news", ({ detail }) => panel.addEvent(detail.text, detail.tone));
+
 fleet.addEventListener("map", () => {
   canvas.style.aspectRatio = `${fleet.map.columns} / ${fleet.map.rows}`;
 });
@@ -97,7 +99,6 @@ function connect(delay = 500) {
   socket.addEventListener("message", (event) => {
     const received = JSON.parse(event.data);
     fleet.apply(received);
-    if (received.type === "event") panel.addEvent(received.text, received.tone);
   });
   socket.addEventListener("close", () => {
     badge.textContent = "connecting";

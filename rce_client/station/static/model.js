@@ -3,9 +3,11 @@
 export const TRAIL_LENGTH = 240;
 
 export class Fleet extends EventTarget {
-  map = null;          // {rows, columns, cell_size, origin: [x, y], robot_radius}; row 0 is the lowest
-  robots = new Map();  // id -> {id, state, cell, goal, plan, granted, replans, pose, seen, trail}
+  map = null;          // {rows, columns, cell_size, origin: [x, y], robot_radius, walls}; row 0 is the lowest
+  robots = new Map();  // id -> {id, state, reason, cell, goal, plan, granted, replans, pose, seen, trail}
+  walls = new Set();   // blocked cells that belong to the map
   blocked = new Set();
+  walls = new Set();   // blocked cells that belong to the map
   pending = new Set();
   engine = null;
   selected = null;
@@ -20,10 +22,13 @@ export class Fleet extends EventTarget {
 
   on_map(message) {
     this.map = message;
+    this.walls = new Set(message.walls);
   }
 
   on_state(message) {
+    for (const [text, tone] of this.#news(message)) this.#tell(text, tone);
     this.blocked = new Set(message.blocked);
+    this.walls = new Set(message.walls);
     this.pending = new Set(message.pending);
     const present = new Set();
     for (const state of message.robots) {
@@ -54,7 +59,32 @@ export class Fleet extends EventTarget {
     this.engine = message;
   }
 
-  on_event() {}
+  on_event(message) {
+    this.#tell(message.text, message.tone);
+  }
+
+  // What an operator should read of a new state.
+  *#news(message) {
+    if (this.blocked.size) {
+      for (const cell of message.blocked) if (!this.blocked.has(cell)) yield [`cell ${cell} is blocked`, "warn"];
+      const left = new Set([...message.blocked, ...message.pending]);
+      for (const cell of this.blocked) if (!left.has(cell)) yield [`cell ${cell} is free`, "good"];
+    }
+    for (const state of message.robots) {
+      const before = this.robots.get(state.id);
+      if (!before) continue;
+      if (state.replans > before.replans) yield [`${state.id} gets a new path`, "warn"];
+      if (state.state === before.state) continue;
+      if (state.state === "arrived") yield [`${state.id} is at its goal, cell ${state.goal}`, "good"];
+      if (state.state === "unreachable") yield [`no way leads ${state.id} to cell ${state.goal}`, "bad"];
+      if (state.state === "silent") yield [`${state.id} is silent: ${state.reason}`, "bad"];
+      if (before.state === "silent") yield [`${state.id} is heard again`, "good"];
+    }
+  }
+
+  #tell(text, tone = "") {
+    this.dispatchEvent(new CustomEvent("news", { detail: { text, tone } }));
+  }
 
   select(id) {
     this.selected = this.selected === id ? null : id;
@@ -86,14 +116,16 @@ export class Fleet extends EventTarget {
 
   #robot(id) {
     if (!this.robots.has(id)) {
-      this.robots.set(id, { id, state: "unknown", cell: null, goal: null, plan: [], granted: [], replans: 0, pose: null, shown: null, seen: null, trail: [] });
+      this.robots.set(id, { id, state: "unknown", reason: "", cell: null, goal: null, plan: [], granted: [], replans: 0, pose: null, shown: null, seen: null, trail: [] });
     }
     return this.robots.get(id);
   }
 }
 
-// A colour that stays with a robot: hues spread by the golden angle over the robots' numbers.
+// A colour that stays with a robot: chosen ones for the first, then hues spread by the golden angle.
+const COLOURS = ["#2a7de1", "#d9480f", "#0f9d76", "#9c36b5", "#c2255c", "#5f7d0e", "#0b7285", "#7048e8"];
+
 export function colourOf(id) {
   const number = Number(id.replace(/\D+/g, "")) || [...id].reduce((sum, c) => sum + c.charCodeAt(0), 0);
-  return `hsl(${(205 + number * 137.508) % 360} 70% 50%)`;
+  return COLOURS[number - 1] ?? `hsl(${(205 + number * 137.508) % 360} 65% 48%)`;
 }

@@ -42,6 +42,7 @@ export class Panel {
   #row(robot) {
     const row = element("tr");
     row.dataset.robot = robot.id;
+    if (robot.reason) row.title = robot.reason;
     row.setAttribute("aria-selected", robot.id === this.fleet.selected);
     const name = element("td");
     const dot = element("span", "", "dot");
@@ -67,7 +68,8 @@ export class Panel {
       return;
     }
     const list = element("ul");
-    for (const container of engine.containers) {
+    const containers = [...engine.containers].sort((a, b) => a.tag.localeCompare(b.tag, "en", { numeric: true }));
+    for (const container of containers) {
       const item = stateLine(container.tag, container.state, container.machine);
       const nodes = element("ul");
       for (const node of container.nodes) nodes.append(stateLine(node.tag, node.state, node.detail));

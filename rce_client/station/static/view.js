@@ -3,6 +3,7 @@
 import { colourOf } from "./model.js";
 
 const MARGIN = 0.15;    // of a cell, around the map
+const BOX = 0.6;        // edge of a box, of a cell
 const SMOOTHING = 0.25; // share of the way to the newest pose that a robot is moved in one frame
 
 export class View {
@@ -39,7 +40,7 @@ export class View {
   #readColours() {
     const style = getComputedStyle(document.documentElement);
     this.colour = Object.fromEntries(
-      ["cell", "line", "blocked", "pending", "ink", "quiet", "accent", "bad"].map((name) => [name, style.getPropertyValue(`--${name}`).trim()]),
+      ["cell", "line", "wall", "box", "boxedge", "shut", "pending", "ink", "quiet", "accent", "bad"].map((name) => [name, style.getPropertyValue(`--${name}`).trim()]),
     );
   }
 
@@ -86,9 +87,13 @@ export class View {
       const [x, y] = fleet.centre(cell);
       const left = this.#x(x) - side / 2 + gap;
       const top = this.#y(y) - side / 2 + gap;
-      context.fillStyle = fleet.blocked.has(cell) ? colour.blocked : fleet.pending.has(cell) ? colour.pending : colour.cell;
-      context.fillRect(left, top, side - 2 * gap, side - 2 * gap);
-      if (!small) {
+      const wall = fleet.walls.has(cell);
+      const boxed = !wall && fleet.blocked.has(cell);
+      context.fillStyle = wall ? colour.wall : boxed ? colour.shut : fleet.pending.has(cell) ? colour.pending : colour.cell;
+      if (wall) context.fillRect(left - gap, top - gap, side, side);
+      else context.fillRect(left, top, side - 2 * gap, side - 2 * gap);
+      if (boxed) this.#drawBox(this.#x(x), this.#y(y), BOX * side);
+      if (!small && !wall) {
         context.fillStyle = colour.quiet;
         context.fillText(cell, left + side * 0.05, top + side * 0.05);
       }
@@ -99,6 +104,22 @@ export class View {
       context.lineWidth = Math.max(2, side * 0.04);
       context.strokeRect(this.#x(x) - side / 2 + gap, this.#y(y) - side / 2 + gap, side - 2 * gap, side - 2 * gap);
     }
+  }
+
+  #drawBox(x, y, side) {
+    const { context, colour } = this;
+    const half = side / 2;
+    context.fillStyle = colour.box;
+    context.fillRect(x - half, y - half, side, side);
+    context.strokeStyle = colour.boxedge;
+    context.lineWidth = Math.max(1, side * 0.06);
+    context.strokeRect(x - half, y - half, side, side);
+    context.beginPath();
+    context.moveTo(x - half, y - half);
+    context.lineTo(x + half, y + half);
+    context.moveTo(x + half, y - half);
+    context.lineTo(x - half, y + half);
+    context.stroke();
   }
 
   #line(points) {

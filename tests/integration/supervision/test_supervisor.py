@@ -6,6 +6,7 @@ import asyncio
 import os
 import signal
 import sys
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 import psutil
@@ -45,7 +46,7 @@ async def test_restarts_a_program_that_died() -> None:
             else:
                 restarted.set()
 
-    code = "import os,time; print('a ready: yes', flush=True); print('pid', os.getpid(), flush=True); time.sleep(1000)"
+    code = "import os, time; print('a ready: yes', flush=True); print('pid', os.getpid(), flush=True); time.sleep(1000)"
     async with asyncio.timeout(20):
         await run_until(Supervisor([python("a", code)], show), restarted)
     assert any("ended with exit code -9" in line for line in lines)
@@ -59,7 +60,10 @@ async def test_a_program_that_never_gets_ready_fails_the_start() -> None:
 
 
 async def test_stop_kills_what_ignores_sigterm() -> None:
-    code = "import signal,time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready: x', flush=True); time.sleep(1000)"
+    code = (
+        "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN);"
+        "print('ready: x', flush=True); time.sleep(1000)"
+    )
     child = await Child.start("stubborn", [sys.executable, "-c", code])
     assert [line async for line in _first(child)] == ["ready: x"]
     await child.stop(timeout=0.2)
@@ -67,7 +71,7 @@ async def test_stop_kills_what_ignores_sigterm() -> None:
     assert [line async for line in child.lines()] == []
 
 
-async def _first(child: Child):  # type: ignore[no-untyped-def]
+async def _first(child: Child) -> AsyncIterator[str]:
     async for line in child.lines():
         yield line
         return
