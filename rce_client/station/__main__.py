@@ -82,12 +82,9 @@ class Feed:
             return
         self._send("map", self._view.map() or {})
         robots = [{key: value for key, value in r.items() if key != "pose"} for r in self._view.robots()]
-        cells = {
-            "blocked": self._view.blocked(),
-            "walls": self._view.walls(),
-            "pending": self._view.pending(),
-        }
-        self._send("state", {"robots": robots, **cells})
+        self._send(
+            "state", {"robots": robots, "blocked": self._view.blocked(), "pending": self._view.pending()}
+        )
 
     def on_engine(self, state: dict[str, Any]) -> None:
         """Send the engine's state."""

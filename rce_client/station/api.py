@@ -74,5 +74,4 @@ class FleetModel(_Model):
     map: MapModel | None
     robots: list[RobotModel]
     blocked: list[int]
-    walls: list[int] = Field(description="Blocked cells that belong to the map and cannot be freed.")
     pending: list[int] = Field(description="Cells that will be blocked as soon as a robot has left them.")

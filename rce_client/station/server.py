@@ -139,7 +139,6 @@ class Station:
                 map=None if grid is None else MapModel(**grid),
                 robots=[RobotModel(**robot) for robot in self._view.robots()],
                 blocked=self._view.blocked(),
-                walls=self._view.walls(),
                 pending=self._view.pending(),
             )
         )

@@ -83,10 +83,6 @@ class FleetView:
         """Cells that nothing may enter."""
         return [] if self.state is None else list(self.state["blocked"])
 
-    def walls(self) -> list[int]:
-        """Blocked cells that belong to the map."""
-        return [] if self.state is None else list(self.state["walls"])
-
     def pending(self) -> list[int]:
         """Cells that will be blocked once they are left."""
         return [] if self.state is None else list(self.state["pending"])

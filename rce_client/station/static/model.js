@@ -7,7 +7,6 @@ export class Fleet extends EventTarget {
   robots = new Map();  // id -> {id, state, reason, cell, goal, plan, granted, replans, pose, seen, trail}
   walls = new Set();   // blocked cells that belong to the map
   blocked = new Set();
-  walls = new Set();   // blocked cells that belong to the map
   pending = new Set();
   engine = null;
   selected = null;
@@ -28,7 +27,6 @@ export class Fleet extends EventTarget {
   on_state(message) {
     for (const [text, tone] of this.#news(message)) this.#tell(text, tone);
     this.blocked = new Set(message.blocked);
-    this.walls = new Set(message.walls);
     this.pending = new Set(message.pending);
     const present = new Set();
     for (const state of message.robots) {

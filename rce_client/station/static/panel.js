@@ -2,7 +2,7 @@
 
 import { colourOf } from "./model.js";
 
-const TROUBLE = new Set(["unreachable", "silent", "lost", "stuck", "offline"]);
+const TROUBLE = new Set(["unreachable", "silent", "stopping"]);
 const TONE = { running: "good", connected: "good", placed: "warn", starting: "warn", requested: "warn", absent: "warn", failed: "bad", lost: "bad", exited: "bad" };
 
 function element(tag, text = "", className = "") {
@@ -51,7 +51,7 @@ export class Panel {
     const age = robot.seen === null ? null : (performance.now() - robot.seen) / 1000;
     row.append(
       name,
-      element("td", robot.state, TROUBLE.has(robot.state) ? "bad" : ""),
+      this.#state(robot),
       element("td", robot.cell ?? ""),
       element("td", robot.goal ?? ""),
       element("td", robot.replans),
@@ -59,6 +59,12 @@ export class Panel {
     );
     row.addEventListener("click", () => this.fleet.select(robot.id));
     return row;
+  }
+
+  #state(robot) {
+    const cell = element("td", robot.state, TROUBLE.has(robot.state) ? "bad" : "");
+    cell.title = robot.reason;
+    return cell;
   }
 
   drawEngine() {

@@ -62,10 +62,12 @@ STATE = {
     "origin_y": 0.0,
     "blocked": [3],
     "pending": [1],
+    "walls": [3],
     "robots": [
         {
             "id": "Robot1",
-            "state": "moving",
+            "state": "driving",
+            "reason": "",
             "cell": 0,
             "goal": 2,
             "plan": [0, 2],

@@ -46,7 +46,10 @@ async def test_restarts_a_program_that_died() -> None:
             else:
                 restarted.set()
 
-    code = "import os, time; print('a ready: yes', flush=True); print('pid', os.getpid(), flush=True); time.sleep(1000)"
+    code = (
+        "import os, time; print('a ready: yes', flush=True);"
+        "print('pid', os.getpid(), flush=True); time.sleep(1000)"
+    )
     async with asyncio.timeout(20):
         await run_until(Supervisor([python("a", code)], show), restarted)
     assert any("ended with exit code -9" in line for line in lines)

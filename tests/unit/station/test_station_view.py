@@ -12,13 +12,13 @@ from rce_client.station.view import FleetView
 
 
 def robot(name: str, **changes: Any) -> dict[str, Any]:
-    known = {"id": name, "state": "idle", "cell": 3, "goal": -1, "plan": [], "granted": [], "replans": 0}
+    known = {"id": name, "state": "idle", "reason": "", "cell": 3, "goal": -1, "plan": [], "granted": [], "replans": 0}
     return known | changes
 
 
 def state(*robots: dict[str, Any], **changes: Any) -> dict[str, Any]:
     grid = {"rows": 8, "columns": 8, "cell_size": 1.0, "origin_x": 0.0, "origin_y": 0.0}
-    return {**grid, "blocked": [], "pending": [], "robots": list(robots), **changes}
+    return {**grid, "blocked": [], "walls": [], "pending": [], "robots": list(robots), **changes}
 
 
 def pose(x: float, y: float, yaw: float) -> dict[str, Any]:
