@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import random
 import socket
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
@@ -10,6 +11,9 @@ from dataclasses import dataclass, fields, replace
 from rce_client.demo.exceptions import PortTakenError
 
 LOOPBACK = "127.0.0.1"
+QUIET = range(12000, 32000)
+"""Below what systems hand out to those who ask for any port."""
+ATTEMPTS = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +57,24 @@ def option_of(name: str) -> str:
 
 @contextlib.contextmanager
 def _hold(port: int, option: str) -> Iterator[int]:
+    with _listen(port, option) if port else _listen_anywhere(option) as server:
+        yield int(server.getsockname()[1])
+
+
+def _listen(port: int, option: str) -> socket.socket:
     try:
-        server = socket.create_server((LOOPBACK, port))
+        return socket.create_server((LOOPBACK, port))
     except OSError as error:
         raise PortTakenError(port, option) from error
-    with server:
-        yield int(server.getsockname()[1])
+
+
+def _listen_anywhere(option: str) -> socket.socket:
+    """Listen on a port that the system gives to nobody by itself.
+
+    It is let go and taken again later by the program that it is for; one of those that the system hands out
+    might be somebody's in between.
+    """
+    for port in random.SystemRandom().sample(QUIET, ATTEMPTS):
+        with contextlib.suppress(PortTakenError):
+            return _listen(port, option)
+    raise PortTakenError(QUIET.start, option)
