@@ -59,6 +59,7 @@ class _Node:
     parent: _Node | None
     urgency: list[float]
     order: list[int]
+    focus: list[int] | None = None
     constraints: deque[tuple[tuple[int, int], ...]] = field(default_factory=lambda: deque([()]))
 
 
@@ -148,12 +149,30 @@ class _Search:
         """Read the next constraint, grow the tree below it, and let PIBT fill in the rest."""
         constraint = node.constraints.popleft()
         if len(constraint) < len(node.cells):
-            robot = node.order[len(constraint)]
+            robot = self._focus(node)[len(constraint)]
             choices = [*self._grid.neighbours[node.cells[robot]], node.cells[robot]]
             self._rng.shuffle(choices)
             node.constraints.extend((*constraint, (robot, cell)) for cell in choices)
         before = node.parent.cells if node.parent is not None else node.cells
         return self._generator.generate(node.cells, before, node.order, dict(constraint))
+
+    def _focus(self, node: _Node) -> list[int]:
+        """The robots in the order in which they are constrained.
+
+        First come those that are not at their goals, then those nearest to them: where robots block each
+        other, it is mostly one of these that has to step aside.
+        """
+        if node.focus is None:
+            away = [robot for robot in node.order if self._fields[robot][node.cells[robot]] > 0]
+            places = [self._grid.place(node.cells[robot]) for robot in away]
+            rest = [robot for robot in node.order if self._fields[robot][node.cells[robot]] == 0]
+
+            def distance(robot: int) -> int:
+                row, column = self._grid.place(node.cells[robot])
+                return min((abs(row - r) + abs(column - c) for r, c in places), default=0)
+
+            node.focus = [*away, *sorted(rest, key=distance)]
+        return node.focus
 
     def _rest(self, cells: Configuration) -> float:
         return sum(min(self._fields[robot][cell], len(self._grid)) for robot, cell in enumerate(cells))

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from random import Random
 
+from rce.fleet.swap import SwapFinder
+
 Configuration = tuple[int, ...]
 """The cell of every robot."""
 
@@ -35,6 +37,7 @@ class ConfigurationGenerator:
         self._neighbours = neighbours
         self._fields = fields
         self._rng = rng
+        self._swaps = SwapFinder(neighbours, fields)
         self._now: Configuration = ()
         self._before: Configuration = ()
         self._next: list[int] = []
@@ -76,7 +79,11 @@ class ConfigurationGenerator:
         """Find a cell for ``robot``, pushing others on; if there is none it stays and ``False`` says so."""
         self._chain.add(robot)
         try:
-            for cell in self._choices(robot):
+            choices = self._choices(robot)
+            partner = self._swaps.partner(robot, choices[0], self._now, self._occupant, self._undecided)
+            if partner is not None:
+                choices.reverse()
+            for index, cell in enumerate(choices):
                 if cell in self._taken:
                     continue
                 other = self._occupant.get(cell, robot)
@@ -86,12 +93,24 @@ class ConfigurationGenerator:
                 self._taken[cell] = robot
                 if other != robot and self._next[other] == _OPEN and not self._move(other):
                     continue
+                if index == 0 and partner is not None:
+                    self._pull(partner, robot)
                 return True
             self._next[robot] = self._now[robot]
             self._taken[self._now[robot]] = robot
             return False
         finally:
             self._chain.discard(robot)
+
+    def _undecided(self, robot: int) -> bool:
+        return self._next[robot] == _OPEN
+
+    def _pull(self, partner: int, robot: int) -> None:
+        """Let ``partner`` follow ``robot`` into the cell that it leaves."""
+        cell = self._now[robot]
+        if self._next[partner] == _OPEN and cell not in self._taken:
+            self._next[partner] = cell
+            self._taken[cell] = partner
 
     def _choices(self, robot: int) -> list[int]:
         """Cells that ``robot`` can be in next, the best first."""

@@ -139,6 +139,7 @@ class FleetPlanner:
         if not self._arrive(record):
             here = self.books.grid.cell_at(record.x, record.y)
             if here not in self.books.ledger.claims(record.id):
+                record.rest = None  # Somebody carried it away: it rests where it was put.
                 self._hold(record, "it left its path")
                 self._make_room(record)
 
