@@ -11,148 +11,34 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from rce.control.messages import Fault, Gone, Status, ToMaster
+from rce.control.messages import Fault, Gone, Status
 from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress
+from rce_container.events import (
+    Adopted,
+    Apply,
+    Drop,
+    Due,
+    Event,
+    Faulted,
+    Instruction,
+    Lost,
+    Made,
+    Put,
+    Quit,
+    Removed,
+    Reported,
+    Start,
+    Stop,
+    Sync,
+    Tell,
+    Wait,
+)
 from rce_container.life import Happening, Phase, after
 
 BACKOFF_S = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
 """Pauses before a container that ended is made again: the first, second, ... time."""
 STABLE_S = 30.0
 """A container that ran for so long starts at the first pause again."""
-
-
-@dataclass(frozen=True, slots=True)
-class Put:
-    """The master desires a container like this."""
-
-    spec: EndpointSpec
-
-
-@dataclass(frozen=True, slots=True)
-class Drop:
-    """The master does not desire a container any more."""
-
-    id: str
-    revision: int
-
-
-@dataclass(frozen=True, slots=True)
-class Sync:
-    """The master desires exactly these."""
-
-    specs: tuple[EndpointSpec, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Adopted:
-    """A container was found that an earlier manager had started; its environment has reported."""
-
-    mark: str
-    status: EndpointStatus
-    address: LinkAddress
-
-
-@dataclass(frozen=True, slots=True)
-class Made:
-    """The processes of a new life were started."""
-
-    id: str
-    mark: str
-    address: LinkAddress
-
-
-@dataclass(frozen=True, slots=True)
-class Reported:
-    """An environment reported."""
-
-    id: str
-    mark: str
-    status: EndpointStatus
-
-
-@dataclass(frozen=True, slots=True)
-class Faulted:
-    """An environment has a fault to tell the user of."""
-
-    id: str
-    mark: str
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class Lost:
-    """An environment is gone, or could not be started (``mark`` is empty then)."""
-
-    id: str
-    mark: str
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class Removed:
-    """Nothing is left of a life."""
-
-    id: str
-    mark: str
-
-
-@dataclass(frozen=True, slots=True)
-class Due:
-    """The pause that :class:`Wait` asked for is over."""
-
-    id: str
-    ticket: int
-
-
-@dataclass(frozen=True, slots=True)
-class Quit:
-    """The manager is to end, with all its containers."""
-
-
-Event = Put | Drop | Sync | Adopted | Made | Reported | Faulted | Lost | Removed | Due | Quit
-
-
-@dataclass(frozen=True, slots=True)
-class Start:
-    """Start a new life; answered by :class:`Made` or :class:`Lost`."""
-
-    id: str
-
-
-@dataclass(frozen=True, slots=True)
-class Apply:
-    """Give a specification to an environment."""
-
-    id: str
-    mark: str
-    spec: EndpointSpec
-
-
-@dataclass(frozen=True, slots=True)
-class Stop:
-    """End a life, nodes first; answered by :class:`Removed` in the end."""
-
-    id: str
-    mark: str
-
-
-@dataclass(frozen=True, slots=True)
-class Wait:
-    """Answer by :class:`Due` after ``delay`` seconds."""
-
-    id: str
-    ticket: int
-    delay: float
-
-
-@dataclass(frozen=True, slots=True)
-class Tell:
-    """Send a message to the master."""
-
-    message: ToMaster
-
-
-Instruction = Start | Apply | Stop | Wait | Tell
 
 
 @dataclass(slots=True)

@@ -26,7 +26,7 @@ from rce.control.messages import (
 )
 from rce.control.model import EndpointStatus, LinkAddress
 from rce.protocol.names import EndpointId, is_name
-from rce_container import core
+from rce_container import core, events
 from rce_container.environment import messages as m
 from rce_container.environment import proc
 from rce_container.environment.channel import connect
@@ -112,11 +112,11 @@ class Manager:
         """Do what the master says."""
         match message:
             case Put(endpoint=spec):
-                self._feed(core.Put(spec))
+                self._feed(events.Put(spec))
             case Drop(id=id_, revision=revision):
-                self._feed(core.Drop(id_, revision))
+                self._feed(events.Drop(id_, revision))
             case Sync(endpoints=specs):
-                self._feed(core.Sync(specs))
+                self._feed(events.Sync(specs))
             case ReadLog():
                 self.send(await asyncio.to_thread(self._read_log, message))
             case _:
@@ -143,7 +143,7 @@ class Manager:
             ready()
             usage = self._tasks.create_task(self._report_usage(), name="usage")
             await quit_.wait()
-            self._feed(core.Quit())
+            self._feed(events.Quit())
             if self._units:
                 await self._empty.wait()
             usage.cancel()
@@ -174,7 +174,7 @@ class Manager:
             unit.kill()
             return
         log.info("adopted container %s", record.id)
-        self._feed(core.Adopted(unit.mark, unit.status, self._address(folder)))
+        self._feed(events.Adopted(unit.mark, unit.status, self._address(folder)))
 
     async def _prune(self, folder: ContainerFolder) -> None:
         """Remove what a dead container left."""
@@ -193,37 +193,37 @@ class Manager:
 
     # What the core decides
 
-    def _feed(self, event: core.Event) -> None:
+    def _feed(self, event: events.Event) -> None:
         for instruction in self._core.handle(event, asyncio.get_running_loop().time()):
             self._perform(instruction)
 
-    def _perform(self, instruction: core.Instruction) -> None:
+    def _perform(self, instruction: events.Instruction) -> None:
         match instruction:
-            case core.Tell(message=message):
+            case events.Tell(message=message):
                 self.send(message)
-            case core.Start(id=id_):
+            case events.Start(id=id_):
                 self._start(id_)
-            case core.Apply(mark=mark, spec=spec):
+            case events.Apply(mark=mark, spec=spec):
                 self._units[mark].apply(spec)
-            case core.Stop(mark=mark):
+            case events.Stop(mark=mark):
                 self._units[mark].stop()
-            case core.Wait(id=id_, ticket=ticket, delay=delay):
-                asyncio.get_running_loop().call_later(delay, self._feed, core.Due(id_, ticket))
+            case events.Wait(id=id_, ticket=ticket, delay=delay):
+                asyncio.get_running_loop().call_later(delay, self._feed, events.Due(id_, ticket))
 
     def _start(self, id_: str) -> None:
         try:
             folder = self._state.create()
         except StateError as error:
-            self._feed(core.Lost(id_, "", str(error)))
+            self._feed(events.Lost(id_, "", str(error)))
             return
         try:
             handle = self._launch(id_, folder)
         except ContainerError as error:
             folder.remove()
-            self._feed(core.Lost(id_, "", str(error)))
+            self._feed(events.Lost(id_, "", str(error)))
             return
         self._own(id_, folder, handle, isolated=self._runtime.isolated)
-        self._feed(core.Made(id_, folder.mark, self._address(folder)))
+        self._feed(events.Made(id_, folder.mark, self._address(folder)))
 
     def _launch(self, id_: str, folder: ContainerFolder) -> Handle:
         settings = self._settings
@@ -265,7 +265,7 @@ class Manager:
     async def _run_unit(self, unit: Unit) -> None:
         await unit.run()
         del self._units[unit.mark]
-        self._feed(core.Removed(unit.id, unit.mark))
+        self._feed(events.Removed(unit.id, unit.mark))
         if not self._units:
             self._empty.set()
 

@@ -14,7 +14,7 @@ import msgspec
 from rce.control.model import EndpointSpec, EndpointStatus, InterfaceUsage, LinkAddress, NodeStatus
 from rce.link.handover import Doorman, HandoverSender
 from rce.link.tasks import TaskScope
-from rce_container import core
+from rce_container import events
 from rce_container.dial import dial
 from rce_container.environment import messages as m
 from rce_container.environment import proc
@@ -41,7 +41,7 @@ class Office:
 
     settings: ContainerSettings
     doorman: Doorman
-    feed: Callable[[core.Event], None]
+    feed: Callable[[events.Event], None]
 
 
 class Unit:
@@ -121,7 +121,7 @@ class Unit:
             if not self._stopping:
                 reason += await asyncio.to_thread(self._last_words)
                 log.warning("container %s: %s", self.id, reason)
-            self._office.feed(core.Lost(self.id, self.mark, reason))
+            self._office.feed(events.Lost(self.id, self.mark, reason))
             await self._clean(_SHIM_TIMEOUT_S if self._stopping and not self._hurry else 0.0)
         except asyncio.CancelledError:
             self.handle.abandon()
@@ -168,7 +168,7 @@ class Unit:
                 case m.Report(status=status):
                     self._report(status)
                 case m.Fault(text=text):
-                    self._office.feed(core.Faulted(self.id, self.mark, text))
+                    self._office.feed(events.Faulted(self.id, self.mark, text))
                 case m.Counters(interfaces=interfaces):
                     self.counters = interfaces
                 case m.Dial() as request:
@@ -181,7 +181,7 @@ class Unit:
             status = msgspec.structs.replace(status, nodes=self._with_outer_pids(status))
         self.status = status
         self.reported.set()
-        self._office.feed(core.Reported(self.id, self.mark, status))
+        self._office.feed(events.Reported(self.id, self.mark, status))
 
     def _with_outer_pids(self, status: EndpointStatus) -> tuple[NodeStatus, ...]:
         """Replace the nodes' pids inside the container by those outside."""

@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 
 from rce.control.model import EndpointKind, EndpointSpec, EndpointState, EndpointStatus
-from rce.link import Endpoint
+from rce.link import Endpoint, LinkHub
 from rce.link.handover import HandoverReceiver
 from rce.protocol.names import EndpointId
 from rce.ros.core import Core
@@ -30,7 +30,7 @@ from rce_container.environment.interfaces import InterfaceMaker, Readiness
 from rce_container.environment.nodes import NodeSet, Workshop
 from rce_container.environment.parameters import Values, difference, evaluate_all
 from rce_container.environment.process import strike_all
-from rce_container.environment.reach import ContainerHub, Operator
+from rce_container.environment.reach import Operator
 from rce_container.environment.reaper import Reaper
 
 log = logging.getLogger(__name__)
@@ -83,9 +83,10 @@ class Environment:
             node = await stack.enter_async_context(
                 Node(NODE_NAME, argv=[], master_uri=self._core.uri, types=types)
             )
-            hub = ContainerHub(self._boot.machine, self._operator if self._boot.isolated else None)
+            dial = self._operator.connect if self._boot.isolated else None
+            hub = LinkHub(self._boot.machine, dial=dial)
             stack.push_async_callback(hub.close)
-            await hub.listen(self._links)
+            await hub.listen_socket(self._links)
             self._hub = hub
             async with asyncio.TaskGroup() as tasks:
                 self._tasks = tasks

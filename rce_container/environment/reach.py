@@ -1,6 +1,6 @@
 """The container's way to its peers.
 
-Links come in on a socket that was made outside, and go out through the manager.
+A container has no network: the manager connects for it and hands the socket in.
 """
 
 from __future__ import annotations
@@ -9,15 +9,9 @@ import asyncio
 import socket
 from collections.abc import Callable
 from itertools import count
-from typing import TYPE_CHECKING
 
 from rce.control.model import LinkAddress
-from rce.link import LinkHub, LinkLost
 from rce_container.environment.messages import Dial
-
-if TYPE_CHECKING:
-    from rce.control.model import LinkSpec
-    from rce.link.carrier import Carrier
 
 _TIMEOUT_S = 10.0
 
@@ -61,35 +55,3 @@ class Operator:
             result.close()
         else:
             answer.set_result(result)
-
-
-class ContainerHub(LinkHub):
-    """A hub without a network of its own.
-
-    Args:
-        machine: As of :class:`~rce.link.LinkHub`.
-        operator: Dials; None where the container sees the machine's network and sockets.
-    """
-
-    def __init__(self, machine: str, operator: Operator | None) -> None:
-        super().__init__(machine)
-        self._operator = operator
-
-    async def listen(self, sock: socket.socket) -> None:
-        """Accept links on a listening unix socket; it belongs to the hub from now on."""
-        sock.setblocking(False)
-        self._servers.append(await self.loop.create_unix_server(self._accept, sock=sock, backlog=128))
-
-    async def connect(self, spec: LinkSpec) -> Carrier:
-        """Reach the accepting end of a link, as :meth:`rce.link.LinkHub.connect`."""
-        if self._operator is None or spec.id in self._accepting:
-            return await super().connect(spec)
-        sock = await self._operator.connect(spec.address)
-        try:
-            _, carrier = await self.loop.connect_accepted_socket(self._new_carrier, sock)
-        except BaseException as error:
-            sock.close()
-            if isinstance(error, OSError):
-                raise LinkLost(f"the connection was of no use: {error}") from error
-            raise
-        return await self._introduce(carrier, spec)

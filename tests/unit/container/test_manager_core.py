@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from rce.control.messages import Fault, Gone, Status
 from rce.control.model import EndpointKind, EndpointSpec, EndpointState, EndpointStatus, LinkAddress
-from rce_container import core
+from rce_container import core, events
 from rce_container.core import ManagerCore
 from rce_container.life import NEXT, Phase
 
@@ -25,56 +25,56 @@ def status(revision: int = 1, id_: str = ID) -> EndpointStatus:
 
 def running(mark: str = "one", revision: int = 1) -> ManagerCore:
     manager = ManagerCore()
-    manager.handle(core.Put(spec(revision)), 0.0)
-    manager.handle(core.Made(ID, mark, ADDRESS), 0.0)
-    manager.handle(core.Reported(ID, mark, status(revision)), 0.0)
+    manager.handle(events.Put(spec(revision)), 0.0)
+    manager.handle(events.Made(ID, mark, ADDRESS), 0.0)
+    manager.handle(events.Reported(ID, mark, status(revision)), 0.0)
     return manager
 
 
-def told(out: list[core.Instruction], kind: type) -> list:
-    return [one.message for one in out if isinstance(one, core.Tell) and isinstance(one.message, kind)]
+def told(out: list[events.Instruction], kind: type) -> list:
+    return [one.message for one in out if isinstance(one, events.Tell) and isinstance(one.message, kind)]
 
 
 def test_put_starts_a_container_and_gives_it_its_spec() -> None:
     manager = ManagerCore()
-    assert manager.handle(core.Put(spec()), 0.0) == [core.Start(ID)]
-    out = manager.handle(core.Made(ID, "one", ADDRESS), 0.0)
-    assert out[0] == core.Apply(ID, "one", spec())
+    assert manager.handle(events.Put(spec()), 0.0) == [events.Start(ID)]
+    out = manager.handle(events.Made(ID, "one", ADDRESS), 0.0)
+    assert out[0] == events.Apply(ID, "one", spec())
     assert told(out, Status)[0].status.state is EndpointState.STARTING
-    out = manager.handle(core.Reported(ID, "one", status()), 0.1)
+    out = manager.handle(events.Reported(ID, "one", status()), 0.1)
     reported = told(out, Status)[0].status
     assert (reported.state, reported.incarnation, reported.address) == (EndpointState.RUNNING, "one", ADDRESS)
 
 
 def test_put_of_an_older_revision_is_ignored() -> None:
     manager = running(revision=5)
-    assert manager.handle(core.Put(spec(4)), 1.0) == []
-    assert manager.handle(core.Put(spec(6)), 1.0) == [core.Apply(ID, "one", spec(6))]
+    assert manager.handle(events.Put(spec(4)), 1.0) == []
+    assert manager.handle(events.Put(spec(6)), 1.0) == [events.Apply(ID, "one", spec(6))]
 
 
 def test_drop_stops_and_says_gone_when_nothing_is_left() -> None:
     manager = running()
-    out = manager.handle(core.Drop(ID, 7), 1.0)
-    assert core.Stop(ID, "one") in out
+    out = manager.handle(events.Drop(ID, 7), 1.0)
+    assert events.Stop(ID, "one") in out
     assert told(out, Status)[0].status.state is EndpointState.STOPPING
     assert not told(out, Gone)
-    manager.handle(core.Lost(ID, "one", "its environment ended"), 1.1)
-    out = manager.handle(core.Removed(ID, "one"), 1.2)
+    manager.handle(events.Lost(ID, "one", "its environment ended"), 1.1)
+    out = manager.handle(events.Removed(ID, "one"), 1.2)
     assert told(out, Gone) == [Gone(id=ID, revision=7)]
     assert not told(out, Fault)
     assert not manager.containers
 
 
 def test_drop_of_what_is_not_there_says_gone_at_once() -> None:
-    assert told(ManagerCore().handle(core.Drop(ID, 3), 0.0), Gone) == [Gone(id=ID, revision=3)]
+    assert told(ManagerCore().handle(events.Drop(ID, 3), 0.0), Gone) == [Gone(id=ID, revision=3)]
 
 
 def test_put_while_it_stops_starts_it_anew_and_never_says_gone() -> None:
     manager = running()
-    manager.handle(core.Drop(ID, 7), 1.0)
-    assert manager.handle(core.Put(spec(8)), 1.1) == []
-    out = manager.handle(core.Removed(ID, "one"), 1.2)
-    assert out == [core.Start(ID)]
+    manager.handle(events.Drop(ID, 7), 1.0)
+    assert manager.handle(events.Put(spec(8)), 1.1) == []
+    out = manager.handle(events.Removed(ID, "one"), 1.2)
+    assert out == [events.Start(ID)]
 
 
 def test_an_unexpected_end_is_told_and_mended_with_growing_pauses() -> None:
@@ -82,17 +82,17 @@ def test_an_unexpected_end_is_told_and_mended_with_growing_pauses() -> None:
     pauses = []
     faults = []
     for number, mark in enumerate(("one", "two", "three", "four")):
-        out = manager.handle(core.Lost(ID, mark, "killed"), number + 1.0)
+        out = manager.handle(events.Lost(ID, mark, "killed"), number + 1.0)
         faults += told(out, Fault)
         assert told(out, Status)[-1].status.state is EndpointState.FAILED
-        out = manager.handle(core.Removed(ID, mark), number + 1.0)
-        (wait,) = (one for one in out if isinstance(one, core.Wait))
+        out = manager.handle(events.Removed(ID, mark), number + 1.0)
+        (wait,) = (one for one in out if isinstance(one, events.Wait))
         pauses.append(wait.delay)
-        assert manager.handle(core.Due(ID, wait.ticket - 1), 2.0) == []
-        assert manager.handle(core.Due(ID, wait.ticket), 2.0) == [core.Start(ID)]
+        assert manager.handle(events.Due(ID, wait.ticket - 1), 2.0) == []
+        assert manager.handle(events.Due(ID, wait.ticket), 2.0) == [events.Start(ID)]
         following = ("one", "two", "three", "four", "five")[number + 1]
-        manager.handle(core.Made(ID, following, ADDRESS), 2.0)
-        manager.handle(core.Reported(ID, following, status()), 2.0)
+        manager.handle(events.Made(ID, following, ADDRESS), 2.0)
+        manager.handle(events.Reported(ID, following, status()), 2.0)
     assert pauses == [0.0, 0.5, 1.0, 2.0]
     assert len(faults) == 1, "the user hears of the same failure once"
     assert "killed" in faults[0].text
@@ -101,21 +101,21 @@ def test_an_unexpected_end_is_told_and_mended_with_growing_pauses() -> None:
 def test_a_stable_container_is_mended_at_once_again() -> None:
     manager = running()
     for mark, now in (("one", 1.0), ("two", 2.0 + core.STABLE_S)):
-        manager.handle(core.Lost(ID, mark, "killed"), now)
-        out = manager.handle(core.Removed(ID, mark), now)
-        (wait,) = (one for one in out if isinstance(one, core.Wait))
+        manager.handle(events.Lost(ID, mark, "killed"), now)
+        out = manager.handle(events.Removed(ID, mark), now)
+        (wait,) = (one for one in out if isinstance(one, events.Wait))
         assert wait.delay == 0.0
-        manager.handle(core.Due(ID, wait.ticket), now)
-        manager.handle(core.Made(ID, "two", ADDRESS), now)
-        manager.handle(core.Reported(ID, "two", status()), now)
+        manager.handle(events.Due(ID, wait.ticket), now)
+        manager.handle(events.Made(ID, "two", ADDRESS), now)
+        manager.handle(events.Reported(ID, "two", status()), now)
 
 
 def test_a_container_that_cannot_be_started_is_tried_again() -> None:
     manager = ManagerCore()
-    manager.handle(core.Put(spec()), 0.0)
-    out = manager.handle(core.Lost(ID, "", "the disk is full"), 0.0)
+    manager.handle(events.Put(spec()), 0.0)
+    out = manager.handle(events.Lost(ID, "", "the disk is full"), 0.0)
     assert "the disk is full" in told(out, Fault)[0].text
-    assert any(isinstance(one, core.Wait) for one in out)
+    assert any(isinstance(one, events.Wait) for one in out)
     assert manager.containers[ID].phase is Phase.WAITING
 
 
@@ -123,10 +123,10 @@ def test_events_of_an_older_life_are_ignored() -> None:
     manager = running("two")
     before = manager.statuses
     for event in (
-        core.Reported(ID, "one", status(9)),
-        core.Lost(ID, "one", "killed"),
-        core.Removed(ID, "one"),
-        core.Faulted(ID, "one", "x"),
+        events.Reported(ID, "one", status(9)),
+        events.Lost(ID, "one", "killed"),
+        events.Removed(ID, "one"),
+        events.Faulted(ID, "one", "x"),
     ):
         assert manager.handle(event, 1.0) == []
     assert manager.statuses == before
@@ -135,20 +135,20 @@ def test_events_of_an_older_life_are_ignored() -> None:
 def test_sync_removes_what_is_not_desired_and_keeps_adopted_ones() -> None:
     manager = ManagerCore()
     for tag in ("kept", "other"):
-        manager.handle(core.Adopted(tag, status(4, f"user/{tag}"), ADDRESS), 0.0)
-    out = manager.handle(core.Sync((spec(5, "user/kept"), spec(1, "user/new"))), 1.0)
-    assert core.Stop("user/other", "other") in out
-    assert core.Apply("user/kept", "kept", spec(5, "user/kept")) in out
-    assert core.Start("user/new") in out
-    out = manager.handle(core.Removed("user/other", "other"), 1.0)
+        manager.handle(events.Adopted(tag, status(4, f"user/{tag}"), ADDRESS), 0.0)
+    out = manager.handle(events.Sync((spec(5, "user/kept"), spec(1, "user/new"))), 1.0)
+    assert events.Stop("user/other", "other") in out
+    assert events.Apply("user/kept", "kept", spec(5, "user/kept")) in out
+    assert events.Start("user/new") in out
+    out = manager.handle(events.Removed("user/other", "other"), 1.0)
     assert told(out, Gone) == [Gone(id="user/other", revision=4)]
 
 
 def test_quit_stops_all_starts_nothing_and_drops_nothing() -> None:
     manager = running()
-    assert core.Stop(ID, "one") in manager.handle(core.Quit(), 1.0)
-    assert manager.handle(core.Put(spec(9)), 1.0) == []
-    assert told(manager.handle(core.Removed(ID, "one"), 1.0), Gone) == []
+    assert events.Stop(ID, "one") in manager.handle(events.Quit(), 1.0)
+    assert manager.handle(events.Put(spec(9)), 1.0) == []
+    assert told(manager.handle(events.Removed(ID, "one"), 1.0), Gone) == []
     assert not manager.containers
 
 
@@ -180,34 +180,34 @@ def test_any_order_of_events_keeps_the_invariants(  # noqa: C901, PLR0912 - a sm
     ended = False
     tickets: list[int] = []
     for now, (name, number) in enumerate(steps):
-        event: core.Event
+        event: events.Event
         match name:
             case "put":
-                event = core.Put(spec(number))
+                event = events.Put(spec(number))
             case "drop":
-                event = core.Drop(ID, number)
+                event = events.Drop(ID, number)
             case "sync":
-                event = core.Sync((spec(number),) if number else ())
+                event = events.Sync((spec(number),) if number else ())
             case "report" if alive and not ended:
-                event = core.Reported(ID, alive, status())
+                event = events.Reported(ID, alive, status())
             case "lost" if alive and not ended:
-                event, ended = core.Lost(ID, alive, "killed"), True
+                event, ended = events.Lost(ID, alive, "killed"), True
             case "removed" if alive and ended:
-                event, alive = core.Removed(ID, alive), None
+                event, alive = events.Removed(ID, alive), None
             case "due" if tickets:
-                event = core.Due(ID, tickets.pop())
+                event = events.Due(ID, tickets.pop())
             case _:
                 continue
         out = manager.handle(event, float(now))
         while out:
             one = out.pop(0)
-            if isinstance(one, core.Start):
+            if isinstance(one, events.Start):
                 assert alive is None, "two lives at once"
                 if name == "due" and number:
-                    out += manager.handle(core.Lost(ID, "", "no"), float(now))
+                    out += manager.handle(events.Lost(ID, "", "no"), float(now))
                 else:
                     alive, ended = f"life {now}", False
-                    out += manager.handle(core.Made(ID, alive, ADDRESS), float(now))
-            elif isinstance(one, core.Wait):
+                    out += manager.handle(events.Made(ID, alive, ADDRESS), float(now))
+            elif isinstance(one, events.Wait):
                 tickets.append(one.ticket)
         manager.validate()
