@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
 from random import Random
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -16,7 +14,8 @@ from rce.fleet.coordination.planner import FleetPlanner
 from rce.fleet.grid import GridMap
 from rce.fleet.movingai import read_map, read_scenario
 
-DATA = Path(os.environ.get("RCE_DATA", "../shared/data")) / "maps"
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 def connected_map(rng: Random, boxes: int) -> GridMap:
@@ -51,13 +50,11 @@ def test_every_robot_arrives_within_its_own_cells(make_fleet: Any, seed: int, co
     }
 
 
+@pytest.mark.needs("data")
 @pytest.mark.parametrize("count", [4, 20])
-def test_robots_drive_on_a_benchmark_map(make_fleet: Any, count: int) -> None:
-    path = DATA / "random-32-32-20.map"
-    if not path.exists():
-        pytest.skip(f"{path} is not there (set RCE_DATA)")
-    grid = read_map(path)
-    rows = read_scenario(DATA / "random-32-32-20-random-1.scen", grid, limit=count)
+def test_robots_drive_on_a_benchmark_map(make_fleet: Any, rce_data: Path, count: int) -> None:
+    grid = read_map(rce_data / "maps" / "random-32-32-20.map")
+    rows = read_scenario(rce_data / "maps" / "random-32-32-20-random-1.scen", grid, limit=count)
     fleet = make_fleet(FleetPlanner(grid), [row.start for row in rows], seed=count)
     fleet.send([row.goal for row in rows])
     fleet.run(fleet.all_arrived)

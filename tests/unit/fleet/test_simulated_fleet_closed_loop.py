@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import inf
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -24,10 +24,14 @@ from rce.fleet.coordination.planner import FleetPlanner
 from rce.fleet.coordination.snapshot import RobotState
 from rce.fleet.grid import GridMap
 from rce.fleet.move_client import MoveClient, SendGoal, SendStop
-from rce.fleet.scenario import Scenario, make_scenario, midway_cell
+from rce.fleet.movingai import read_map, read_scenario
+from rce.fleet.scenario import Scenario, given_scenario, make_scenario, midway_cell
 from rce.fleet.simulation.move_base import SimulatedMoveBase
 from rce.fleet.simulation.obstacles import hit_points
 from rce.fleet.simulation.world import World
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 class SimulatedFleet:
@@ -124,7 +128,17 @@ class SimulatedFleet:
 
 @pytest.mark.parametrize(("robots", "seed"), [(1, 0), (3, 1), (8, 2), (8, 3)])
 def test_nobody_touches_anything_on_the_way_to_the_goals(robots: int, seed: int) -> None:
-    fleet = SimulatedFleet(make_scenario(GridMap(), robots, seed=seed), seed)
+    check_run(SimulatedFleet(make_scenario(GridMap(), robots, seed=seed), seed))
+
+
+@pytest.mark.needs("data")
+def test_four_robots_drive_on_a_benchmark_map(rce_data: Path) -> None:
+    grid = read_map(rce_data / "maps" / "random-32-32-20.map")
+    rows = read_scenario(rce_data / "maps" / "random-32-32-20-random-1.scen", grid, limit=4)
+    check_run(SimulatedFleet(given_scenario(grid, [(row.start, row.goal) for row in rows]), seed=0))
+
+
+def check_run(fleet: SimulatedFleet) -> None:
     fleet.run()
     assert fleet.world.collisions.total == 0
     assert fleet.world.min_separation > 0.1
