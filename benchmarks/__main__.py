@@ -9,7 +9,7 @@ from typing import Any
 
 import uvloop
 
-from benchmarks import containers, fanout, rate, roundtrip
+from benchmarks import containers, fanout, rate, roundtrip, stalled
 from benchmarks.engine import RunningEngine, engine
 from benchmarks.figures import plot_round_trips, save, show
 
@@ -34,6 +34,7 @@ def suites(*, quick: bool) -> dict[str, tuple[str, Callable[[RunningEngine], Awa
             "Fan-out",
             lambda e: fanout.run(e, clients=20 if quick else 200, rate=20.0, seconds=seconds),
         ),
+        "stalled": ("One client stops reading", lambda e: stalled.run(e, seconds=seconds)),
     }
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import psutil
 
-from benchmarks.engine import RunningEngine
+from benchmarks.engine import RunningEngine, pss
 from benchmarks.figures import spread
 from benchmarks.wire import STRING, Robot, robot, serialized_string
 
@@ -43,11 +43,10 @@ async def many(running: RunningEngine, *, count: int) -> list[dict[str, Any]]:
         for _ in range(count):
             await client.receive_binary()
         elapsed = perf_counter() - start
-        environments = running.named("rce_container.environment")
-        weight = sum(_own_memory(process) for process in environments) / max(1, len(environments)) / 1e6
+        weight = _weight_of_each(running, count)
         for number in range(count):
             await client.send("DC", {"containerTag": f"crowd{number}"})
-    return [{"containers": count, "all at once": f"{elapsed:.1f} s", "environment PSS MB": round(weight, 1)}]
+    return [{"containers": count, "all at once": f"{elapsed:.1f} s", **weight}]
 
 
 def memory(running: RunningEngine) -> list[dict[str, Any]]:
@@ -56,14 +55,24 @@ def memory(running: RunningEngine) -> list[dict[str, Any]]:
     for needle in ("rce_master", "rce_robot", "rce_container"):
         for process in running.named(needle):
             if "environment" not in " ".join(process.cmdline()):
-                rows.append({"process": needle, "PSS MB": round(_own_memory(process) / 1e6, 1)})  # noqa: PERF401
+                rows.append({"process": needle, "PSS MB": round(pss(process) / 1e6, 1)})  # noqa: PERF401
     return rows
 
 
-def _own_memory(process: psutil.Process) -> int:
-    with contextlib.suppress(psutil.Error):
-        return int(process.memory_full_info().pss)
-    return 0
+def _weight_of_each(running: RunningEngine, count: int) -> dict[str, float]:
+    """What one of ``count`` containers weighs on average, by kind of process."""
+    kinds = {"environment": "rce_container.environment", "echo node": "stringEcho.py", "bwrap": "bwrap"}
+    weights = dict.fromkeys((*kinds, "shim"), 0)
+    for process in running.processes():
+        with contextlib.suppress(psutil.Error):
+            name, line = process.name(), " ".join(process.cmdline())
+            if name.startswith("python"):
+                kind = next((kind for kind, needle in kinds.items() if needle in line), "")
+            else:
+                kind = {"bwrap": "bwrap", "sh": "shim"}.get(name, "")
+            if kind:
+                weights[kind] += pss(process)
+    return {f"{kind} PSS MB": round(weight / count / 1e6, 1) for kind, weight in weights.items()}
 
 
 async def _create(client: Robot, container: str) -> None:

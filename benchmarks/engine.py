@@ -42,6 +42,16 @@ class RunningEngine:
         return [p for p in self.processes() if needle in " ".join(p.cmdline()) and "python" in p.name()]
 
 
+def pss(process: psutil.Process) -> int:
+    """Proportional set size in bytes: a page that several processes share counts for each by its part.
+
+    0 for a process that ended or may not be looked into (environments, unless the user is root).
+    """
+    with contextlib.suppress(psutil.Error):
+        return int(process.memory_full_info().pss)
+    return 0
+
+
 def free_ports(count: int) -> list[int]:
     """TCP ports that nobody uses now."""
     with contextlib.ExitStack() as stack:

@@ -22,7 +22,7 @@ async def run(running: RunningEngine, *, clients: int, rate: float, seconds: flo
         listeners = [
             await stack.enter_async_context(robot(running.url, f"listener{n}")) for n in range(clients)
         ]
-        await _wire(source, listeners)
+        await wire(source, listeners)
         process = running.named("rce_robot")[0]
         latencies: list[float] = []
         tasks = [asyncio.create_task(_listen(listener, latencies)) for listener in listeners]
@@ -41,7 +41,9 @@ async def run(running: RunningEngine, *, clients: int, rate: float, seconds: flo
     return [row | {"rce-robot cpu %": round(100 * cpu / (perf_counter() - start), 1)}]
 
 
-async def _wire(source: Robot, listeners: list[Robot]) -> None:
+async def wire(source: Robot, listeners: list[Robot]) -> None:
+    """Connect an interface ``out`` of one robot with an interface ``in`` of each of the others."""
+
     def interface(client: Robot, tag: str, kind: str) -> dict[str, str]:
         return {"endpointTag": client.name, "interfaceTag": tag, "interfaceType": kind, "className": STRING}
 
