@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from random import Random
 
@@ -31,16 +33,27 @@ def draw(robots: int, seed: int, *, world: Path | None = None, scen: Path | None
     Raises:
         DemoError: There is no such scenario.
     """
-    try:
-        grid = FLOOR if world is None else read_map(world)
-        if scen is None:
+    grid = FLOOR
+    if world is not None:
+        with _naming(world):
+            grid = read_map(world)
+    if scen is None:
+        with _naming("scenario"):
             return _draw_long(grid, robots, seed)
+    with _naming(scen):
         rows = read_scenario(scen, grid, limit=robots)
         if len(rows) < robots:
             raise DemoError(f"{scen} has {len(rows)} rows, which is not enough for {robots} robots")
         return given_scenario(grid, [(row.start, row.goal) for row in rows], seed=seed)
+
+
+@contextmanager
+def _naming(source: object) -> Iterator[None]:
+    """Say where a fault lies."""
+    try:
+        yield
     except (FleetError, OSError) as error:
-        raise DemoError(str(error)) from error
+        raise DemoError(f"{source}: {error}") from error
 
 
 def _draw_long(grid: GridMap, robots: int, seed: int) -> Scenario:

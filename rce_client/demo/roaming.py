@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from collections.abc import Callable
 from random import Random
@@ -30,6 +31,7 @@ class Roamer:
     def __init__(self, rng: Random) -> None:
         self._rng = rng
         self._given: dict[str, int] = {}
+        self._tried: dict[str, int] = {}
         self._free_since: dict[str, float] = {}
         self._taken_over: set[str] = set()
 
@@ -42,22 +44,25 @@ class Roamer:
         """Look at the fleet at ``now`` (seconds); returns the robots that shall get new goals."""
         goals: dict[str, int] = {}
         for robot in fleet.robots:
-            if robot.goal is not None and robot.goal != self._given.get(robot.id):
+            if robot.goal is not None and robot.goal == self._tried.get(robot.id):
+                self._given[robot.id] = self._tried.pop(robot.id)
+                self._free_since.pop(robot.id, None)
+            if robot.goal not in (None, self._given.get(robot.id)):
                 self._taken_over.add(robot.id)
             if robot.id in self._taken_over or robot.state not in STANDING:
                 self._free_since.pop(robot.id, None)
                 continue
             since = self._free_since.setdefault(robot.id, now)
             if now - since >= REST or robot.goal is None:
-                cell = self._choose(fleet, goals)
+                # What was tried before may have been heard: it is said again, not replaced.
+                cell = self._tried.get(robot.id, self._choose(fleet, goals))
                 if cell is not None:
-                    goals[robot.id] = cell
+                    goals[robot.id] = self._tried[robot.id] = cell
         return goals
 
-    def gave(self, robot: str, cell: int) -> None:
-        """A robot is about to get a goal."""
-        self._given[robot] = cell
-        self._free_since.pop(robot, None)
+    def refused(self, robot: str) -> None:
+        """A goal was not taken, and is not to be tried again."""
+        self._tried.pop(robot, None)
 
     def _choose(self, fleet: FleetModel, goals: dict[str, int]) -> int | None:
         if fleet.map is None:
@@ -73,14 +78,12 @@ async def roam(station: StationApi, rng: Random, say: Callable[[str], None]) -> 
     """Give robots goals until cancelled."""
     roamer, told = Roamer(rng), frozenset[str]()
     while True:
-        try:
+        with contextlib.suppress(StationAwayError):
             for robot, cell in roamer.look(await station.fleet(), time.monotonic()).items():
-                # Noted first: its effect may be seen before the answer comes.
-                roamer.gave(robot, cell)
-                await station.set_goal(robot, cell)
-        except (StationAwayError, WishRefusedError):
-            # The planner is away, or somebody was quicker; the next look tells.
-            pass
+                try:
+                    await station.set_goal(robot, cell)
+                except WishRefusedError:
+                    roamer.refused(robot)
         for robot in sorted(roamer.taken_over - told):
             say(f"{robot} is yours now: it waits for your goals")
         told = roamer.taken_over

@@ -1,0 +1,149 @@
+"""``rce demo --headless``: everything as separate processes, goals, a cell blocked under way, a report."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from support.demo import clean_folder, environment, run_headless, running_demo
+from support.engine import engine_processes, until
+
+from rce_client.simulation.report import read_report
+
+pytestmark = [pytest.mark.e2e, pytest.mark.needs("pymunk")]
+
+TIMEOUT_S = 170.0
+RUNTIMES = ["process", pytest.param("namespace", marks=pytest.mark.needs("bwrap"))]
+
+
+def check(code: int, report: dict[str, Any], text: str, robots: int) -> None:
+    """Check that a run was good and its report whole."""
+    assert code == 0, text
+    assert report["ok"] is True
+    assert report["collisions"] == 0
+    assert report["duration_s"] > 0
+    assert report["engine"]["messages"] > 0
+    assert report["engine"]["dropped"] == 0
+    assert [robot["id"] for robot in report["robots"]] == [f"Robot{n + 1}" for n in range(robots)]
+    for robot in report["robots"]:
+        assert robot["reached"] is True
+        assert robot["distance_m"] > 0.5
+        assert robot["start_cell"] != robot["goal_cell"]
+    assert sum(robot["replans"] for robot in report["robots"]) >= 1
+    assert report["blocked_cell"] is not None
+    if robots == 1:
+        assert report["min_separation_m"] is None
+    else:
+        assert report["min_separation_m"] > 0.05
+
+
+@pytest.mark.timeout(240)
+@pytest.mark.parametrize("runtime", RUNTIMES)
+async def test_three_robots(runtime: str) -> None:
+    check(*await run_headless("--robots", 3, "--runtime", runtime, timeout=TIMEOUT_S), robots=3)
+
+
+@pytest.mark.timeout(240)
+async def test_one_robot() -> None:
+    check(*await run_headless("--robots", 1, "--seed", 11, timeout=TIMEOUT_S), robots=1)
+
+
+@pytest.mark.timeout(240)
+async def test_eight_robots() -> None:
+    check(*await run_headless("--robots", 8, "--seed", 3, timeout=TIMEOUT_S), robots=8)
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.needs("data")
+async def test_a_public_benchmark_map(rce_data: Path) -> None:
+    maps = rce_data / "maps"
+    code, report, text = await run_headless(
+        *("--world", maps / "random-32-32-20.map", "--scen", maps / "random-32-32-20-random-1.scen"),
+        *("--robots", 4),
+        timeout=240,
+    )
+    check(code, report, text, robots=4)
+    first = report["robots"][0]
+    assert (first["start_cell"], first["goal_cell"]) == (16 * 32 + 5, 24 * 32 + 31)
+
+
+@pytest.mark.timeout(120)
+async def test_a_run_that_is_too_short_says_so() -> None:
+    code, report, text = await run_headless("--robots", 1, timeout=1)
+    assert code == 1
+    assert report["ok"] is False
+    assert "the time of 1 s is over" in text
+    assert report["robots"][0]["reached"] is False
+
+
+@pytest.mark.timeout(120)
+async def test_a_program_that_dies_ends_the_demo_and_is_named() -> None:
+    async with running_demo("--robots", 1, "--runtime", "process", "--no-auto") as demo:
+        (world,) = [p for p in engine_processes(demo.folder) if "rce_client.simulation" in p.cmdline()]
+        world.kill()
+        assert await asyncio.wait_for(demo.process.wait(), 40) == 1
+        assert "world ended with exit code -9" in demo.output()
+
+
+@pytest.mark.timeout(120)
+async def test_a_taken_port_is_named_with_its_option() -> None:
+    async with running_demo("--robots", 1, "--runtime", "process", "--no-auto") as demo:
+        second = await asyncio.create_subprocess_exec(
+            *psutil.Process(demo.process.pid).cmdline(),
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.STDOUT,
+        )
+        output, _ = await second.communicate()
+        assert second.returncode == 1
+        assert f"port {demo.ports.page} is in use; choose another one with --port" in output.decode()
+
+
+@pytest.mark.timeout(120)
+async def test_sigterm_ends_a_demo_that_is_still_starting() -> None:
+    with clean_folder() as folder:
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "rce_client.demo", "--headless", "--robots", "1"),
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.STDOUT,
+            env=environment(folder),
+        )
+        assert process.stdout is not None
+        assert b"1 robots" in await process.stdout.readline()
+        process.send_signal(signal.SIGTERM)
+        assert b"stopped" in await asyncio.wait_for(process.stdout.read(), 30)
+        assert await process.wait() == 0
+
+
+@pytest.mark.timeout(180)
+@pytest.mark.parametrize("runtime", RUNTIMES)
+async def test_robots_go_on_when_parts_of_the_engine_are_killed(runtime: str) -> None:
+    async with running_demo("--robots", 2, "--runtime", runtime) as demo:
+        (report,) = demo.folder.glob("rce-demo-*/world.json")
+
+        def driven() -> float:
+            found = read_report(report)
+            return sum(robot.distance_m for robot in found.robots) if found else 0.0
+
+        await until(lambda: driven() > 0.5, timeout=30, what="robots drive")
+        for part in ("rce_robot", "rce_master", "rce_container.environment", "rce_container"):
+            victims = [
+                process
+                for process in psutil.Process(demo.process.pid).children(recursive=True)
+                if part in process.cmdline()
+            ]
+            assert victims, part
+            victims[0].kill()
+            before = driven()
+            await until(
+                lambda before=before: driven() > before + 1.5,
+                timeout=60,
+                what=f"robots drive on after {part} was killed",
+            )
+        found = read_report(report)
+        assert found is not None
+        assert found.collisions.total == 0

@@ -1,0 +1,126 @@
+"""``rce demo`` as a process, as a user runs it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import shutil
+import signal
+import sys
+import tempfile
+from collections.abc import AsyncIterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rce_client.demo.ports import ANY, Ports, option_of
+from support.engine import engine_processes, until
+
+STOP_TIMEOUT_S = 30.0
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """An environment in which nothing of a demo lands outside of ``folder``."""
+    kept = {key: value for key, value in os.environ.items() if not key.startswith(("RCE_", "ROS_"))}
+    return {**kept, "PYTHONUNBUFFERED": "1", "XDG_RUNTIME_DIR": str(folder), "TMPDIR": str(folder)}
+
+
+@contextlib.contextmanager
+def clean_folder() -> Any:
+    """A short-named folder; at the end no process of a demo in it may be left, and no file."""
+    folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
+    try:
+        yield folder
+        left = engine_processes(folder)
+        for process in left:
+            with contextlib.suppress(Exception):
+                process.kill()
+        assert not left, f"processes left behind: {left}"
+        files = [path for path in folder.iterdir() if path.name != "rce"]
+        assert not files, f"files left behind: {files}"
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+async def run_headless(*options: object, timeout: float) -> tuple[int, dict[str, Any], str]:
+    """Run ``rce demo --headless``; returns exit code, report and what it printed."""
+    with clean_folder() as folder:
+        report = folder / "report.json"
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "rce_client.demo", "--headless"),
+            *(*map(str, options), "--report", str(report), "--timeout", str(timeout)),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.STDOUT,
+            env=environment(folder),
+        )
+        try:
+            output, _ = await asyncio.wait_for(process.communicate(), timeout + STOP_TIMEOUT_S)
+        finally:
+            if process.returncode is None:
+                process.kill()
+                await process.wait()
+        text = output.decode()
+        found = json.loads(report.read_text()) if report.exists() else {}
+        report.unlink(missing_ok=True)
+        assert process.returncode is not None
+        return process.returncode, found, text
+
+
+@dataclass(slots=True)
+class Demo:
+    """A demo with a page."""
+
+    process: asyncio.subprocess.Process
+    ports: Ports
+    folder: Path
+    log: Path
+
+    @property
+    def page(self) -> str:
+        return f"http://127.0.0.1:{self.ports.page}/"
+
+    def output(self) -> str:
+        return self.log.read_text(errors="replace")
+
+    async def stop(self, number: signal.Signals = signal.SIGINT) -> int:
+        """Ctrl-C, and wait."""
+        self.process.send_signal(number)
+        return await asyncio.wait_for(self.process.wait(), STOP_TIMEOUT_S)
+
+
+@contextlib.asynccontextmanager
+async def running_demo(*options: object) -> AsyncIterator[Demo]:
+    """Run a demo with a page; at the end it is stopped and must leave nothing."""
+    with clean_folder() as folder:
+        ports = ANY.chosen()
+        log = Path(tempfile.mktemp(prefix="rce-demo-log-", dir="/tmp"))
+        names = ("page", "http", "control", "ws", "robot_link", "container_link")
+        with log.open("wb") as output:
+            process = await asyncio.create_subprocess_exec(
+                *(sys.executable, "-m", "rce_client.demo"),
+                *(part for name in names for part in (option_of(name), str(getattr(ports, name)))),
+                *map(str, options),
+                stdin=asyncio.subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                env=environment(folder),
+            )
+        demo = Demo(process, ports, folder, log)
+        try:
+            await until(
+                lambda: process.returncode is not None or f"RCE demo: {demo.page}" in demo.output(),
+                timeout=50,
+                what="the demo says where its page is",
+            )
+            assert process.returncode is None, demo.output()
+            yield demo
+            if process.returncode is None:
+                assert await demo.stop() == 0, demo.output()
+        finally:
+            if process.returncode is None:
+                process.kill()
+                await process.wait()
+            log.unlink()

@@ -1,0 +1,45 @@
+"""States of a fleet as the operator station says them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from rce_client.simulation.report import Contacts, RobotTruth, WorldReport
+from rce_client.station.api import FleetModel, MapModel, RobotModel
+
+
+def robot(name: str, **fields: Any) -> RobotModel:
+    plan = fields.get("plan", [fields["cell"]] if fields.get("cell") is not None else [])
+    filled = {
+        "state": "idle",
+        "reason": "",
+        "cell": None,
+        "goal": None,
+        "plan": plan,
+        "granted": plan[:1],
+        "replans": 0,
+        "pose": None,
+        **fields,
+    }
+    return RobotModel(id=name, **filled)
+
+
+def fleet(
+    *robots: RobotModel, blocked: Sequence[int] = (), pending: Sequence[int] = (), size: int = 4
+) -> FleetModel:
+    floor = MapModel(rows=size, columns=size, cell_size=1.0, origin=(0, 0), robot_radius=0.22, walls=[])
+    return FleetModel(map=floor, robots=list(robots), blocked=list(blocked), pending=list(pending))
+
+
+def truth(
+    *, boxes: Sequence[int] = (), collisions: int = 0, apart: float | None = None, **cells: int
+) -> WorldReport:
+    """A world in which robots stand in ``cells`` and have driven a metre each."""
+    contacts = Contacts(robot_robot=collisions, robot_box=0, robot_wall=0, total=collisions)
+    robots = [
+        RobotTruth(id=name, cell=cell, x=0.0, y=0.0, yaw=0.0, distance_m=1.0) for name, cell in cells.items()
+    ]
+    return WorldReport(
+        time_s=1.0, collisions=contacts, min_separation_m=apart, boxes=list(boxes), robots=robots
+    )

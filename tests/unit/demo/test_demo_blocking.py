@@ -1,0 +1,77 @@
+"""Which cell is blocked under way, and whether that took effect."""
+
+from __future__ import annotations
+
+from support.fleet_states import fleet, robot
+
+from rce.fleet.grid import GridMap
+from rce_client.demo.blocking import EFFECT_TIMEOUT, REPLAN_TIMEOUT, MidwayBlock, Step
+
+GRID = GridMap(rows=4, columns=4)
+ROW = [0, 1, 2, 3]
+
+
+def test_the_middle_of_the_path_is_blocked_and_its_effect_seen() -> None:
+    block = MidwayBlock(GRID, {"a": 3})
+    assert block.look(fleet(robot("a", cell=0, goal=3, plan=ROW)), (), 0.0) is Step.BLOCK
+    assert block.cell in (1, 2)
+    assert block.under_way
+    cell = block.cell
+    around = robot("a", cell=0, goal=3, plan=[0, 4, 5, 6, 7, 3], replans=1)
+    assert block.look(fleet(around, pending=[cell]), (), 0.5) is Step.NOTHING
+    assert block.look(fleet(around, blocked=[cell]), (), 0.7) is Step.NOTHING
+    assert block.done is None, "the box is not there yet"
+    assert block.look(fleet(around, blocked=[cell]), (cell,), 0.9) is Step.NOTHING
+    assert block.done == cell
+    assert not block.under_way
+    assert block.look(fleet(robot("a", cell=0, goal=3, plan=ROW)), (), 9.0) is Step.NOTHING
+
+
+def test_cells_that_were_granted_are_left_alone_if_possible() -> None:
+    block = MidwayBlock(GRID, {"a": 3})
+    assert block.look(fleet(robot("a", cell=0, goal=3, plan=ROW, granted=[0, 1])), (), 0.0) is Step.BLOCK
+    assert block.cell == 2
+    block = MidwayBlock(GRID, {"a": 3})
+    assert block.look(fleet(robot("a", cell=0, goal=3, plan=ROW, granted=ROW)), (), 0.0) is Step.BLOCK
+    assert block.cell == 2
+
+
+def test_nobody_is_cut_off() -> None:
+    corridor = GridMap(rows=1, columns=6)
+    block = MidwayBlock(corridor, {"a": 5})
+    assert block.look(fleet(robot("a", cell=0, goal=5, plan=[0, 1, 2, 3, 4, 5])), (), 0.0) is Step.NOTHING
+    assert not block.under_way
+
+
+def test_nothing_is_blocked_while_a_robot_has_no_place() -> None:
+    block = MidwayBlock(GRID, {"a": 3, "b": 12})
+    lost = robot("b", state="joining")
+    assert block.look(fleet(robot("a", cell=0, goal=3, plan=ROW), lost), (), 0.0) is Step.NOTHING
+
+
+def test_a_cell_without_effect_is_given_back_and_another_tried() -> None:
+    block = MidwayBlock(GRID, {"a": 3})
+    block.look(fleet(robot("a", cell=0, goal=3, plan=ROW)), (), 0.0)
+    cell = block.cell
+    past = fleet(robot("a", cell=3, goal=3), blocked=[cell])
+    assert block.look(past, (cell,), REPLAN_TIMEOUT) is Step.NOTHING
+    assert block.look(past, (cell,), REPLAN_TIMEOUT + 0.1) is Step.FREE
+    assert block.cell == cell
+    assert not block.under_way
+
+
+def test_a_cell_that_stays_pending_is_given_back() -> None:
+    block = MidwayBlock(GRID, {"a": 3})
+    block.look(fleet(robot("a", cell=0, goal=3, plan=ROW)), (), 0.0)
+    held = fleet(robot("a", cell=0, goal=3, replans=1), pending=[block.cell])
+    assert block.look(held, (), EFFECT_TIMEOUT - 0.1) is Step.NOTHING
+    assert block.look(held, (), EFFECT_TIMEOUT + 0.1) is Step.FREE
+
+
+def test_a_refused_cell_is_chosen_anew() -> None:
+    block = MidwayBlock(GRID, {"a": 3})
+    driving = fleet(robot("a", cell=0, goal=3, plan=ROW))
+    assert block.look(driving, (), 0.0) is Step.BLOCK
+    block.refused()
+    assert not block.under_way
+    assert block.look(driving, (), 0.2) is Step.BLOCK

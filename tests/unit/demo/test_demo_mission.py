@@ -1,0 +1,135 @@
+"""The headless run, with a station and a world that are played."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+from support.fleet_states import fleet, robot, truth
+
+from rce.fleet.grid import GridMap
+from rce.fleet.scenario import Scenario
+from rce_client.demo import mission as mission_module
+from rce_client.demo.exceptions import StationAwayError, WishRefusedError
+from rce_client.demo.mission import Mission
+from rce_client.simulation.report import WorldReport
+from rce_client.station.api import FleetModel
+
+SCENARIO = Scenario(
+    grid=GridMap(rows=4, columns=4),
+    starts=(0,),
+    headings=(0.0,),
+    goals=(3,),
+    known_boxes=(),
+    hidden_boxes=(),
+)
+ROW = [0, 1, 2, 3]
+
+
+class PlayedStation:
+    """A planner whose one robot needs some looks for everything."""
+
+    def __init__(self) -> None:
+        self.goals: list[tuple[str, int | None]] = []
+        self.blocks: list[tuple[int, bool]] = []
+        self.goal: int | None = None
+        self.blocked: list[int] = []
+        self.looks = 0
+        self.restart_at = -1
+        self.away_at: set[int] = set()
+        self.refuse_blocks = 0
+        self.truly_at_goal = True
+        self._driven = 0
+        self._replans = 0
+
+    async def fleet(self) -> FleetModel:
+        await asyncio.sleep(0)
+        self.looks += 1
+        if self.looks in self.away_at:
+            raise StationAwayError("away")
+        if self.looks == self.restart_at:
+            self.goal, self.blocked, self._replans = None, [], 0
+        if self.looks < 3:
+            return fleet(robot("Robot1", state="joining"))
+        if self.goal is None:
+            return fleet(robot("Robot1", cell=0))
+        self._driven += 1
+        if self._driven < 12:
+            driving = robot("Robot1", cell=0, goal=3, plan=ROW, state="driving", replans=self._replans)
+            return fleet(driving, blocked=self.blocked)
+        there = robot("Robot1", cell=3, goal=3, state="arrived", replans=self._replans)
+        return fleet(there, blocked=self.blocked)
+
+    async def set_goal(self, name: str, cell: int | None) -> None:
+        self.goals.append((name, cell))
+        self.goal = cell
+
+    async def block(self, cell: int, *, blocked: bool) -> None:
+        if self.refuse_blocks:
+            self.refuse_blocks -= 1
+            raise WishRefusedError("no")
+        self.blocks.append((cell, blocked))
+        self.blocked = [cell] if blocked else []
+        self._replans += blocked
+
+    def truth(self) -> WorldReport:
+        at_goal = self._driven >= 12 and self.truly_at_goal
+        return truth(boxes=self.blocked, Robot1=3 if at_goal else 1)
+
+
+@pytest.fixture(autouse=True)
+def _no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mission_module, "LOOK_EVERY", 0.0)
+
+
+def make(station: Any) -> Mission:
+    return Mission(station, SCENARIO, station.truth, lambda _: None)
+
+
+async def test_a_robot_is_sent_a_cell_is_blocked_and_it_arrives() -> None:
+    station = PlayedStation()
+    mission = make(station)
+    assert mission.duration == 0.0
+    await asyncio.wait_for(mission.run(), 5)
+    assert station.goals == [("Robot1", 3)]
+    (blocked,) = station.blocks
+    assert blocked == (mission.block.done, True)
+    assert mission.reached == {"Robot1"}
+    assert mission.replans == {"Robot1": 1}
+    ended = mission.duration
+    await asyncio.sleep(0.01)
+    assert mission.duration == ended > 0
+
+
+async def test_a_station_that_is_away_for_a_while_is_waited_for() -> None:
+    station = PlayedStation()
+    station.away_at = {1, 5, 6, 9}
+    await asyncio.wait_for(make(station).run(), 5)
+
+
+async def test_a_planner_that_was_restarted_is_told_again() -> None:
+    station = PlayedStation()
+    station.restart_at = 10
+    mission = make(station)
+    await asyncio.wait_for(mission.run(), 5)
+    assert station.goals == [("Robot1", 3)] * 2
+    assert station.blocks == [(mission.block.done, True)] * 2
+    assert mission.replans["Robot1"] == 2, "what the first planner counted is not forgotten"
+
+
+async def test_a_refused_block_is_tried_again() -> None:
+    station = PlayedStation()
+    station.refuse_blocks = 2
+    mission = make(station)
+    await asyncio.wait_for(mission.run(), 5)
+    assert mission.block.done is not None
+
+
+async def test_the_planners_word_is_not_enough() -> None:
+    station = PlayedStation()
+    station.truly_at_goal = False
+    mission = make(station)
+    with pytest.raises(TimeoutError):
+        await asyncio.wait_for(mission.run(), 0.2)
+    assert mission.reached == set()
