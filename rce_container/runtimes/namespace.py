@@ -9,6 +9,7 @@ bubblewrap and environment are tied to each other, so that none outlives the one
 
 from __future__ import annotations
 
+import compileall
 import shutil
 import subprocess
 import sys
@@ -61,6 +62,7 @@ class NamespaceRuntime(Runtime):
                 self.name, "bwrap is not installed (Debian, Ubuntu: apt install bubblewrap)"
             )
         self._options = _run([self._bwrap, "--help"]).stdout
+        _compile()
         with tempfile.TemporaryDirectory() as scratch:
             folder = ContainerFolder(Path(scratch), Path(scratch) / "run", "0" * 12)
             folder.make()
@@ -115,6 +117,12 @@ def interpreter_paths() -> list[Path]:
     wanted = [Path(sys.prefix), Path(sys.base_prefix), Path(sys.base_exec_prefix)]
     wanted.append(Path(sys.executable).resolve().parents[1])
     return [*wanted, *(path.resolve() for path in wanted), root / "rce", root / "rce_container"]
+
+
+def _compile() -> None:
+    """Have the modules compiled here: inside nothing can be written, and every container would do it anew."""
+    for package in ("rce", "rce_container"):
+        compileall.compile_dir(source_root() / package, quiet=2)
 
 
 def _system() -> list[str]:
