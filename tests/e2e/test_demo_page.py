@@ -1,0 +1,197 @@
+"""The operator's page in a browser, on a demo that runs for real."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.async_api import Page, async_playwright
+from support.demo import Demo, running_demo
+
+from rce.fleet.scenario import midway_cell
+from rce_client.demo.floor import FLOOR
+from rce_client.simulation.report import read_report
+
+pytestmark = [pytest.mark.e2e, pytest.mark.needs("chromium", "pymunk"), pytest.mark.timeout(180)]
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+ARTIFACTS = Path(__file__).parents[2] / "artifacts"
+BROWSER = (
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+DESKTOP, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
+WAIT_MS = 40_000
+
+
+def artifact(name: str) -> Path:
+    """Where a picture is kept to be looked at after the test."""
+    ARTIFACTS.mkdir(exist_ok=True)
+    return ARTIFACTS / name
+
+
+@contextlib.asynccontextmanager
+async def opened(demo: Demo, viewport: Any = DESKTOP, *, expected: str = "") -> AsyncIterator[Page]:
+    """The page in a browser; what the browser complains of and is not ``expected`` fails the test."""
+    complaints: list[str] = []
+    async with async_playwright() as playwright:
+        browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=list(BROWSER))
+        try:
+            page = await browser.new_page(
+                viewport=viewport, color_scheme="light", has_touch=viewport is PHONE
+            )
+            page.on("console", lambda said: complaints.append(said.text) if said.type == "error" else None)
+            page.on("pageerror", lambda error: complaints.append(str(error)))
+            page.set_default_timeout(WAIT_MS)
+            await page.goto(demo.page)
+            await page.wait_for_function("document.querySelector('#link').textContent === 'live'")
+            yield page
+        finally:
+            await browser.close()
+    assert [text for text in complaints if not (expected and expected in text)] == []
+
+
+async def robots_placed(page: Page, count: int) -> None:
+    await page.wait_for_function(
+        """count => [...rceFleet.fleet.robots.values()]
+            .filter(robot => robot.pose && robot.cell !== null).length === count""",
+        arg=count,
+    )
+
+
+async def click_cell(page: Page, cell: int) -> None:
+    x, y = await page.evaluate("cell => rceFleet.view.screenOf(cell)", cell)
+    await page.locator("#map").click(position={"x": x, "y": y})
+
+
+async def robot_of(page: Page, robot: str) -> dict[str, Any]:
+    found: dict[str, Any] = await page.evaluate(
+        """id => {
+            const { plan, goal, granted, replans } = rceFleet.fleet.robots.get(id);
+            return { plan, goal, granted, replans };
+        }""",
+        robot,
+    )
+    return found
+
+
+def midway(demo: Demo, robot: str, seen: dict[str, Any]) -> int:
+    """A cell on a robot's way that it does not need."""
+    (report,) = demo.folder.glob("rce-demo-*/world.json")
+    truth = read_report(report)
+    assert truth is not None
+    grid = FLOOR.with_blocked(FLOOR.blocked.union(truth.boxes))
+    cell = midway_cell(grid, {robot: seen["plan"]}, {robot: seen["goal"]}, seen["granted"][:3])
+    assert cell is not None
+    return cell
+
+
+async def send_far(page: Page, robot: str) -> dict[str, Any]:
+    """Pick a robot and click a goal that is far away and free."""
+    goal = await page.evaluate(
+        """id => {
+            const { fleet } = rceFleet;
+            const { rows, columns } = fleet.map;
+            const here = fleet.robots.get(id).cell;
+            const taken = new Set([...fleet.robots.values()].flatMap(r => [r.cell, r.goal]));
+            const away = cell => Math.abs(cell % columns - here % columns)
+                + Math.abs(Math.floor(cell / columns) - Math.floor(here / columns));
+            return [...Array(rows * columns).keys()]
+                .filter(cell => !fleet.blocked.has(cell) && !taken.has(cell))
+                .sort((a, b) => away(b) - away(a))[0];
+        }""",
+        robot,
+    )
+    await page.locator(f"tr[data-robot={robot}]").click()
+    await page.wait_for_function("id => rceFleet.fleet.selected === id", arg=robot)
+    await click_cell(page, goal)
+    await page.wait_for_function(
+        """([id, goal]) => {
+            const robot = rceFleet.fleet.robots.get(id);
+            return robot.goal === goal && robot.plan.length > 5;
+        }""",
+        arg=[robot, goal],
+    )
+    assert await page.evaluate("rceFleet.fleet.selected") is None
+    return await robot_of(page, robot)
+
+
+async def test_an_operator_sends_a_robot_and_blocks_its_way() -> None:
+    async with running_demo("--seed", 4, "--runtime", "process", "--no-auto") as demo, opened(demo) as page:
+        await robots_placed(page, 3)
+        before = await send_far(page, "Robot1")
+        cell = midway(demo, "Robot1", before)
+        await click_cell(page, cell)
+        await page.wait_for_function("cell => rceFleet.fleet.blocked.has(cell)", arg=cell)
+        await page.wait_for_function(
+            """([id, cell]) => {
+                const { plan, goal } = rceFleet.fleet.robots.get(id);
+                return plan.length > 1 && plan.at(-1) === goal && !plan.includes(cell);
+            }""",
+            arg=["Robot1", cell],
+        )
+        after = await robot_of(page, "Robot1")
+        assert after["goal"] == before["goal"]
+        assert after["replans"] >= before["replans"] + 1
+        assert cell not in after["plan"]
+        await send_far(page, "Robot2")
+        await send_far(page, "Robot3")
+        await page.wait_for_function("[...rceFleet.fleet.robots.values()].every(r => r.trail.length > 20)")
+        await page.screenshot(path=artifact("fleet.png"))
+
+        await click_cell(page, cell)
+        await page.wait_for_function("cell => !rceFleet.fleet.blocked.has(cell)", arg=cell)
+        await page.wait_for_function("id => rceFleet.fleet.robots.get(id).state === 'arrived'", arg="Robot1")
+        words = await page.locator("#events").inner_text()
+        assert f"cell {cell} is blocked" in words
+        assert f"cell {cell} is free" in words
+        assert "Robot1 gets a new path" in words
+        assert "Robot1 is at its goal" in words
+
+
+async def test_the_page_shows_engine_and_refusals() -> None:
+    async with (
+        running_demo("--robots", 1, "--runtime", "process", "--no-auto") as demo,
+        opened(demo, expected="409") as page,
+    ):
+        await robots_placed(page, 1)
+        await page.wait_for_function(
+            "document.querySelector('#engine').textContent.includes('fleetPlanner running')"
+        )
+        engine = await page.locator("#engine").inner_text()
+        assert "cTag_01 running" in engine
+        assert "moveClient_1 running" in engine
+        wall = await page.evaluate("[...rceFleet.fleet.walls][0]")
+        async with page.expect_response(lambda reply: f"/cells/{wall}" in reply.url) as answered:
+            await click_cell(page, wall)
+        assert (await answered.value).status == 409
+        await page.wait_for_function("document.querySelector('#message').textContent.includes('wall')")
+
+
+async def test_the_page_on_a_phone() -> None:
+    async with (
+        running_demo("--robots", 3, "--runtime", "process") as demo,
+        opened(demo, PHONE) as page,
+    ):
+        await robots_placed(page, 3)
+        width = await page.evaluate("document.documentElement.scrollWidth")
+        assert width <= PHONE["width"], "nothing sticks out to the right"
+        box = await page.locator("#map").bounding_box()
+        assert box is not None
+        assert box["width"] > 0.8 * PHONE["width"]
+        for button in await page.locator("button").all():
+            size = await button.bounding_box()
+            assert size is not None
+            assert size["height"] >= 30
+        await page.locator("tr[data-robot=Robot2]").tap()
+        await page.wait_for_function("rceFleet.fleet.selected === 'Robot2'")
+        await page.screenshot(path=artifact("fleet-phone.png"))
