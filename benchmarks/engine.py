@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import psutil
 
@@ -50,6 +51,38 @@ def pss(process: psutil.Process) -> int:
     with contextlib.suppress(psutil.Error):
         return int(process.memory_full_info().pss)
     return 0
+
+
+class Meter:
+    """Tells how much processor time the data path's processes used, by kind of process.
+
+    On a machine that does other things too, this says more than the clock.
+    """
+
+    KINDS: ClassVar[dict[str, str]] = {
+        "rce-robot": "rce_robot",
+        "environment": "rce_container.environment",
+        "node": "stringEcho.py",
+    }
+
+    def __init__(self, running: RunningEngine) -> None:
+        self._processes = {kind: running.named(needle) for kind, needle in self.KINDS.items()}
+
+    def read(self) -> dict[str, float]:
+        """Seconds since each kind's processes began."""
+        return {kind: sum(map(_cpu_seconds, found)) for kind, found in self._processes.items()}
+
+    def per_message(self, before: dict[str, float], messages: int) -> dict[str, float]:
+        """Milliseconds per message since ``before`` was read."""
+        now = self.read()
+        return {f"{kind} cpu_ms": 1e3 * (now[kind] - before[kind]) / messages for kind in now}
+
+
+def _cpu_seconds(process: psutil.Process) -> float:
+    """CPU time of a process's main thread, from the scheduler's nanoseconds."""
+    with contextlib.suppress(OSError):
+        return int(Path(f"/proc/{process.pid}/schedstat").read_text().split()[0]) / 1e9
+    return 0.0
 
 
 def free_ports(count: int) -> list[int]:

@@ -6,7 +6,7 @@ import asyncio
 from time import perf_counter
 from typing import Any
 
-from benchmarks.engine import RunningEngine
+from benchmarks.engine import Meter, RunningEngine
 from benchmarks.wire import Robot, robot, serialized_string, wire_echo
 
 SIZE = 64
@@ -19,13 +19,17 @@ async def run(running: RunningEngine, *, seconds: float) -> list[dict[str, Any]]
     for form in ("Forwarder", "Converter"):
         async with robot(running.url, f"rate{form}") as client:
             await wire_echo(client, form, f"box{form}")
-            rate = await _rate(client, form, seconds)
+            meter = Meter(running)
+            before = meter.read()
+            rate, returned = await _rate(client, form, seconds)
+            costs = meter.per_message(before, returned)
             await client.send("DC", {"containerTag": f"box{form}"})
-        rows.append({"path": form.lower(), "bytes": SIZE, "in flight": IN_FLIGHT, "messages/s": round(rate)})
+        row = {"path": form.lower(), "bytes": SIZE, "in flight": IN_FLIGHT, "messages/s": round(rate)}
+        rows.append(row | {name: round(cost, 4) for name, cost in costs.items()})
     return rows
 
 
-async def _rate(client: Robot, form: str, seconds: float) -> float:
+async def _rate(client: Robot, form: str, seconds: float) -> tuple[float, int]:
     payload = serialized_string(SIZE)
     message = {"iTag": "request", "type": "std_msgs/String", "msgID": "nil", "msg": {"data": "x" * SIZE}}
     window = asyncio.Semaphore(IN_FLIGHT)
@@ -49,4 +53,4 @@ async def _rate(client: Robot, form: str, seconds: float) -> float:
     finally:
         sender.cancel()
         await asyncio.gather(sender, return_exceptions=True)
-    return returned / elapsed
+    return returned / elapsed, returned

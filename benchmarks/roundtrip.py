@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import gc
-import json
 from collections.abc import Awaitable, Callable
 from time import perf_counter
 from typing import Any
 
 from websockets.asyncio.client import connect
 
-from benchmarks.engine import RunningEngine, bare_echo
-from benchmarks.figures import spread
+from benchmarks.engine import Meter, RunningEngine, bare_echo
+from benchmarks.figures import percentile, spread
 from benchmarks.wire import ECHO, STRING, Robot, robot, serialized_string, wire_echo
 
 SIZES = (
@@ -83,6 +82,7 @@ def service_trip(client: Robot) -> Trip:
 async def run(running: RunningEngine, *, passes: int, sizes: tuple[int, ...] = SIZES) -> list[dict[str, Any]]:
     """Measure all paths, pass by pass in turn, so that a drift of the machine meets all of them."""
     times: dict[tuple[str, int], list[float]] = {}
+    costs: dict[tuple[str, int], list[float]] = {}
     async with (
         bare_echo() as url,
         connect(url, compression=None, max_size=None) as bare,
@@ -102,19 +102,32 @@ async def run(running: RunningEngine, *, passes: int, sizes: tuple[int, ...] = S
             "converter": converter_trip(converting),
             "service": service_trip(converting),
         }
+        meter = Meter(running)
         for _ in range(passes):
             for size in sizes:
                 for name, trip in trips.items():
-                    times.setdefault((name, size), []).extend(await measure(trip, size))
-        for client in (forwarding, converting):
-            for container in ("benchForwarder", "benchConverter"):
-                await client.socket.send(json.dumps({"type": "DC", "data": {"containerTag": container}}))
-            break
-    rows = []
-    for (name, size), seconds in sorted(times.items(), key=lambda item: item[0][1]):
-        figures = spread(seconds)
-        bare_p50 = spread(times["bare websockets echo", size])["p50_ms"]
-        rows.append(
-            {"path": name, "bytes": size, **figures, "x bare": round(figures["p50_ms"] / bare_p50, 2)}
-        )
-    return rows
+                    before = meter.read()
+                    measured = await measure(trip, size)
+                    times.setdefault((name, size), []).extend(measured)
+                    costs.setdefault((name, size), []).append(
+                        sum(meter.per_message(before, len(measured) + 1).values())
+                    )
+        for client, container in ((forwarding, "benchForwarder"), (converting, "benchConverter")):
+            await client.send("DC", {"containerTag": container})
+    return [_row(key, times, costs) for key in sorted(times, key=lambda key: key[1])]
+
+
+def _row(
+    key: tuple[str, int], times: dict[tuple[str, int], list[float]], costs: dict[tuple[str, int], list[float]]
+) -> dict[str, Any]:
+    name, size = key
+    figures = spread(times[key])
+    bare = spread(times["bare websockets echo", size])["p50_ms"]
+    return {
+        "path": name,
+        "bytes": size,
+        "p10_ms": round(1e3 * percentile(times[key], 0.1), 4),
+        **figures,
+        "x bare": round(figures["p50_ms"] / bare, 2),
+        "engine cpu_ms": round(percentile(costs[key], 0.5), 4),
+    }
