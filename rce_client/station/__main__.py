@@ -103,7 +103,12 @@ async def serve(config: ClientConfig, bind: str, port: int, token: str) -> None:
     view, pages = FleetView(), Broadcast()
     feed = Feed(view, pages)
     fleet = FleetLink(config, view, on_change=feed.on_change, on_event=feed.on_event)
-    watch = EngineWatch(config.url, config.user, config.password.get_secret_value(), on_state=feed.on_engine)
+
+    def on_engine(state: dict[str, Any]) -> None:
+        feed.on_engine(state)
+        fleet.on_engine(state)
+
+    watch = EngineWatch(config.url, config.user, config.password.get_secret_value(), on_state=on_engine)
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)

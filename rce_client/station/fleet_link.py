@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Awaitable, Callable
 from typing import Any
 
 from rce.config.client import ClientConfig
+from rce.protocol.messages import Request
 from rce_client.connection import Connection, State
 from rce_client.ends import ServiceClient
 from rce_client.exceptions import CallError, ClientError
+from rce_client.station.respawn import repairs
 from rce_client.station.view import FleetView
+from rce_client.station.wishes import CellWish, GoalWish, Wishes
 
 STATE = "fleet/FleetState"
 POSE = "geometry_msgs/PoseWithCovarianceStamped"
 SET_GOAL = "fleet/SetGoal"
 BLOCK_CELL = "fleet/BlockCell"
 CALL_TIMEOUT_S = 10.0
+TELL_AGAIN_S = 20.0
+"""How long a planner that was restarted is told again what it does not know."""
+TELL_EVERY_S = 0.5
 
 
 class FleetError(Exception):
@@ -52,6 +59,10 @@ class FleetLink:
         self._view = view
         self._on_change = on_change
         self._on_event = on_event
+        self._wishes = Wishes()
+        self._planner_began: str | None = None
+        self._planner_restarted = asyncio.Event()
+        self._repairs: asyncio.Queue[Request] = asyncio.Queue()
         self._known: set[str] = set()
         self._new_robots: asyncio.Queue[str] = asyncio.Queue()
         self._set_goal: ServiceClient[dict[str, Any]] | None = None
@@ -73,8 +84,10 @@ class FleetLink:
                     await connection.request(request)
                 await self._wire(connection)
                 await ready()
-                while True:
-                    await self._follow(connection, await self._new_robots.get())
+                async with asyncio.TaskGroup() as group:
+                    group.create_task(self._follow_robots(connection))
+                    group.create_task(self._repair(connection))
+                    group.create_task(self._tell_again())
             finally:
                 await connection.remove_all()
 
@@ -84,7 +97,9 @@ class FleetLink:
         Raises:
             FleetError: The planner refuses, or is away.
         """
-        return await self._ask(self._set_goal, {"robot": robot, "cell": -1 if cell is None else cell})
+        said = await self._ask(self._set_goal, {"robot": robot, "cell": -1 if cell is None else cell})
+        self._wishes.set_goal(robot, cell)
+        return said
 
     async def block_cell(self, cell: int, *, blocked: bool) -> str:
         """Block or free a cell; returns what the planner says.
@@ -92,7 +107,14 @@ class FleetLink:
         Raises:
             FleetError: The planner refuses, or is away.
         """
-        return await self._ask(self._block_cell, {"cell": cell, "blocked": blocked})
+        said = await self._ask(self._block_cell, {"cell": cell, "blocked": blocked})
+        self._wishes.set_cell(cell, blocked=blocked)
+        return said
+
+    def on_engine(self, state: dict[str, Any]) -> None:
+        """Take the engine's state; nodes that ended are started again."""
+        for request in repairs(self._config, state):
+            self._repairs.put_nowait(request)
 
     async def _ask(self, service: ServiceClient[dict[str, Any]] | None, request: dict[str, Any]) -> str:
         if service is None:
@@ -121,6 +143,35 @@ class FleetLink:
         for tag in ("fleetState", "setGoal", "blockCell"):
             await connection.wait_active(tag)
 
+    async def _follow_robots(self, connection: Connection) -> None:
+        while True:
+            await self._follow(connection, await self._new_robots.get())
+
+    async def _repair(self, connection: Connection) -> None:
+        while True:
+            await connection.request(await self._repairs.get())
+
+    async def _tell_again(self) -> None:
+        """Tell a planner that was restarted what it forgot, until it knows or it is time to give up."""
+        while True:
+            await self._planner_restarted.wait()
+            self._planner_restarted.clear()
+            self._on_event("the planner was restarted; telling it goals and blocked cells again", "warn")
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(TELL_AGAIN_S):
+                    while not self._planner_restarted.is_set():
+                        await self._tell_unmet()
+                        await asyncio.sleep(TELL_EVERY_S)
+
+    async def _tell_unmet(self) -> None:
+        for wish in self._wishes.unmet(self._view.state) if self._view.state else ():
+            with contextlib.suppress(FleetError):
+                match wish:
+                    case CellWish(cell, blocked):
+                        await self.block_cell(cell, blocked=blocked)
+                    case GoalWish(robot, cell):
+                        await self.set_goal(robot, cell)
+
     async def _follow(self, connection: Connection, robot: str) -> None:
         """Wire a robot's pose to the station."""
         tag = f"pose{robot}"
@@ -135,6 +186,9 @@ class FleetLink:
 
     def _take_state(self, message: dict[str, Any]) -> None:
         self._view.on_state(message)
+        if self._planner_began not in (None, message["started"]):
+            self._planner_restarted.set()
+        self._planner_began = message["started"]
         for robot in self._view.robot_ids():
             if robot not in self._known:
                 self._known.add(robot)

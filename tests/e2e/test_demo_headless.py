@@ -8,11 +8,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import aiohttp
 import psutil
 import pytest
 from support.demo import clean_folder, environment, run_headless, running_demo
 from support.engine import engine_processes, until
 
+from rce_client.demo.exceptions import StationAwayError
+from rce_client.demo.floor import draw
+from rce_client.demo.station import StationApi
 from rce_client.simulation.report import read_report
 
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("pymunk")]
@@ -147,3 +151,38 @@ async def test_robots_go_on_when_parts_of_the_engine_are_killed(runtime: str) ->
         found = read_report(report)
         assert found is not None
         assert found.collisions.total == 0
+
+
+@pytest.mark.timeout(180)
+async def test_a_planner_that_is_killed_comes_back_and_knows_what_was_wanted() -> None:
+    async with (
+        running_demo("--robots", 1, "--seed", 2, "--runtime", "process", "--no-auto") as demo,
+        aiohttp.ClientSession() as session,
+    ):
+        station = StationApi(session, demo.page)
+        await until(lambda: states(station, "idle"), timeout=30, what="the robot is in its place")
+        (robot,) = (await station.fleet()).robots
+        scenario = draw(1, 2)
+        known = {*scenario.starts, *scenario.goals, *scenario.boxes}
+        corner = next(cell for cell in scenario.grid.free if cell not in known)
+        await station.block(corner, blocked=True)
+        await station.set_goal(robot.id, scenario.goals[0])
+        await until(lambda: states(station, "driving"), timeout=30, what="the robot drives")
+        (planner,) = [
+            process
+            for process in psutil.Process(demo.process.pid).children(recursive=True)
+            if process.cmdline()[-1:] and process.cmdline()[-1].endswith("fleet_planner.py")
+        ]
+        planner.kill()
+        await until(lambda: states(station, "arrived"), timeout=90, what="the robot is at its goal")
+        fleet = await station.fleet()
+        assert fleet.robots[0].cell == fleet.robots[0].goal == scenario.goals[0]
+        assert corner in fleet.blocked
+
+
+async def states(station: StationApi, wanted: str) -> bool:
+    try:
+        fleet = await station.fleet()
+    except StationAwayError:
+        return False
+    return bool(fleet.robots) and all(robot.state == wanted for robot in fleet.robots)

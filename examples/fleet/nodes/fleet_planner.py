@@ -72,6 +72,7 @@ class PlannerNode:
         self._cells: dict[str, Publisher] = {}
         self._cancels: dict[str, Publisher] = {}
         self._state_changed = True
+        self._started = Time.now()
         self._state: Publisher
         self._blocked: Publisher
         self._map: Publisher
@@ -198,6 +199,7 @@ class PlannerNode:
         grid, snapshot = self._planner.books.grid, self._planner.snapshot()
         walls = sorted(grid.blocked)
         self._state.publish(
+            started=self._started,
             rows=grid.rows,
             columns=grid.columns,
             cell_size=grid.cell_size,
