@@ -146,6 +146,7 @@ async def test_an_operator_sends_a_robot_and_blocks_its_way() -> None:
         await send_far(page, "Robot2")
         await send_far(page, "Robot3")
         await page.wait_for_function("[...rceFleet.fleet.robots.values()].every(r => r.trail.length > 20)")
+        await page.mouse.move(2, 2)
         await page.screenshot(path=artifact("fleet.png"))
 
         await click_cell(page, cell)

@@ -90,7 +90,7 @@ export class View {
       const wall = fleet.walls.has(cell);
       const boxed = !wall && fleet.blocked.has(cell);
       context.fillStyle = wall ? colour.wall : boxed ? colour.shut : fleet.pending.has(cell) ? colour.pending : colour.cell;
-      if (wall) context.fillRect(left - gap, top - gap, side, side);
+      if (wall) context.fillRect(left - gap - 0.5, top - gap - 0.5, side + 1, side + 1);
       else context.fillRect(left, top, side - 2 * gap, side - 2 * gap);
       if (boxed) this.#drawBox(this.#x(x), this.#y(y), BOX * side);
       if (!small && !wall) {
