@@ -1,0 +1,100 @@
+"""The programs of a demo: started, watched, ended together."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+
+from rce_client.demo import children as children_module
+from rce_client.demo.children import Children
+from rce_client.demo.exceptions import ChildDiedError, DemoError, NotReadyError
+
+TALKER = "import time\nprint('talker ready: 42')\ntime.sleep(600)"
+DEAF = "import signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\nprint('up')\ntime.sleep(600)"
+DYING = "print('something is wrong')\nraise SystemExit(3)"
+
+
+def python(code: str) -> list[str]:
+    return [sys.executable, "-c", code]
+
+
+def ignore(_: str) -> None:
+    pass
+
+
+async def for_ever() -> None:
+    await asyncio.Event().wait()
+
+
+async def test_lines_are_logged_shown_and_waited_for(tmp_path: Path) -> None:
+    shown: list[str] = []
+    async with Children(tmp_path, shown.append) as children:
+        talker = await children.start("talker", python(TALKER))
+        assert await children.wait_line(talker, "talker ready:", 20) == "42"
+    assert shown == ["[talker] talker ready: 42"]
+    assert (tmp_path / "talker.log").read_text() == "talker ready: 42\n"
+    assert talker.child.returncode == -signal.SIGTERM
+
+
+async def test_a_program_that_dies_is_named_with_its_last_words(tmp_path: Path) -> None:
+    async with Children(tmp_path, ignore) as children:
+        talker = await children.start("talker", python(TALKER))
+        await children.start("dying", python(DYING))
+        with pytest.raises(ChildDiedError, match="dying ended with exit code 3\n    something is wrong"):
+            await asyncio.wait_for(children.while_alive(for_ever()), 20)
+    assert not psutil.pid_exists(talker.child.pid)
+
+
+async def test_a_program_that_does_not_get_ready_is_named(tmp_path: Path) -> None:
+    async with Children(tmp_path, ignore) as children:
+        talker = await children.start("talker", python(TALKER))
+        with pytest.raises(NotReadyError, match="talker was not ready"):
+            await children.wait_line(talker, "never:", 0.05)
+
+
+async def test_work_returns_its_result_and_its_errors(tmp_path: Path) -> None:
+    async def answer() -> int:
+        return 42
+
+    async def fail() -> None:
+        raise DemoError("no")
+
+    async with Children(tmp_path, ignore) as children:
+        await children.start("talker", python(TALKER))
+        assert await children.while_alive(answer()) == 42
+        with pytest.raises(DemoError, match="no"):
+            await children.while_alive(fail())
+
+
+async def test_a_program_that_does_not_listen_is_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(children_module, "STOP_TIMEOUT", 0.1)
+    async with Children(tmp_path, ignore) as children:
+        await children.start("talker", python(TALKER))
+        deaf = await children.start("deaf", python(DEAF))
+        await children.wait_line(deaf, "up", 20)
+    assert deaf.child.returncode == -signal.SIGKILL
+
+
+async def test_all_end_when_the_work_is_cancelled(tmp_path: Path) -> None:
+    started = asyncio.Event()
+    pids: list[int] = []
+
+    async def run() -> None:
+        async with Children(tmp_path, ignore) as children:
+            pids.extend([(await children.start(name, python(TALKER))).child.pid for name in ("a", "b")])
+            started.set()
+            await children.while_alive(for_ever())
+
+    task = asyncio.create_task(run())
+    await started.wait()
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert not any(psutil.pid_exists(pid) for pid in pids)

@@ -1,0 +1,37 @@
+"""Ports that are chosen, and ports that are taken."""
+
+from __future__ import annotations
+
+import socket
+from dataclasses import astuple, replace
+
+import pytest
+
+from rce_client.demo.exceptions import PortTakenError
+from rce_client.demo.ports import ANY, QUIET, Ports, option_of
+
+
+def test_free_ports_are_all_different_and_free() -> None:
+    ports = astuple(ANY.chosen())
+    assert len(set(ports)) == len(ports)
+    for port in ports:
+        assert port in QUIET
+        socket.create_server(("127.0.0.1", port)).close()
+
+
+@pytest.mark.parametrize(
+    ("name", "option"),
+    [("page", "--port"), ("http", "--http-port"), ("container_link", "--container-link-port")],
+)
+def test_a_taken_port_is_named_with_its_option(name: str, option: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        with pytest.raises(PortTakenError, match=f"port {port} is in use.* {option}$"):
+            replace(ANY, **{name: port}).chosen()
+    assert option_of(name) == option
+
+
+def test_ports_that_are_given_are_kept() -> None:
+    wished = ANY.chosen()
+    assert wished.chosen() == wished
+    assert Ports().http == 9000

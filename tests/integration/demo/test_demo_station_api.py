@@ -1,0 +1,121 @@
+"""The station's API as the demo uses it, against a server that is played."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from typing import Any
+
+import aiohttp
+import pytest
+from aiohttp import web
+from aiohttp.test_utils import TestServer
+from support.fleet_states import fleet, robot
+
+from rce_client.demo.counters import Counters, read_counters
+from rce_client.demo.exceptions import DemoError, StationAwayError, WishRefusedError
+from rce_client.demo.station import StationApi
+
+FLEET = fleet(robot("Robot1", cell=3), blocked=[5])
+
+
+class Played:
+    """A server with the routes of station and master."""
+
+    def __init__(self) -> None:
+        self.heard: list[tuple[str, Any]] = []
+        self.answer: web.Response | None = None
+
+    def app(self) -> web.Application:
+        app = web.Application()
+        app.router.add_get("/api/v1/fleet", self.fleet)
+        app.router.add_put("/api/v1/{path:.*}", self.put)
+        app.router.add_post("/api/v1/login", self.login)
+        app.router.add_get("/api/v1/interfaces", self.interfaces)
+        return app
+
+    async def fleet(self, _: web.Request) -> web.Response:
+        return self.answer or web.Response(text=FLEET.model_dump_json(), content_type="application/json")
+
+    async def put(self, request: web.Request) -> web.Response:
+        self.heard.append((request.match_info["path"], await request.json()))
+        return self.answer or web.json_response({"message": "done"})
+
+    async def login(self, _: web.Request) -> web.Response:
+        return self.answer or web.json_response({"token": "abc"})
+
+    async def interfaces(self, request: web.Request) -> web.Response:
+        assert request.headers["Authorization"] == "Bearer abc"
+        counted = [{"messages_in": 3, "dropped": 0}, {"messages_in": 4, "dropped": 1}]
+        return web.json_response({"interfaces": counted})
+
+
+@pytest.fixture
+def played() -> Played:
+    return Played()
+
+
+@pytest.fixture
+async def server(played: Played) -> AsyncIterator[TestServer]:
+    async with TestServer(played.app()) as server:
+        yield server
+
+
+@pytest.fixture
+async def session() -> AsyncIterator[aiohttp.ClientSession]:
+    async with aiohttp.ClientSession() as session:
+        yield session
+
+
+async def test_state_and_wishes(played: Played, server: TestServer, session: aiohttp.ClientSession) -> None:
+    station = StationApi(session, str(server.make_url("/")))
+    assert await station.fleet() == FLEET
+    await station.set_goal("Robot1", 7)
+    await station.set_goal("Robot1", None)
+    await station.block(9, blocked=True)
+    assert played.heard == [
+        ("robots/Robot1/goal", {"cell": 7}),
+        ("robots/Robot1/goal", {"cell": None}),
+        ("cells/9", {"blocked": True}),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("status", "error"), [(409, WishRefusedError), (404, WishRefusedError), (503, StationAwayError)]
+)
+async def test_refusals(
+    status: int,
+    error: type[Exception],
+    played: Played,
+    server: TestServer,
+    session: aiohttp.ClientSession,
+) -> None:
+    played.answer = web.json_response({"error": "cell 9 is a wall"}, status=status)
+    with pytest.raises(error, match="cell 9 is a wall"):
+        await StationApi(session, str(server.make_url("/"))).block(9, blocked=True)
+
+
+async def test_an_answer_that_is_no_state(
+    played: Played, server: TestServer, session: aiohttp.ClientSession
+) -> None:
+    played.answer = web.json_response({"robots": 3})
+    with pytest.raises(WishRefusedError, match="cannot be read"):
+        await StationApi(session, str(server.make_url("/"))).fleet()
+
+
+async def test_nobody_there(server: TestServer, session: aiohttp.ClientSession) -> None:
+    url = str(server.make_url("/"))
+    await server.close()
+    with pytest.raises(StationAwayError):
+        await StationApi(session, url).fleet()
+    with pytest.raises(DemoError):
+        await read_counters(session, url, "u", "p")
+
+
+async def test_counters_are_summed(server: TestServer, session: aiohttp.ClientSession) -> None:
+    assert await read_counters(session, str(server.make_url("/")), "u", "p") == Counters(7, 1)
+
+
+async def test_a_refused_login(played: Played, server: TestServer, session: aiohttp.ClientSession) -> None:
+    played.answer = web.json_response({"error": "wrong"}, status=401)
+    with pytest.raises(DemoError, match="401"):
+        await read_counters(session, str(server.make_url("/")), "u", "p")
