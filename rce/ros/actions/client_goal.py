@@ -1,0 +1,143 @@
+"""A goal as the program sees it that asked for it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from typing import TYPE_CHECKING, Any
+
+from rce.ros.actions.exceptions import GoalFailed
+from rce.ros.actions.goal_id import GoalId
+from rce.ros.actions.states import CommState, GoalState
+from rce.ros.actions.tracker import GoalTracker
+from rce.ros.node.queue import DropOldest
+
+if TYPE_CHECKING:
+    from rce.ros.types import Message
+
+FEEDBACK_QUEUE = 100
+"""How many feedbacks wait for an iteration before the oldest is dropped."""
+
+FeedbackCallback = Callable[[Any], None]
+"""Called with each feedback message; must not block."""
+
+ChangeCallback = Callable[["ClientGoal"], None]
+"""Called with the goal after each change of its state; must not block."""
+
+
+class ClientGoal:
+    """One goal of an action client. Made by :meth:`rce.ros.actions.ActionClient.send`.
+
+    An async iterator over the feedback; it ends when the goal is over.
+    """
+
+    def __init__(
+        self,
+        goal_id: GoalId,
+        tracker: GoalTracker,
+        send_cancel: Callable[[ClientGoal], None],
+        on_feedback: FeedbackCallback | None,
+        on_change: ChangeCallback | None,
+    ) -> None:
+        self.goal_id = goal_id
+        self.tracker = tracker
+        """What is known of it."""
+        self._send_cancel = send_cancel
+        self._on_feedback = on_feedback
+        self._on_change = on_change
+        self._result: Message | None = None
+        self._done = asyncio.Event()
+        self._feedback: DropOldest[Message] = DropOldest(FEEDBACK_QUEUE)
+        self._arrived = asyncio.Event()
+
+    def __repr__(self) -> str:
+        return f"<ClientGoal {self.id} {self.state.name} {self.comm_state.name}>"
+
+    @property
+    def id(self) -> str:
+        """The goal's name, unique in the graph."""
+        return self.goal_id.id
+
+    @property
+    def state(self) -> GoalState:
+        """The goal's state, as its server last said."""
+        return self.tracker.state
+
+    @property
+    def comm_state(self) -> CommState:
+        """How far the exchange with the server is."""
+        return self.tracker.comm
+
+    @property
+    def text(self) -> str:
+        """The server's words on its state."""
+        return self.tracker.text
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the result is there or the goal is lost."""
+        return self.tracker.is_done
+
+    def cancel(self) -> None:
+        """Ask the server to end it; without effect once it is over. How it ended, its result tells."""
+        if not self.is_done:
+            self._send_cancel(self)
+
+    async def wait(self, timeout: float | None = None) -> GoalState:
+        """Wait until it is over.
+
+        Returns:
+            How it ended.
+
+        Raises:
+            TimeoutError: It is not over within ``timeout`` seconds; it goes on.
+        """
+        async with asyncio.timeout(timeout):
+            await self._done.wait()
+        return self.state
+
+    async def result(self, timeout: float | None = None) -> Message:
+        """Wait for the result. A caller that is cancelled does not cancel the goal.
+
+        Raises:
+            GoalFailed: It ended in another way than by success.
+            TimeoutError: It is not over within ``timeout`` seconds; it goes on.
+        """
+        state = await self.wait(timeout)
+        if state is not GoalState.SUCCEEDED or self._result is None:
+            raise GoalFailed(self.id, state, self.text, self._result)
+        return self._result
+
+    def __aiter__(self) -> AsyncIterator[Message]:
+        return self
+
+    async def __anext__(self) -> Message:
+        while not self._feedback:
+            if self.is_done:
+                raise StopAsyncIteration
+            self._arrived.clear()
+            await self._arrived.wait()
+        return self._feedback.take()
+
+    # ------------------------------------------------------------------ what the client tells
+
+    def feedback_received(self, feedback: Message) -> None:
+        """Take feedback."""
+        if self.is_done:
+            return
+        if self._on_feedback is not None:
+            self._on_feedback(feedback)
+        else:
+            self._feedback.put(feedback, 0)
+            self._arrived.set()
+
+    def changed(self, passed: tuple[CommState, ...], result: Message | None = None) -> None:
+        """Take what the tracker made of an event."""
+        if not passed:
+            return
+        if self.is_done:
+            self._result = result
+            self._done.set()
+            self._arrived.set()
+        if self._on_change is not None:
+            self._on_change(self)

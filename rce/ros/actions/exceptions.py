@@ -1,0 +1,81 @@
+"""What can go wrong with actions.
+
+::
+
+    RosError
+    +-- ActionError
+        +-- GoalFailed          a goal ended in another way than by success: how, why and with which result
+        +-- IllegalTransition   a goal cannot do that in its present state (misuse, or a peer out of step)
+        +-- UnknownGoal         a server was asked about a goal that it does not remember
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import TYPE_CHECKING
+
+from rce.ros.errors import RosError
+
+if TYPE_CHECKING:
+    from rce.ros.actions.states import GoalState
+    from rce.ros.types import Message
+
+
+class ActionError(RosError):
+    """Base of all errors of :mod:`rce.ros.actions`."""
+
+
+class GoalFailed(ActionError):  # noqa: N818
+    """A goal did not succeed.
+
+    Attributes:
+        goal_id: Which goal.
+        state: How it ended: aborted, rejected, preempted, recalled or lost.
+        text: What the server says about it.
+        result: The result that came all the same; None for a lost goal.
+    """
+
+    def __init__(self, goal_id: str, state: GoalState, text: str, result: Message | None) -> None:
+        super().__init__(goal_id, state, text, result)
+        self.goal_id = goal_id
+        self.state = state
+        self.text = text
+        self.result = result
+
+    def __str__(self) -> str:
+        reason = f": {self.text}" if self.text else ""
+        return f"goal {self.goal_id} was {self.state.name.lower()}{reason}"
+
+
+class IllegalTransition(ActionError):  # noqa: N818
+    """An event does not fit the state of a goal; nothing was changed.
+
+    Attributes:
+        goal_id: Which goal.
+        state: The state it is in.
+        event: What should have happened, or the status that a server reported.
+    """
+
+    def __init__(self, goal_id: str, state: Enum, event: Enum) -> None:
+        super().__init__(goal_id, state, event)
+        self.goal_id = goal_id
+        self.state = state
+        self.event = event
+
+    def __str__(self) -> str:
+        return f"goal {self.goal_id} is {self.state.name}: {self.event.name} is not possible"
+
+
+class UnknownGoal(ActionError, LookupError):  # noqa: N818
+    """There is no such goal, or not any longer.
+
+    Attributes:
+        goal_id: Which goal.
+    """
+
+    def __init__(self, goal_id: str) -> None:
+        super().__init__(goal_id)
+        self.goal_id = goal_id
+
+    def __str__(self) -> str:
+        return f"there is no goal {self.goal_id}"

@@ -1,0 +1,151 @@
+"""A goal as the program sees it that works on it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Protocol
+
+from rce.ros.actions.goal_id import GoalId
+from rce.ros.actions.ledger import Entry
+from rce.ros.actions.states import GoalEvent, GoalState
+from rce.ros.types.values import NANOSECONDS, Time
+
+if TYPE_CHECKING:
+    from rce.ros.types import Message
+
+Content = Mapping[str, Any]
+"""The fields of a message."""
+
+
+class GoalServer(Protocol):
+    """What a goal needs of its server."""
+
+    def transition(self, entry: Entry, event: GoalEvent, text: str, result: Message | Content | None) -> None:
+        """Let something happen to a goal and tell its clients."""
+
+    def publish_feedback(self, entry: Entry, feedback: Message | Content) -> None:
+        """Tell the goal's clients how it goes."""
+
+
+class ServerGoal:
+    """One goal of an action server; what handlers are called with.
+
+    Attributes:
+        request: The goal's content, a message of the action's ``Goal`` type.
+    """
+
+    def __init__(self, server: GoalServer, entry: Entry, request: Message) -> None:
+        self.request = request
+        self._server = server
+        self._entry = entry
+        self._stop = asyncio.Event()
+
+    def __repr__(self) -> str:
+        return f"<ServerGoal {self.id} {self.state.name}>"
+
+    @property
+    def goal_id(self) -> GoalId:
+        """The goal's name and stamp."""
+        return self._entry.goal_id
+
+    @property
+    def id(self) -> str:
+        """The goal's name, unique in the graph."""
+        return self._entry.goal_id.id
+
+    @property
+    def stamp(self) -> Time:
+        """When the client made the goal."""
+        return Time(*divmod(self._entry.goal_id.stamp, NANOSECONDS))
+
+    @property
+    def state(self) -> GoalState:
+        """How the goal stands."""
+        return self._entry.state
+
+    @property
+    def text(self) -> str:
+        """What was said last on how it stands."""
+        return self._entry.text
+
+    # ------------------------------------------------------------------ what happens to it
+
+    def accept(self, text: str = "") -> None:
+        """Begin to work on it.
+
+        Raises:
+            IllegalTransition: It was accepted already, or is over.
+        """
+        self._server.transition(self._entry, GoalEvent.ACCEPT, text, None)
+
+    def reject(self, text: str = "", result: Message | Content | None = None) -> None:
+        """Refuse to work on it.
+
+        Raises:
+            IllegalTransition: It was accepted already, or is over.
+        """
+        self._server.transition(self._entry, GoalEvent.REJECT, text, result)
+
+    def succeed(self, result: Message | Content | None = None, text: str = "") -> None:
+        """End it: it was reached. ``result`` is a message, or a mapping of its fields.
+
+        Raises:
+            IllegalTransition: It was not accepted, or is over.
+            SerializationError: The result does not fit its type; the goal goes on.
+        """
+        self._server.transition(self._entry, GoalEvent.SUCCEED, text, result)
+
+    def abort(self, text: str = "", result: Message | Content | None = None) -> None:
+        """End it: it is given up.
+
+        Raises:
+            IllegalTransition: It was not accepted, or is over.
+            SerializationError: The result does not fit its type; the goal goes on.
+        """
+        self._server.transition(self._entry, GoalEvent.ABORT, text, result)
+
+    def cancel(self, text: str = "", result: Message | Content | None = None) -> None:
+        """End it early: preempted if it was accepted, else recalled.
+
+        Raises:
+            IllegalTransition: It is over.
+            SerializationError: The result does not fit its type; the goal goes on.
+        """
+        self._server.transition(self._entry, GoalEvent.CANCEL, text, result)
+
+    def publish_feedback(self, feedback: Message | Content | None = None, /, **fields: Any) -> None:
+        """Tell the clients how it goes, by a message, a mapping of its fields, or its fields.
+
+        Raises:
+            SerializationError: A value does not fit its field.
+        """
+        self._server.publish_feedback(self._entry, fields if feedback is None else feedback)
+
+    # ------------------------------------------------------------------ being asked to end
+
+    @property
+    def cancel_requested(self) -> bool:
+        """Whether a client, or a newer goal of a simple server, asks to end it."""
+        return self._stop.is_set()
+
+    async def wait_for_cancel(self) -> None:
+        """Wait until it is asked to end."""
+        await self._stop.wait()
+
+    async def sleep(self, seconds: float) -> bool:
+        """Sleep for real seconds, or wake up early because the goal is asked to end.
+
+        Returns:
+            Whether to go on: ``while await goal.sleep(0.1): ...``.
+        """
+        try:
+            async with asyncio.timeout(seconds):
+                await self._stop.wait()
+        except TimeoutError:
+            return True
+        return False
+
+    def request_cancel(self) -> None:
+        """Ask the handler to end it; the server does, programs may."""
+        self._stop.set()
