@@ -32,6 +32,6 @@ async def _serve(bind: str, port: int, advertised: str | None) -> None:
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stop.set)
-    async with Core(bind, port, advertised=advertised) as running:
+    async with Core(bind, port, advertised=advertised, rosout=True) as running:
         typer.echo(f"rce core ready: ROS_MASTER_URI={running.uri}")
         await stop.wait()

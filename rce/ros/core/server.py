@@ -7,7 +7,7 @@ import copy
 import uuid
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import AsyncExitStack, contextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from types import TracebackType
 from typing import Any, Self
 
@@ -15,6 +15,7 @@ from rce.ros.core.api import MasterApi
 from rce.ros.core.events import GraphEvent, Outcome
 from rce.ros.core.graph import Graph
 from rce.ros.core.notifier import Notifier
+from rce.ros.core.roslaunch import roslaunch_methods
 from rce.ros.errors import ParameterMissing
 from rce.ros.tasks import TaskScope
 from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer
@@ -66,7 +67,12 @@ class Core:
     """
 
     def __init__(
-        self, host: str = "127.0.0.1", port: int = DEFAULT_PORT, *, advertised: str | None = None
+        self,
+        host: str = "127.0.0.1",
+        port: int = DEFAULT_PORT,
+        *,
+        advertised: str | None = None,
+        rosout: bool = False,
     ) -> None:
         """Prepare a core.
 
@@ -74,11 +80,14 @@ class Core:
             host: Address to listen on; ``0.0.0.0`` for all.
             port: 0 takes a free one.
             advertised: Host or address in :attr:`uri`; by default ``host``, or loopback if that is "all".
+            rosout: Run the node ``/rosout``, which gathers all nodes' log records on ``/rosout_agg``.
         """
         self.graph = Graph()
-        self._advertised = advertised or ("127.0.0.1" if host == "0.0.0.0" else host)  # noqa: S104
+        self._local = "127.0.0.1" if host == "0.0.0.0" else host  # noqa: S104
+        self._advertised = advertised or self._local
+        self._rosout = rosout
         self._api = MasterApi(self.graph, lambda: self.uri, self._perform)
-        self._server = RpcServer(Dispatcher(self._api.methods()), host, port)
+        self._server = RpcServer(Dispatcher(self._api.methods() | roslaunch_methods()), host, port)
         self._notifier: Notifier | None = None
         self._watches: set[GraphWatch] = set()
         self._changed = asyncio.Event()
@@ -96,6 +105,8 @@ class Core:
             self._notifier = Notifier(client, tasks)
             await stack.enter_async_context(self._server)
             self._set_well_known_parameters()
+            if self._rosout:
+                await stack.enter_async_context(self._gathering_logs())
             self._stack = stack.pop_all()
         return self
 
@@ -170,6 +181,14 @@ class Core:
 
     # ------------------------------------------------------------------ inside
 
+    @asynccontextmanager
+    async def _gathering_logs(self) -> AsyncIterator[None]:
+        from rce.ros.core.rosout import RosoutNode  # a core without it needs no node
+
+        async with RosoutNode(f"http://{self._local}:{self._server.port}/", self._advertised) as node:
+            await node.gather()
+            yield
+
     def _perform(self, outcome: Outcome) -> None:
         if self._notifier is not None:
             for call in outcome.calls:
@@ -183,3 +202,5 @@ class Core:
         self.set_param("/run_id", str(uuid.uuid1()))
         self.set_param("/rosversion", f"{ROS_VERSION}\n")
         self.set_param("/rosdistro", f"{ROS_DISTRIBUTION}\n")
+        host = "".join(character if character.isalnum() else "_" for character in self._advertised)
+        self.set_param(f"/roslaunch/uris/host_{host}__{self._server.port}", self.uri)

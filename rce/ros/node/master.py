@@ -69,6 +69,14 @@ class MasterClient:
         """Say that the node no longer provides a service."""
         await self.call("unregisterService", name, service_uri)
 
+    async def lookup_node(self, name: str) -> str | None:
+        """Return the slave API of a node, if the master knows it."""
+        try:
+            uri: str = await self.call("lookupNode", name)
+        except MasterRefused:
+            return None
+        return uri
+
     async def lookup_service(self, name: str) -> str | None:
         """Return the ``rosrpc`` URI of a service's provider, if there is one."""
         try:

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
-from rce.ros.errors import HandshakeRefused, MasterError, MasterUnreachable, NodeClosed
-from rce.ros.node import rosout, signals
+from rce.ros.errors import HandshakeRefused, MasterError, MasterUnreachable, NodeClosed, TypeMismatch
+from rce.ros.node import clock, rosout, signals
+from rce.ros.node.clock import NANOSECONDS, Clock
+from rce.ros.node.local import neighbour
+from rce.ros.node.loggers import Loggers
 from rce.ros.node.master import MasterClient
 from rce.ros.node.parameters import Parameters
-from rce.ros.node.publisher import Publisher
+from rce.ros.node.registrar import Registrar
 from rce.ros.node.runtime import Runtime, Types
-from rce.ros.node.service import Service
+from rce.ros.node.service import SerializedHandler, Service
 from rce.ros.node.service_client import ServiceClient
 from rce.ros.node.settings import NodeSettings
 from rce.ros.node.slave import SlaveApi
+from rce.ros.node.subscriber import CallbackSink
 from rce.ros.node.topics import Topics
 from rce.ros.tasks import TaskScope
 from rce.ros.tcpros.connection import Connection
@@ -27,7 +30,7 @@ from rce.ros.tcpros.listener import Listener
 from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer
 
 if TYPE_CHECKING:
-    from rce.ros.types import TypeRegistry
+    from rce.ros.types import ServiceType, TypeRegistry
 
 _log = logging.getLogger(__name__)
 
@@ -51,11 +54,18 @@ class GraphMember:
         *,
         signals: bool,
         master_timeout: float | None,
+        intra_process: bool,
+        rosout: bool,
     ) -> None:
         self.log = logging.getLogger("ros" + settings.resolver.node_name.replace("/", "."))
         self._settings = settings
         self._types = Types(types)
+        if self.log.level == logging.NOTSET:
+            self.log.setLevel(logging.INFO)  # what nodes tell, whatever their program's own logging does
         self._signals = signals
+        self._intra_process = intra_process
+        self._rosout = rosout
+        self._clock = Clock()
         self._master_timeout = master_timeout
         self._topics = Topics()
         self._services: dict[str, Service] = {}
@@ -98,6 +108,7 @@ class GraphMember:
         if not self._stop.is_set():
             _log.info("%s stops: %s", self.name, reason)
             self._stop.set()
+            self._clock.end()
             for source in self._topics.inputs.values():
                 for subscriber in source.subscribers:
                     subscriber.sink.end()
@@ -111,31 +122,22 @@ class GraphMember:
             await self._stop.wait()
 
     async def sleep(self, seconds: float) -> bool:
-        """Sleep, or wake up early because the node is told to stop.
+        """Sleep in ROS time, or wake up early because the node is told to stop or simulated time jumps back.
 
         Returns:
             Whether the node goes on: ``while await node.sleep(0.1): ...``.
         """
-        try:
-            async with asyncio.timeout(seconds):
-                await self._stop.wait()
-        except TimeoutError:
-            return True
-        return False
+        return await self._clock.sleep_until(self._clock.nanoseconds() + round(seconds * NANOSECONDS))
 
     async def reregister(self) -> None:
-        """Tell the master again of all topics and services: it may have been restarted.
+        """Tell the master again of all topics and services, at once.
+
+        A node does so by itself when its master was restarted.
 
         Raises:
             MasterError: The master cannot be told.
         """
-        master = self._running.master
-        for topic, output in list(self._topics.outputs.items()):
-            await master.register_publisher(topic, output.kind_name)
-        for topic, source in list(self._topics.inputs.items()):
-            source.set_publishers(await master.register_subscriber(topic, source.kind_name))
-        for name in list(self._services):
-            await master.register_service(name, self._service_uri)
+        await self._registrar(self._running.master).register_all()
 
     # ------------------------------------------------------------------ life
 
@@ -158,10 +160,16 @@ class GraphMember:
             server = await stack.enter_async_context(RpcServer(Dispatcher(slave.methods()), settings.bind))
             slave_uri = f"http://{settings.host}:{server.port}/"
             master = MasterClient(settings.master_uri, self.name, slave_uri, rpc)
-            self._runtime = Runtime(self.name, self._types, tasks, rpc, master, scratch)
+            self._runtime = Runtime(
+                self.name, self._types, tasks, rpc, master, scratch, intra_process=self._intra_process
+            )
             self._parameters = Parameters(master)
+            if self._intra_process:
+                stack.enter_context(neighbour(slave_uri, self._topics))
             stack.push_async_callback(self._leave_graph)
+            await self._until_master_answers()
             await self._join_graph(stack)
+            tasks.start(self._registrar(master).keep(), name=f"{self.name} stays registered")
             if self._signals:
                 stack.enter_context(signals.handled(self.shutdown))
             self._stack = stack.pop_all()
@@ -175,29 +183,58 @@ class GraphMember:
         self._runtime = None
 
     async def _join_graph(self, stack: AsyncExitStack) -> None:
-        publisher = await self._until_master_answers(
-            lambda: self._topics.advertise(
-                self._running, rosout.TOPIC, rosout.KIND, latch=False, queue_size=DEFAULT_QUEUE
-            )
+        """Do what every node does first."""
+        if self._clock.simulated:
+            sink = CallbackSink(self._clock.tick, clock.TOPIC)
+            await self._topics.subscribe(self._running, clock.TOPIC, clock.CLOCK, sink, decodes=False)
+        for name, value in self._private_parameters.items():
+            await self._parameters.set(name, value)
+        if self._rosout:
+            await self._publish_log(stack)
+        for name, kind, handler in Loggers(self.log).handlers(self._types):
+            await self._provide(f"{self.name}/{name}", kind, handler)
+
+    async def _publish_log(self, stack: AsyncExitStack) -> None:
+        publisher = await self._topics.advertise(
+            self._running, rosout.TOPIC, rosout.KIND, latch=False, queue_size=DEFAULT_QUEUE
         )
-        handler = rosout.RosoutHandler(publisher, self.name)
+        handler = rosout.RosoutHandler(publisher, self.name, self._clock)
         publisher.on_subscriber = handler.flush
         self.log.addHandler(handler)
         stack.callback(self.log.removeHandler, handler)
-        for name, value in self._settings.parameters.items():
-            await self._parameters.set(f"{self.name}/{name}", value)
 
-    async def _until_master_answers(self, attempt: Callable[[], Awaitable[Publisher]]) -> Publisher:
+    async def _provide(self, name: str, kind: str | ServiceType, handler: SerializedHandler) -> Service:
+        """Provide a service under a global name."""
+        runtime, uri = self._running, self._service_uri
+        if name in self._services:
+            raise TypeMismatch(f"this node provides {name} already")
+
+        async def release(service: Service) -> None:
+            del self._services[service.name]
+            await runtime.master.unregister_service(service.name, uri)
+
+        service = self._services[name] = Service(runtime, name, kind, handler, release)
+        try:
+            await runtime.master.register_service(name, uri)
+        except BaseException:
+            del self._services[name]
+            raise
+        return service
+
+    async def _until_master_answers(self) -> None:
+        """Ask the master, which may not be up yet, whether time is simulated."""
         loop = asyncio.get_running_loop()
         deadline = None if self._master_timeout is None else loop.time() + self._master_timeout
         while True:
             try:
-                return await attempt()
+                self._clock.simulated = await self._parameters.get(clock.PARAMETER, default=False) is True
             except MasterUnreachable as error:
                 if deadline is not None and loop.time() >= deadline:
                     raise
                 _log.info("%s; trying again", error)
                 await asyncio.sleep(RETRY)
+            else:
+                return
 
     async def _leave_graph(self) -> None:
         """Unregister everything, as far as there is still a master that listens."""
@@ -235,6 +272,21 @@ class GraphMember:
     @property
     def _service_uri(self) -> str:
         return f"rosrpc://{self._settings.host}:{self._listener.port}"
+
+    @property
+    def _private_parameters(self) -> dict[str, Any]:
+        return {f"{self.name}/{name}": value for name, value in self._settings.parameters.items()}
+
+    def _registrar(self, master: MasterClient) -> Registrar:
+        return Registrar(
+            master,
+            self._topics,
+            self._services,
+            self._parameters,
+            self._service_uri,
+            self._private_parameters,
+            self.shutdown,
+        )
 
     def _parameter_changed(self, name: str, value: object) -> None:
         self._parameters.changed(name, value)

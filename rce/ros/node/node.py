@@ -8,10 +8,11 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from rce.ros.errors import TypeMismatch
+from rce.ros.node.clock import NANOSECONDS
 from rce.ros.node.member import DEFAULT_QUEUE, GraphMember
 from rce.ros.node.parameters import REQUIRED, ParameterCallback
 from rce.ros.node.publisher import Publisher
+from rce.ros.node.runtime import TypeName
 from rce.ros.node.service import Handler, SerializedHandler, Service, coding
 from rce.ros.node.service_client import ServiceClient, answers
 from rce.ros.node.settings import NodeSettings
@@ -21,12 +22,13 @@ from rce.ros.node.subscriber import (
     SerializedCallback,
     Subscriber,
     decoding,
-    serialized_sink,
+    sink_for,
 )
+from rce.ros.node.timing import Rate, Timer, TimerCallback
 from rce.ros.tcpros.header import ANY
 
 if TYPE_CHECKING:
-    from rce.ros.types import MessageType, ServiceType, TypeRegistry
+    from rce.ros.types import MessageType, ServiceType, Time, TypeRegistry
 
 SERVICE_POLL = 0.1
 """Seconds between two looks for a service that is not there yet."""
@@ -58,6 +60,8 @@ class Node(GraphMember):
         anonymous: bool = False,
         signals: bool | None = None,
         master_timeout: float | None = 10.0,
+        intra_process: bool = True,
+        rosout: bool = True,
     ) -> None:
         """Prepare a node.
 
@@ -71,6 +75,9 @@ class Node(GraphMember):
             signals: Stop the node at SIGINT and SIGTERM; ``None`` means: if it is the program's main node,
                 which is the one that takes the program's command line.
             master_timeout: Seconds to wait for a master that is not up yet; ``None`` for ever.
+            intra_process: Take messages of other nodes of this process as the objects that they published,
+                which then must not be changed; else by a connection, as from any node.
+            rosout: Publish the log on ``/rosout``.
 
         Raises:
             InvalidName: A name or remapping is not legal.
@@ -84,7 +91,14 @@ class Node(GraphMember):
             anonymous=anonymous,
         )
         handle_signals = argv is None if signals is None else signals
-        super().__init__(settings, types, signals=handle_signals, master_timeout=master_timeout)
+        super().__init__(
+            settings,
+            types,
+            signals=handle_signals,
+            master_timeout=master_timeout,
+            intra_process=intra_process,
+            rosout=rosout,
+        )
 
     def resolve(self, name: str) -> str:
         """Return the global name that ``name`` stands for, after remapping.
@@ -145,14 +159,16 @@ class Node(GraphMember):
         name = self.resolve(topic)
         message_type = runtime.types.message(kind)
         if callback is None:
-            return await self._topics.subscribe(runtime, name, message_type, QueueSink(queue_size))
-        sink = serialized_sink(decoding(message_type, callback), queue_size, name, runtime.tasks)
-        return await self._topics.subscribe(runtime, name, message_type, sink)
+            return await self._topics.subscribe(
+                runtime, name, message_type, QueueSink(queue_size), decodes=True
+            )
+        sink = sink_for(decoding(message_type, callback), queue_size, name, runtime.tasks)
+        return await self._topics.subscribe(runtime, name, message_type, sink, decodes=True)
 
     async def subscribe_serialized(
         self,
         topic: str,
-        kind: str | MessageType,
+        kind: str | MessageType | TypeName,
         callback: SerializedCallback,
         *,
         queue_size: int = DEFAULT_QUEUE,
@@ -161,7 +177,7 @@ class Node(GraphMember):
 
         Args:
             topic: The topic.
-            kind: Its type; ``*`` for any.
+            kind: Its type; ``*`` for any. A :class:`~rce.ros.node.runtime.TypeName` saves loading it.
             callback: Called with ``(payload, latched)``; ``latched`` is what the publisher says of itself.
                 Plain function or coroutine function, as for :meth:`subscribe`.
             queue_size: As for :meth:`subscribe`.
@@ -173,9 +189,11 @@ class Node(GraphMember):
         """
         runtime = self._running
         name = self.resolve(topic)
-        sink = serialized_sink(callback, queue_size, name, runtime.tasks)
-        message_type = None if kind == ANY else runtime.types.message(kind)
-        return await self._topics.subscribe(runtime, name, message_type, sink)
+        sink = sink_for(callback, queue_size, name, runtime.tasks)
+        if kind == ANY:
+            return await self._topics.subscribe(runtime, name, None, sink, decodes=False)
+        known = kind if isinstance(kind, TypeName) else runtime.types.message(kind)
+        return await self._topics.subscribe(runtime, name, known, sink, decodes=False)
 
     # ------------------------------------------------------------------ services
 
@@ -196,7 +214,7 @@ class Node(GraphMember):
             MasterError: The master cannot be told.
         """
         service_type = self._running.types.service(kind)
-        return await self._advertise_service(name, service_type, coding(service_type, handler))
+        return await self._provide(self.resolve(name), service_type, coding(service_type, handler))
 
     async def advertise_service_serialized(
         self, name: str, kind: str | ServiceType, handler: SerializedHandler
@@ -208,7 +226,7 @@ class Node(GraphMember):
             UnknownType: There is no such type.
             MasterError: The master cannot be told.
         """
-        return await self._advertise_service(name, self._running.types.service(kind), handler)
+        return await self._provide(self.resolve(name), self._running.types.service(kind), handler)
 
     def service_client(self, name: str, kind: str | ServiceType, *, persistent: bool = True) -> ServiceClient:
         """Make a client of a service, which need not be there yet.
@@ -240,22 +258,36 @@ class Node(GraphMember):
             while not await answers(runtime, service):  # noqa: ASYNC110 - a master tells nobody of services
                 await asyncio.sleep(SERVICE_POLL)
 
-    async def _advertise_service(self, name: str, kind: ServiceType, handler: SerializedHandler) -> Service:
-        runtime, resolved, uri = self._running, self.resolve(name), self._service_uri
-        if resolved in self._services:
-            raise TypeMismatch(f"this node provides {resolved} already")
+    # ------------------------------------------------------------------ time
 
-        async def release(service: Service) -> None:
-            del self._services[service.name]
-            await runtime.master.unregister_service(service.name, uri)
+    @property
+    def is_time_simulated(self) -> bool:
+        """Whether time comes from ``/clock``: parameter ``/use_sim_time`` was true when the node started."""
+        return self._clock.simulated
 
-        service = self._services[resolved] = Service(runtime, resolved, kind, handler, release)
-        try:
-            await runtime.master.register_service(resolved, uri)
-        except BaseException:
-            del self._services[resolved]
-            raise
-        return service
+    def now(self) -> Time:
+        """Return ROS time as messages carry it. Simulated time is zero until the first tick."""
+        from rce.ros.types import Time
+
+        return Time(*divmod(self._clock.nanoseconds(), NANOSECONDS))
+
+    def time(self) -> float:
+        """Return ROS time in seconds since the epoch."""
+        return self._clock.nanoseconds() / NANOSECONDS
+
+    def rate(self, hz: float) -> Rate:
+        """Make what keeps a loop at a rate in ROS time: ``async for _ in node.rate(10): ...``."""
+        return Rate(self._clock, hz)
+
+    def timer(self, period: float, callback: TimerCallback, *, oneshot: bool = False) -> Timer:
+        """Call a function every ``period`` seconds of ROS time, or once.
+
+        Args:
+            period: Seconds; the first call is after the first period.
+            callback: Called with a :class:`~rce.ros.node.timing.TimerEvent`; a coroutine function is awaited.
+            oneshot: Call it only once.
+        """
+        return Timer(self._clock, period, callback, self._running.tasks, oneshot=oneshot)
 
     # ------------------------------------------------------------------ parameters
 
@@ -267,6 +299,15 @@ class Node(GraphMember):
             MasterUnreachable: The master does not answer.
         """
         return await self._parameters.get(self.resolve(name), default)
+
+    async def get_param_cached(self, name: str, default: Any = REQUIRED) -> Any:
+        """Return a parameter as the master told it last: the first call asks, later changes are told.
+
+        Raises:
+            ParameterMissing: It is not set, or an empty namespace, and there is no ``default``.
+            MasterUnreachable: The master does not answer.
+        """
+        return await self._parameters.get_cached(self.resolve(name), default)
 
     async def set_param(self, name: str, value: Any) -> None:
         """Set a parameter, or a whole namespace from a dictionary."""

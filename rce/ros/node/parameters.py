@@ -16,6 +16,9 @@ class _Required:
     """Marks a parameter without a default."""
 
 
+UNSET: dict[str, Any] = {}
+"""What a master tells of a parameter that is not set."""
+
 REQUIRED = _Required()
 """In place of a default: the parameter must be set."""
 
@@ -26,6 +29,8 @@ class Parameters:
     def __init__(self, master: MasterClient) -> None:
         self._master = master
         self._watchers: dict[str, list[ParameterCallback]] = {}
+        self._known: dict[str, Any] = {}
+        """What the master has told of subscribed parameters."""
 
     async def get(self, name: str, default: Any = REQUIRED) -> Any:
         """Return a parameter, or all of a namespace as a dictionary.
@@ -41,9 +46,28 @@ class Parameters:
                 raise ParameterMissing(name) from error
             return default
 
+    async def get_cached(self, name: str, default: Any = REQUIRED) -> Any:
+        """Return a parameter as the master told it last; only the first call asks.
+
+        An empty namespace counts as not set. The value must not be changed.
+
+        Raises:
+            ParameterMissing: It is not set and there is no default.
+            MasterUnreachable: The master does not answer.
+        """
+        if name not in self._known:
+            await self._subscribe(name)
+        value = self._known[name]
+        if value != UNSET:
+            return value
+        if default is REQUIRED:
+            raise ParameterMissing(name)
+        return default
+
     async def set(self, name: str, value: Any) -> None:
         """Set a parameter, or a whole namespace from a dictionary."""
         await self._master.call("setParam", name, value)
+        self._note(name, value)  # the master tells all but who did it
 
     async def has(self, name: str) -> bool:
         """Tell whether a parameter or namespace is set."""
@@ -59,6 +83,7 @@ class Parameters:
             await self._master.call("deleteParam", name)
         except MasterRefused as error:
             raise ParameterMissing(name) from error
+        self._note(name, UNSET)
 
     async def search(self, name: str) -> str | None:
         """Look for a relative name in the node's namespace and then upwards; return the global name."""
@@ -80,18 +105,66 @@ class Parameters:
             The value now; an empty dictionary while it is not set.
         """
         self._watchers.setdefault(name, []).append(callback)
-        return await self._master.call("subscribeParam", self._master.slave_uri, name)
+        await self._subscribe(name)
+        return self._known[name]
 
     async def unwatch_all(self) -> None:
         """Stop watching."""
-        while self._watchers:
-            name, _ = self._watchers.popitem()
+        self._watchers.clear()
+        while self._known:
+            name, _ = self._known.popitem()
             await self._master.call("unsubscribeParam", self._master.slave_uri, name)
+
+    async def renew(self) -> None:
+        """Subscribe again at a master that forgot; tell those who watch of values that are others now."""
+        for name, before in list(self._known.items()):
+            await self._subscribe(name)
+            if self._known[name] != before:
+                self._tell(name, self._known[name])
 
     def changed(self, name: str, value: Any) -> None:
         """Tell those who watch of a new value."""
         name = names.canonical(name)
+        self._note(name, value)
+        self._tell(name, value)
+
+    async def _subscribe(self, name: str) -> None:
+        self._known[name] = await self._master.call("subscribeParam", self._master.slave_uri, name)
+
+    def _note(self, name: str, value: Any) -> None:
+        """Put a change into what is known of it, of the namespaces above it and of what is below it."""
+        path = names.segments(name)
+        for known in self._known:
+            own = names.segments(known)
+            if path[: len(own)] == own:
+                self._known[known] = _replaced(self._known[known], path[len(own) :], value)
+            elif own[: len(path)] == path:
+                self._known[known] = _within(value, own[len(path) :])
+
+    def _tell(self, name: str, value: Any) -> None:
         for watched, callbacks in self._watchers.items():
             if name == watched or name.startswith(watched.rstrip(names.SEPARATOR) + names.SEPARATOR):
                 for callback in callbacks:
                     callback(name, value)
+
+
+def _replaced(tree: Any, path: list[str], value: Any) -> Any:
+    """Return a copy of a tree with another value at a path; an unset one is left out."""
+    if not path:
+        return value
+    branch = dict(tree) if isinstance(tree, dict) else {}
+    below = _replaced(branch.get(path[0], UNSET), path[1:], value)
+    if len(path) == 1 and below == UNSET:
+        branch.pop(path[0], None)
+    else:
+        branch[path[0]] = below
+    return branch
+
+
+def _within(tree: Any, path: list[str]) -> Any:
+    """Return what a tree holds at a path."""
+    for segment in path:
+        if not isinstance(tree, dict) or segment not in tree:
+            return UNSET
+        tree = tree[segment]
+    return tree

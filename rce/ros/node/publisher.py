@@ -6,11 +6,12 @@ import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from rce.ros.errors import NodeClosed, TypeMismatch
+from rce.ros.errors import HandshakeRefused, NodeClosed, TypeMismatch
+from rce.ros.node.local import LocalLink, Parcel
 from rce.ros.node.queue import DropOldest
 from rce.ros.node.runtime import Runtime
 from rce.ros.tcpros.connection import Connection
-from rce.ros.tcpros.framing import Chunks, frame
+from rce.ros.tcpros.framing import Chunks, frame, payload_of
 from rce.ros.tcpros.header import ANY, check_type, encode_header, require
 
 if TYPE_CHECKING:
@@ -22,6 +23,8 @@ Payload = bytes | bytearray | memoryview
 
 class Link:
     """One subscriber of a topic, at the end of a TCPROS connection."""
+
+    transport = "TCPROS"
 
     def __init__(self, output: TopicOutput, connection: Connection, subscriber: str) -> None:
         self.subscriber = subscriber
@@ -35,6 +38,11 @@ class Link:
     def dropped(self) -> int:
         """How many messages the subscriber was too slow for."""
         return self._queue.dropped
+
+    @property
+    def description(self) -> str:
+        """What the slave API says of the connection."""
+        return str(self.connection)
 
     def send(self, chunks: Chunks, size: int) -> None:
         """Send a frame, or queue it while the connection is full."""
@@ -71,10 +79,14 @@ class TopicOutput:
         self.kind_name = kind if isinstance(kind, str) else kind.name
         self.queue_size = queue_size
         self.links: list[Link] = []
+        """Subscribers at the other end of a connection."""
+        self.local_links: list[LocalLink] = []
+        """Subscribers in this process."""
         self.publishers: list[Publisher] = []
         self.lost = 0
         """Messages dropped on links that are gone."""
         self.changed = asyncio.Event()
+        self.node_name = runtime.name
         self._runtime = runtime
         self._kind = kind
 
@@ -85,6 +97,11 @@ class TopicOutput:
             self._kind = self._runtime.types.message(self._kind)
         return self._kind
 
+    @property
+    def known_kind(self) -> MessageType | None:
+        """The topic's type if it was needed already."""
+        return None if isinstance(self._kind, str) else self._kind
+
     def accept(self, connection: Connection, fields: Mapping[str, str]) -> None:
         """Take a subscriber.
 
@@ -94,15 +111,14 @@ class TopicOutput:
         require(fields, "md5sum")
         kind = self.kind
         check_type(fields, md5sum=kind.md5sum, kind=kind.name, subject=f"topic {self.topic}")
-        latched = [chunks for publisher in self.publishers if (chunks := publisher.latched) is not None]
-        latching = bool(latched) or any(publisher.latch for publisher in self.publishers)
+        latched = self._latched()
         reply = {
             "callerid": self._runtime.name,
             "topic": self.topic,
             "type": kind.name,
             "md5sum": kind.md5sum,
             "message_definition": kind.definition,
-            "latching": "1" if latching else "0",
+            "latching": "1" if self.is_latching else "0",
         }
         link = Link(self, connection, fields.get("callerid", ANY))
         connection.owner = link
@@ -110,21 +126,63 @@ class TopicOutput:
         for chunks in latched:
             link.send(chunks, sum(map(len, chunks)))
         self.links.append(link)
-        self.changed.set()
-        for publisher in self.publishers:
-            if publisher.on_subscriber is not None:
-                publisher.on_subscriber()
+        self._joined()
 
-    def drop(self, link: Link) -> None:
+    def attach(self, link: LocalLink, md5sum: str) -> None:
+        """Take a subscriber of this process.
+
+        Raises:
+            HandshakeRefused: It means another type.
+        """
+        if md5sum not in (ANY, self.kind.md5sum):
+            raise HandshakeRefused(
+                f"{self.topic} is of type {self.kind.name} there, which does not have md5 sum {md5sum}"
+            )
+        for chunks in self._latched():
+            link.send(Parcel(self.kind, payload=payload_of(chunks)), latched=True)
+        self.local_links.append(link)
+        self._joined()
+
+    def send_locally(self, parcel: Parcel) -> None:
+        """Give a message to the subscribers of this process."""
+        latched = self.is_latching
+        for link in self.local_links:
+            link.send(parcel, latched=latched)
+
+    def drop(self, link: Link | LocalLink) -> None:
         """Forget a subscriber that is gone."""
         self.lost += link.dropped
-        self.links.remove(link)
+        if isinstance(link, LocalLink):
+            self.local_links.remove(link)
+        else:
+            self.links.remove(link)
         self.changed.set()
 
     def close(self) -> None:
         """Close all links."""
         for link in self.links:
             link.connection.close()
+        for local in self.local_links:
+            local.end()
+
+    @property
+    def all_links(self) -> list[Link | LocalLink]:
+        """The subscribers of either sort."""
+        return [*self.links, *self.local_links]
+
+    @property
+    def is_latching(self) -> bool:
+        """Whether a new subscriber may get an old message."""
+        return any(publisher.latch or publisher.latched is not None for publisher in self.publishers)
+
+    def _latched(self) -> list[Chunks]:
+        return [chunks for publisher in self.publishers if (chunks := publisher.latched) is not None]
+
+    def _joined(self) -> None:
+        self.changed.set()
+        for publisher in self.publishers:
+            if publisher.on_subscriber is not None:
+                publisher.on_subscriber()
 
 
 class Publisher:
@@ -161,15 +219,17 @@ class Publisher:
     @property
     def connections(self) -> int:
         """How many subscribers are connected to the topic."""
-        return len(self._output.links)
+        return len(self._output.all_links)
 
     @property
     def dropped(self) -> int:
         """How many messages of the topic subscribers were too slow for, counted once for each subscriber."""
-        return self._output.lost + sum(link.dropped for link in self._output.links)
+        return self._output.lost + sum(link.dropped for link in self._output.all_links)
 
     def publish(self, message: Message | Mapping[str, Any] | None = None, /, **fields: Any) -> None:
         """Publish a message, given as an object, as a mapping of its fields, or by its fields.
+
+        Subscribers in this process may be given the object itself: it must not be changed afterwards.
 
         Raises:
             SerializationError: A value does not fit its field.
@@ -183,6 +243,9 @@ class Publisher:
             raise TypeError("give a message or its fields, not both")
         elif message.__class__ is not kind.cls and not isinstance(message, Mapping):
             raise TypeMismatch(f"{self.topic} carries {kind.name}, not {type(message).__name__}")
+        if self._output.local_links and not isinstance(message, Mapping):
+            self._publish_locally(kind, message)
+            return
         self.publish_serialized(kind.serialize(message))
 
     def publish_serialized(self, payload: Payload, latch: bool = False) -> None:
@@ -195,6 +258,13 @@ class Publisher:
         Raises:
             NodeClosed: The publisher was closed.
         """
+        output = self._output
+        self._send(payload, latch)
+        if output.local_links:
+            output.send_locally(Parcel(output.known_kind, payload=bytes(payload)))
+
+    def _send(self, payload: Payload, latch: bool) -> None:
+        """Send to the subscribers of other processes."""
         if self._closed:
             raise NodeClosed(f"the publisher of {self.topic} is closed")
         chunks = frame(payload)
@@ -204,6 +274,16 @@ class Publisher:
         for link in self._output.links:
             link.send(chunks, size)
 
+    def _publish_locally(self, kind: MessageType, message: Message) -> None:
+        """Give an object to the subscribers of this process; write it only if there are others."""
+        output = self._output
+        if self._closed:
+            raise NodeClosed(f"the publisher of {self.topic} is closed")
+        parcel = Parcel(kind, message)
+        if output.links or self.latch:
+            self._send(parcel.payload(), False)
+        output.send_locally(parcel)
+
     async def wait_for_subscribers(self, count: int = 1, *, timeout: float | None = None) -> None:
         """Wait until at least ``count`` subscribers are connected.
 
@@ -212,7 +292,7 @@ class Publisher:
         """
         output = self._output
         async with asyncio.timeout(timeout):
-            while len(output.links) < count:
+            while len(output.all_links) < count:
                 output.changed.clear()
                 await output.changed.wait()
 

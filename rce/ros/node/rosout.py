@@ -6,10 +6,12 @@ import logging
 from collections import deque
 
 from rce.ros.errors import NodeClosed
+from rce.ros.node.clock import NANOSECONDS, Clock
 from rce.ros.node.publisher import Publisher
 
 TOPIC = "/rosout"
 KIND = "rosgraph_msgs/Log"
+MD5SUM = "acffd30cd6b6de30f120938c17c593fb"
 
 MAX_WAITING = 100
 """How many records are kept for the first listener."""
@@ -24,8 +26,9 @@ class RosoutHandler(logging.Handler):
     Records that come before anybody listens wait for the first listener; the message type is loaded then.
     """
 
-    def __init__(self, publisher: Publisher, node: str) -> None:
+    def __init__(self, publisher: Publisher, node: str, clock: Clock) -> None:
         super().__init__()
+        self._clock = clock
         self._publisher = publisher
         self._node = node
         self._waiting: deque[logging.LogRecord] = deque(maxlen=MAX_WAITING)
@@ -49,7 +52,8 @@ class RosoutHandler(logging.Handler):
     def _publish(self, record: logging.LogRecord) -> None:
         from rce.ros.types import Time
 
-        secs, fraction = divmod(record.created, 1)
+        seconds = self._clock.nanoseconds() / NANOSECONDS if self._clock.simulated else record.created
+        secs, fraction = divmod(seconds, 1)
         self._publisher.publish(
             header={"stamp": Time(int(secs), int(fraction * 1e9))},
             level=next((level for floor, level in _LEVELS if record.levelno >= floor), _DEBUG),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from rce.ros.node.master import MasterClient
 from rce.ros.tasks import TaskScope
@@ -11,6 +11,13 @@ from rce.ros.xmlrpc import RpcClient
 
 if TYPE_CHECKING:
     from rce.ros.types import MessageType, ServiceType, TypeRegistry
+
+
+class TypeName(NamedTuple):
+    """Name and checksum of a message type: enough to take serialized messages."""
+
+    name: str
+    md5sum: str
 
 
 class Types:
@@ -50,3 +57,5 @@ class Runtime:
     master: MasterClient
     scratch: memoryview
     """Read buffer of all TCPROS connections."""
+    intra_process: bool
+    """Whether messages of nodes in this process are taken as objects."""

@@ -48,20 +48,27 @@ class Service:
         self,
         runtime: Runtime,
         name: str,
-        kind: ServiceType,
+        kind: str | ServiceType,
         handler: SerializedHandler,
         release: Callable[[Service], Awaitable[None]],
     ) -> None:
         self.name = name
         """The service's global name."""
-        self.type = kind
         self.calls = 0
         """How many requests came."""
         self._runtime = runtime
+        self._kind = kind
         self._handler = handler
         self._release = release
         self._sessions: set[Session] = set()
         self._closed = False
+
+    @property
+    def type(self) -> ServiceType:
+        """The service's type."""
+        if isinstance(self._kind, str):
+            self._kind = self._runtime.types.service(self._kind)
+        return self._kind
 
     def accept(self, connection: Connection, fields: Mapping[str, str]) -> None:
         """Take a client.

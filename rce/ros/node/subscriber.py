@@ -9,7 +9,9 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rce.ros.errors import NodeClosed
+from rce.ros.node.local import Parcel
 from rce.ros.node.queue import DropOldest
+from rce.ros.node.runtime import TypeName
 from rce.ros.tasks import TaskScope
 from rce.ros.tcpros.framing import LARGE
 
@@ -21,6 +23,12 @@ _log = logging.getLogger(__name__)
 MessageCallback = Callable[[Any], Awaitable[None] | None]
 SerializedCallback = Callable[[bytes, bool], Awaitable[None] | None]
 
+Item = bytes | Parcel
+"""A message that arrived: over a connection, or from a publisher of this process."""
+
+ItemCallback = Callable[[Any, bool], Awaitable[None] | None]
+"""Takes items, or nothing but bytes if the subscriber does not decode."""
+
 
 class Sink(Protocol):
     """What a topic's messages are given to."""
@@ -29,7 +37,7 @@ class Sink(Protocol):
     def dropped(self) -> int:
         """How many messages were dropped, the oldest first, because they were not taken in time."""
 
-    def deliver(self, payload: bytes, latched: bool) -> None:
+    def deliver(self, payload: Item, latched: bool) -> None:
         """Take a message; must neither wait nor raise."""
 
     def end(self) -> None:
@@ -39,7 +47,7 @@ class Sink(Protocol):
 class CallbackSink:
     """Calls a function that is not a coroutine, at once."""
 
-    def __init__(self, callback: Callable[[bytes, bool], object], topic: str) -> None:
+    def __init__(self, callback: ItemCallback, topic: str) -> None:
         self._callback = callback
         self._topic = topic
 
@@ -48,7 +56,7 @@ class CallbackSink:
         """Nothing ever is."""
         return 0
 
-    def deliver(self, payload: bytes, latched: bool) -> None:
+    def deliver(self, payload: Item, latched: bool) -> None:
         """Call."""
         try:
             self._callback(payload, latched)
@@ -63,7 +71,7 @@ class QueueSink:
     """Keeps messages until a task takes them; drops the oldest when they are too many."""
 
     def __init__(self, queue_size: int) -> None:
-        self._queue: DropOldest[tuple[bytes, bool]] = DropOldest(queue_size)
+        self._queue: DropOldest[tuple[Item, bool]] = DropOldest(queue_size)
         self._arrived = asyncio.Event()
         self._ended = False
 
@@ -72,7 +80,7 @@ class QueueSink:
         """How many messages were dropped."""
         return self._queue.dropped
 
-    def deliver(self, payload: bytes, latched: bool) -> None:
+    def deliver(self, payload: Item, latched: bool) -> None:
         """Keep."""
         self._queue.put((payload, latched), len(payload))
         self._arrived.set()
@@ -82,7 +90,7 @@ class QueueSink:
         self._ended = True
         self._arrived.set()
 
-    async def take(self) -> tuple[bytes, bool]:
+    async def take(self) -> tuple[Item, bool]:
         """Wait for the next message.
 
         Raises:
@@ -97,7 +105,7 @@ class QueueSink:
 
 
 async def call_in_order(
-    sink: QueueSink, callback: Callable[[bytes, bool], Awaitable[None]], topic: str
+    sink: QueueSink, callback: Callable[[Any, bool], Awaitable[None]], topic: str
 ) -> None:
     """Give a sink's messages to a coroutine function, one after the other, until the sink ends."""
     while True:
@@ -111,7 +119,7 @@ async def call_in_order(
             _log.exception("the callback of %s failed", topic)
 
 
-def serialized_sink(callback: SerializedCallback, queue_size: int, topic: str, tasks: TaskScope) -> Sink:
+def sink_for(callback: ItemCallback, queue_size: int, topic: str, tasks: TaskScope) -> Sink:
     """Make what gives messages to ``callback``, a function or coroutine function."""
     if not inspect.iscoroutinefunction(callback):
         return CallbackSink(callback, topic)
@@ -120,22 +128,24 @@ def serialized_sink(callback: SerializedCallback, queue_size: int, topic: str, t
     return sink
 
 
-def decode(kind: MessageType, payload: bytes) -> Message:
+def decode(kind: MessageType, payload: Item) -> Message:
     """Read a message. Fields cut out of a view are copied once, out of bytes twice."""
+    if isinstance(payload, Parcel):
+        return payload.message(kind)
     return kind.deserialize(memoryview(payload) if len(payload) >= LARGE else payload)
 
 
-def decoding(kind: MessageType, callback: MessageCallback) -> SerializedCallback:
+def decoding(kind: MessageType, callback: MessageCallback) -> ItemCallback:
     """Turn a callback that takes messages into one that takes their bytes."""
     if inspect.iscoroutinefunction(callback):
 
-        async def decode_and_wait(payload: bytes, latched: bool) -> None:
+        async def decode_and_wait(payload: Item, latched: bool) -> None:
             del latched
             await callback(decode(kind, payload))
 
         return decode_and_wait
 
-    def decode_and_call(payload: bytes, latched: bool) -> None:
+    def decode_and_call(payload: Item, latched: bool) -> None:
         del latched
         callback(decode(kind, payload))
 
@@ -152,17 +162,21 @@ class Subscriber:
     def __init__(
         self,
         topic: str,
-        kind: MessageType | None,
+        kind: MessageType | TypeName | None,
         sink: Sink,
         release: Callable[[Subscriber], Awaitable[None]],
         connected: Callable[[], int],
         changed: asyncio.Event,
+        *,
+        decodes: bool,
     ) -> None:
         self.topic = topic
         """The topic's global name."""
         self.sink = sink
         """Takes what arrives."""
-        self._kind = kind
+        self.decodes = decodes
+        """Whether the sink's messages are read: objects will do."""
+        self._kind = None if isinstance(kind, TypeName) else kind
         self._release = release
         self._connected = connected
         self._changed = changed

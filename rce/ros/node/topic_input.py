@@ -6,13 +6,18 @@ import asyncio
 import logging
 import random
 from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING
 
 from rce.ros.errors import HandshakeRefused, RosError, TcprosError, TypeMismatch
+from rce.ros.node.local import LocalLink, Parcel, find_neighbour
 from rce.ros.node.runtime import Runtime
 from rce.ros.node.subscriber import Subscriber
 from rce.ros.tcpros.connection import Connection
 from rce.ros.tcpros.header import ANY, check_type, decode_header, encode_header, raise_error_field
 from rce.ros.xmlrpc.dispatch import SUCCESS
+
+if TYPE_CHECKING:
+    from rce.ros.node.topics import Topics
 
 _log = logging.getLogger(__name__)
 
@@ -30,10 +35,12 @@ class TopicInput:
         self.kind_name = kind_name
         self.md5sum = md5sum
         self.subscribers: list[Subscriber] = []
-        self.links: list[InputLink] = []
+        self.links: list[InputLink | LocalLink] = []
         self.changed = asyncio.Event()
         self._runtime = runtime
         self._following: dict[str, asyncio.Task[None]] = {}
+        self._orphans: set[str] = set()
+        """Publishers that a restarted master has not named yet: followed until their connection ends."""
 
     def check(self, kind_name: str, md5sum: str) -> None:
         """Check that another subscriber of the node means the same type; the first concrete one counts.
@@ -56,16 +63,31 @@ class TopicInput:
         for subscriber in self.subscribers:
             subscriber.sink.deliver(payload, latched)
 
+    def deliver_parcel(self, parcel: Parcel, latched: bool) -> None:
+        """Give a message of a publisher of this process to all subscribers."""
+        for subscriber in self.subscribers:
+            subscriber.sink.deliver(parcel if subscriber.decodes else parcel.payload(), latched)
+
     def catch_up(self, subscriber: Subscriber) -> None:
         """Give a subscriber that came later the latched messages; they come only once over a connection."""
         for link in self.links:
-            if link.kept is not None:
+            if isinstance(link.kept, Parcel) and not subscriber.decodes:
+                subscriber.sink.deliver(link.kept.payload(), True)
+            elif link.kept is not None:
                 subscriber.sink.deliver(link.kept, True)
 
-    def set_publishers(self, uris: Iterable[str]) -> None:
-        """Follow these publishers, given by their slave APIs, and no others."""
+    def set_publishers(self, uris: Iterable[str], *, of_new_master: bool = False) -> None:
+        """Follow these publishers, given by their slave APIs, and no others.
+
+        Args:
+            uris: The publishers.
+            of_new_master: The master was restarted and may not know all yet: connections that are there stay.
+        """
         wanted = set(uris)
-        for uri in self._following.keys() - wanted:
+        if of_new_master:
+            self._orphans |= {link.uri for link in self.links}
+        self._orphans -= wanted
+        for uri in self._following.keys() - wanted - self._orphans:
             self._following.pop(uri).cancel()
         for uri in wanted - self._following.keys():
             self._following[uri] = self._runtime.tasks.start(
@@ -74,6 +96,7 @@ class TopicInput:
 
     def close(self) -> None:
         """Follow nobody any longer."""
+        self._orphans.clear()
         self.set_publishers(())
 
     async def _follow(self, uri: str) -> None:
@@ -81,15 +104,40 @@ class TopicInput:
         waits = _waits()
         while True:
             link = InputLink(self, uri)
+            neighbour = find_neighbour(uri) if self._runtime.intra_process else None
             try:
-                await self._receive(link)
+                await (self._receive(link) if neighbour is None else self._receive_locally(uri, neighbour))
             except HandshakeRefused as error:
                 _log.warning("no messages of %s from %s: %s", self.topic, uri, error)
             except (RosError, OSError) as error:
                 _log.info("%s from %s: %s", self.topic, uri, str(error) or type(error).__name__)
+            if uri in self._orphans:
+                self._orphans.remove(uri)
+                del self._following[uri]
+                return
             if link.messages:
                 waits = _waits()
             await asyncio.sleep(next(waits))
+
+    async def _receive_locally(self, uri: str, neighbour: Topics) -> None:
+        output = neighbour.outputs.get(self.topic)
+        if output is None:
+            raise TcprosError(f"{uri} does not offer {self.topic}")
+        link = LocalLink(
+            self,
+            uri=uri,
+            publisher=output.node_name,
+            subscriber=self._runtime.name,
+            queue_size=output.queue_size,
+        )
+        output.attach(link, self.md5sum)
+        self.links.append(link)
+        self.changed.set()
+        try:
+            await link.ended
+        finally:
+            self.links.remove(link)
+            output.drop(link)
 
     async def _receive(self, link: InputLink) -> None:
         loop = asyncio.get_running_loop()
@@ -133,6 +181,8 @@ class TopicInput:
 
 class InputLink:
     """One publisher of a topic; owns the connection to it."""
+
+    transport = "TCPROS"
 
     def __init__(self, target: TopicInput, uri: str) -> None:
         self.uri = uri

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from rce.ros.errors import HandshakeRefused, TypeMismatch
 from rce.ros.node.publisher import Publisher, TopicOutput
-from rce.ros.node.runtime import Runtime
+from rce.ros.node.runtime import Runtime, TypeName
 from rce.ros.node.subscriber import Sink, Subscriber
 from rce.ros.node.topic_input import TopicInput
 from rce.ros.tcpros.connection import Connection
@@ -63,15 +63,16 @@ class Topics:
         return publisher
 
     async def subscribe(
-        self, runtime: Runtime, topic: str, kind: MessageType | None, sink: Sink
+        self, runtime: Runtime, topic: str, kind: MessageType | TypeName | None, sink: Sink, *, decodes: bool
     ) -> Subscriber:
         """Make a subscriber; return once the master knows of it. Publishers are connected to after that.
 
         Args:
             runtime: The node's means.
             topic: The topic.
-            kind: Its type; ``None`` for any.
+            kind: Its type; ``None`` for any. Its name and checksum will do if nothing is decoded.
             sink: Takes the messages.
+            decodes: Whether the messages are read: the objects of publishers of this process will do.
 
         Raises:
             TypeMismatch: The node subscribes to the topic with another type already.
@@ -91,7 +92,7 @@ class Topics:
                 source.close()
                 await runtime.master.unregister_subscriber(topic)
 
-        subscriber = Subscriber(topic, kind, sink, release, source.connected, source.changed)
+        subscriber = Subscriber(topic, kind, sink, release, source.connected, source.changed, decodes=decodes)
         source.subscribers = [*source.subscribers, subscriber]  # a new list: one may be in use by a delivery
         if is_first:
             try:
@@ -121,12 +122,13 @@ class Topics:
         info: list[list[object]] = []
         for topic, output in self.outputs.items():
             info += [
-                [_id(link), link.subscriber, "o", "TCPROS", topic, True, str(link.connection)]
-                for link in output.links
+                [_id(link), link.subscriber, "o", link.transport, topic, True, link.description]
+                for link in output.all_links
             ]
         for topic, source in self.inputs.items():
             info += [
-                [_id(link), link.uri, "i", "TCPROS", topic, True, link.publisher] for link in source.links
+                [_id(link), link.uri, "i", link.transport, topic, True, link.publisher]
+                for link in source.links
             ]
         return info
 
@@ -135,8 +137,8 @@ class Topics:
         return [
             [
                 topic,
-                sum(link.bytes_out for link in output.links),
-                [[_id(link), link.bytes_out, link.messages, True] for link in output.links],
+                sum(link.bytes_out for link in output.all_links),
+                [[_id(link), link.bytes_out, link.messages, True] for link in output.all_links],
             ]
             for topic, output in self.outputs.items()
         ]

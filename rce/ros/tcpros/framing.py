@@ -39,6 +39,11 @@ def frame(payload: bytes | bytearray | memoryview) -> Chunks:
     return (length, payload)  # type: ignore[return-value]
 
 
+def payload_of(chunks: Chunks) -> bytes:
+    """Return what :func:`frame` was given."""
+    return chunks[1] if len(chunks) > 1 else chunks[0][_LENGTH.size :]
+
+
 def answer_frame(payload: bytes | bytearray | memoryview, *, ok: bool) -> Chunks:
     """Make the frame of a service's answer: a response if ``ok``, else an error text."""
     head = (b"\x01" if ok else b"\x00") + _LENGTH.pack(len(payload))

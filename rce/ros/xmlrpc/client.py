@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import socket
 from collections.abc import Sequence
 from http import HTTPStatus
 from types import TracebackType
@@ -78,6 +79,25 @@ class RpcClient:
         except (OSError, h11.ProtocolError, EOFError, ValueError) as error:
             raise RpcUnreachable(uri, str(error) or type(error).__name__) from error
         return decode_response(answer)
+
+    async def until_lost(self, uri: str) -> None:
+        """Wait until the server at ``uri`` goes away: until a connection made for nothing else is lost.
+
+        Raises:
+            RpcUnreachable: It is away already.
+        """
+        try:
+            reader, writer = await asyncio.open_connection(*_address(uri))
+        except (OSError, ValueError) as error:
+            raise RpcUnreachable(uri, str(error)) from error
+        _keep_alive(writer.get_extra_info("socket"))
+        try:
+            with contextlib.suppress(OSError):  # lost, whatever the reason
+                await reader.read(1)
+        finally:
+            writer.transport.abort()
+            with contextlib.suppress(OSError):
+                await writer.wait_closed()
 
     async def _exchange(self, uri: str, document: bytes) -> bytes:
         address = _address(uri)
@@ -178,6 +198,14 @@ class _Connection:
                     raise ValueError(f"the answer is longer than {MAX_ANSWER} bytes")
             elif isinstance(event, h11.EndOfMessage):
                 return bytes(body)
+
+
+def _keep_alive(connection: socket.socket) -> None:
+    """Let the system notice within half a minute that the other machine vanished without a word."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 4)):
+        if hasattr(socket, option):
+            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
 
 
 def _address(uri: str) -> tuple[str, int]:

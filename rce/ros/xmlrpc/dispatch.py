@@ -18,7 +18,10 @@ from rce.ros.xmlrpc.codec import decode_call, encode_fault, encode_response
 _log = logging.getLogger(__name__)
 
 Method = Callable[..., Any]
-"""A method of an API: takes the caller's name first, returns ``(status, message, value)``. Must not block."""
+"""A method of an API; must not block.
+
+It takes the caller's name first if it takes anything, and returns ``(status, message, value)``.
+"""
 
 ERROR, FAILURE, SUCCESS = -1, 0, 1
 MAX_MULTICALL = 10_000
@@ -69,14 +72,14 @@ class Dispatcher:
         except BadArgument as error:
             return ERROR, f"{method}: {error}", 0
         except Exception as error:  # noqa: BLE001 - a caller is answered, whatever happens
-            _log.exception("%s failed for %s", method, arguments[0])
+            _log.exception("%s failed for %s", method, arguments[0] if arguments else "?")
             return FAILURE, f"internal failure: {error}", 0
 
     def _check(self, method: str, arguments: Sequence[Any]) -> None:
         at_least, at_most = self._arity[method]
         if not at_least <= len(arguments) <= at_most:
             raise BadArgument(f"takes {at_least} arguments, not {len(arguments)}")
-        if not isinstance(arguments[0], str):
+        if arguments and not isinstance(arguments[0], str):
             raise BadArgument("the caller's id must be a string")
 
     def _multicall(self, arguments: Sequence[Any]) -> list[Any]:

@@ -26,7 +26,8 @@ async def core() -> AsyncIterator[Core]:
 
 @pytest.fixture
 def make_node(core: Core) -> Callable[..., Node]:
-    return partial(Node, argv=[], master_uri=core.uri)
+    """Nodes that talk over sockets, as those of several processes do."""
+    return partial(Node, argv=[], master_uri=core.uri, intra_process=False)
 
 
 # libuv keeps one pipe for signals from its first loop on; here, it is none of a test's leaks.

@@ -36,7 +36,8 @@ async def test_parameters(core: Core, make_node: MakeNode) -> None:
             await a.get_param("rel/list")
         with pytest.raises(ParameterMissing):
             await a.delete_param("rel/list")
-        assert set(await a.get_param_names()) == {
+        names = {name for name in await a.get_param_names() if not name.startswith("/roslaunch/uris/host_")}
+        assert names == {
             "/rosdistro", "/rosversion", "/run_id", "/ns/a/gain", "/ns/rel/deep/text",
         }  # fmt: skip
         assert core.get_param("/ns/a/gain") == 2.5

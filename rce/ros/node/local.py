@@ -1,0 +1,146 @@
+"""Messages between nodes of one process: handed over as objects, not written and read again.
+
+What is delivered is the very object that was published, to every subscriber of the process. Neither side may
+change it afterwards; who wants another message makes another one. Delivery is as with a connection otherwise:
+in order, not within the call that publishes, and the oldest messages are dropped if they are too many.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Protocol
+
+from rce.ros.node.queue import DropOldest
+
+if TYPE_CHECKING:
+    from rce.ros.node.topics import Topics
+    from rce.ros.types import Message, MessageType
+
+TRANSPORT = "INTRAPROCESS"
+"""What the slave API calls it; roscpp's word."""
+
+_neighbours: dict[str, tuple[asyncio.AbstractEventLoop, Topics]] = {}
+"""Topics of all nodes of this process that deliver locally, by their slave APIs."""
+
+
+@contextmanager
+def neighbour(uri: str, topics: Topics) -> Iterator[None]:
+    """Let the other nodes of this event loop take a node's messages without a connection."""
+    _neighbours[uri] = (asyncio.get_running_loop(), topics)
+    try:
+        yield
+    finally:
+        del _neighbours[uri]
+
+
+def find_neighbour(uri: str) -> Topics | None:
+    """Return the topics of the node whose slave API is ``uri`` if it runs in this event loop."""
+    loop, topics = _neighbours.get(uri, (None, None))
+    return topics if loop is asyncio.get_running_loop() else None
+
+
+class Parcel:
+    """A published message, as an object, as bytes, or both; each is made of the other when asked for."""
+
+    __slots__ = ("_kind", "_message", "_payload")
+
+    def __init__(
+        self, kind: MessageType | None, message: Message | None = None, payload: bytes | None = None
+    ) -> None:
+        assert payload is not None or (kind is not None and message is not None)
+        self._kind = kind
+        self._message = message
+        self._payload = payload
+
+    def __len__(self) -> int:
+        """Bytes that the message has on the wire, 0 while it was not written."""
+        return 0 if self._payload is None else len(self._payload)
+
+    def payload(self) -> bytes:
+        """Return the serialized message."""
+        if self._payload is None:
+            assert self._kind is not None
+            assert self._message is not None
+            self._payload = bytes(self._kind.serialize(self._message))
+        return self._payload
+
+    def message(self, kind: MessageType) -> Message:
+        """Return the message as an object of a type with the same checksum."""
+        if self._message is None or self._message.__class__ is not kind.cls:
+            return kind.deserialize(self.payload())
+        return self._message
+
+
+class Taker(Protocol):
+    """What a local link's messages are given to."""
+
+    def deliver_parcel(self, parcel: Parcel, latched: bool) -> None:
+        """Take a message; must neither wait nor raise."""
+
+
+class LocalLink:
+    """A publisher's and a subscriber's topic of one process, seen from both sides.
+
+    Attributes:
+        uri: The publisher's slave API.
+        publisher: The publishing node's name.
+        subscriber: The subscribing node's name.
+        messages: How many messages were delivered.
+        bytes_in: Bytes of those that were serialized for some reason.
+        bytes_out: The same.
+        kept: The newest message of a latching publisher.
+        ended: Done when the publisher's topic is closed.
+    """
+
+    is_greeted = True
+    transport = TRANSPORT
+
+    def __init__(self, taker: Taker, *, uri: str, publisher: str, subscriber: str, queue_size: int) -> None:
+        self.uri = uri
+        self.publisher = publisher
+        self.subscriber = subscriber
+        self.messages = 0
+        self.bytes_in = 0
+        self.kept: Parcel | None = None
+        loop = asyncio.get_running_loop()
+        self.ended: asyncio.Future[None] = loop.create_future()
+        self._loop = loop
+        self._taker = taker
+        self._queue: DropOldest[tuple[Parcel, bool]] = DropOldest(queue_size)
+
+    @property
+    def bytes_out(self) -> int:
+        """Bytes sent: all are received."""
+        return self.bytes_in
+
+    @property
+    def dropped(self) -> int:
+        """How many messages were dropped because too many were published at once."""
+        return self._queue.dropped
+
+    @property
+    def description(self) -> str:
+        """What the slave API says of the connection."""
+        return f"{TRANSPORT} {self.publisher} to {self.subscriber}"
+
+    def send(self, parcel: Parcel, *, latched: bool) -> None:
+        """Queue a message; it is delivered as soon as the event loop is free."""
+        if not self._queue:
+            self._loop.call_soon(self._deliver)
+        self._queue.put((parcel, latched), len(parcel))
+
+    def end(self) -> None:
+        """End the link from the publisher's side; what waits is delivered still."""
+        if not self.ended.done():
+            self.ended.set_result(None)
+
+    def _deliver(self) -> None:
+        while self._queue:
+            parcel, latched = self._queue.take()
+            self.messages += 1
+            self.bytes_in += len(parcel)
+            if latched:
+                self.kept = parcel
+            self._taker.deliver_parcel(parcel, latched)

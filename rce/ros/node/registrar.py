@@ -1,0 +1,133 @@
+"""Keeps a node registered at its master: one that was restarted, or forgot, is told everything again.
+
+A restarted master knows nobody. Nodes notice by a connection that they hold to it for this purpose, and by
+asking now and then whether the master still knows them; parameter ``/run_id`` tells one life of a core from
+the next.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import random
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from rce.ros.errors import MasterError, MasterRefused, MasterUnreachable, RpcUnreachable
+from rce.ros.node.master import MasterClient
+from rce.ros.node.parameters import Parameters
+from rce.ros.node.service import Service
+from rce.ros.node.topics import Topics
+
+_log = logging.getLogger(__name__)
+
+CHECK_INTERVAL = 30.0
+"""Seconds after which the master is asked whether it knows the node, although no connection was lost."""
+
+RETRY_FIRST = 0.1
+RETRY_MOST = 3.0
+"""Seconds between attempts to reach a master that is away: the first wait and the longest."""
+
+RUN_ID = "/run_id"
+
+
+@dataclass(slots=True)
+class Registrar:
+    """Does it for one node."""
+
+    master: MasterClient
+    topics: Topics
+    services: dict[str, Service]
+    parameters: Parameters
+    service_uri: str
+    private_parameters: dict[str, Any]
+    """Parameters that the command line set, by global name."""
+    on_displaced: Callable[[str], None]
+    """Takes the reason when another node has this one's name."""
+    _run_id: Any = field(default=None, init=False)
+
+    async def register_all(self) -> None:
+        """Tell the master of all topics, services and parameters of the node.
+
+        Raises:
+            MasterError: The master cannot be told.
+        """
+        master, topics = self.master, self.topics
+        for topic, output in list(topics.outputs.items()):
+            await master.register_publisher(topic, output.kind_name)
+            if topic not in topics.outputs:  # closed meanwhile
+                await master.unregister_publisher(topic)
+        for topic, source in list(topics.inputs.items()):
+            publishers = await master.register_subscriber(topic, source.kind_name)
+            if topics.inputs.get(topic) is source:
+                source.set_publishers(publishers, of_new_master=True)
+            else:
+                await master.unregister_subscriber(topic)
+        for name in list(self.services):
+            await master.register_service(name, self.service_uri)
+            if name not in self.services:
+                await master.unregister_service(name, self.service_uri)
+        await self.parameters.renew()
+
+    async def keep(self) -> None:
+        """Watch the master for as long as the node lives."""
+        await self._until_reached(self._remember_run)
+        while True:
+            was_lost = await self._until_in_doubt()
+            await self._until_reached(lambda was_lost=was_lost: self._check(was_lost=was_lost))  # type: ignore[misc]
+
+    async def _until_in_doubt(self) -> bool:
+        """Wait until there is reason to look; tell whether the connection to the master was lost."""
+        try:
+            async with asyncio.timeout(CHECK_INTERVAL * random.uniform(0.75, 1.25)):  # noqa: S311 - no secret
+                await self.master.rpc.until_lost(self.master.uri)
+        except TimeoutError:
+            return False
+        except RpcUnreachable as error:
+            _log.debug("%s", error)
+        return True
+
+    async def _until_reached(self, attempt: Callable[[], Awaitable[None]]) -> None:
+        for wait in _waits():
+            try:
+                await attempt()
+            except MasterUnreachable as error:
+                _log.debug("%s; trying again", error)
+            except MasterError as error:
+                _log.warning("%s does not take %s back: %s", self.master.uri, self.master.caller, error)
+            else:
+                return
+            await asyncio.sleep(wait)
+
+    async def _check(self, *, was_lost: bool) -> None:
+        master = self.master
+        uri = await master.lookup_node(master.caller)
+        if uri not in (None, master.slave_uri):
+            self.on_displaced(f"another node at {uri} has its name")
+            return
+        run_id = await self._ask_run_id()
+        if was_lost or uri is None or run_id != self._run_id:
+            if run_id != self._run_id:
+                _log.info("%s is another core now: %s registers again", master.uri, master.caller)
+                for name, value in self.private_parameters.items():
+                    await self.parameters.set(name, value)
+            await self.register_all()
+            self._run_id = run_id
+
+    async def _remember_run(self) -> None:
+        self._run_id = await self._ask_run_id()
+
+    async def _ask_run_id(self) -> Any:
+        try:
+            return await self.master.call("getParam", RUN_ID)
+        except MasterRefused:
+            return None  # a bare rosmaster has none
+
+
+def _waits() -> Iterator[float]:
+    """Yield growing waits, jittered so that not all nodes come back at once."""
+    wait = RETRY_FIRST
+    while True:
+        yield wait * random.uniform(0.5, 1.0)  # noqa: S311 - no secret
+        wait = min(RETRY_MOST, 2 * wait)

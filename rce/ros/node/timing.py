@@ -1,0 +1,117 @@
+"""Doing things at a rate, in ROS time: :class:`Rate` in a loop of one's own, :class:`Timer` beside it."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import logging
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import NamedTuple
+
+from rce.ros.node.clock import NANOSECONDS, Clock
+from rce.ros.tasks import TaskScope
+
+_log = logging.getLogger(__name__)
+
+
+class Rate:
+    """Keeps a loop at a rate. Made by :meth:`rce.ros.node.Node.rate`.
+
+    ``async for _ in node.rate(10): ...`` or ``while await rate.sleep(): ...``; both end with the node. Time
+    that the loop's body takes does not shift the beat; a beat that is missed altogether is left out.
+    """
+
+    def __init__(self, clock: Clock, hz: float) -> None:
+        if hz <= 0:
+            raise ValueError(f"a rate is positive, not {hz}")
+        self.period = 1.0 / hz
+        """Seconds."""
+        self._clock = clock
+        self._step = round(NANOSECONDS / hz)
+        self._last = clock.nanoseconds()
+
+    @property
+    def remaining(self) -> float:
+        """Seconds until the next beat; negative if it was missed."""
+        return (self._last + self._step - self._clock.nanoseconds()) / NANOSECONDS
+
+    async def sleep(self) -> bool:
+        """Sleep until the next beat.
+
+        Returns:
+            Whether the node goes on.
+        """
+        self._last = min(self._last, self._clock.nanoseconds())  # time may have jumped back
+        goes_on = await self._clock.sleep_until(self._last + self._step)
+        self._last += self._step
+        now = self._clock.nanoseconds()
+        if not self._last <= now <= self._last + self._step:
+            self._last = now
+        return goes_on
+
+    async def __aiter__(self) -> AsyncIterator[int]:
+        """Count the beats, the first at once."""
+        beat = 0
+        while True:
+            yield beat
+            beat += 1
+            if not await self.sleep():
+                return
+
+
+class TimerEvent(NamedTuple):
+    """What a timer's callback is told; all in seconds."""
+
+    expected: float
+    """When the call was due, in ROS time."""
+    now: float
+    """When it is made."""
+    last: float | None
+    """When the call before was made."""
+
+
+TimerCallback = Callable[[TimerEvent], Awaitable[None] | None]
+
+
+class Timer:
+    """Calls a function at a rate. Made by :meth:`rce.ros.node.Node.timer`; runs until the node stops.
+
+    A coroutine function is awaited before the next call; calls that are missed meanwhile are left out. What
+    it raises is logged.
+    """
+
+    def __init__(
+        self, clock: Clock, period: float, callback: TimerCallback, tasks: TaskScope, *, oneshot: bool
+    ) -> None:
+        if period <= 0:
+            raise ValueError(f"a timer's period is positive, not {period}")
+        self.calls = 0
+        """How many calls were made."""
+        self._clock = clock
+        self._rate = Rate(clock, 1.0 / period)
+        self._callback = callback
+        self._oneshot = oneshot
+        self._task: asyncio.Task[None] = tasks.start(self._run(), name="timer")
+
+    def stop(self) -> None:
+        """Make no more calls; one that is being made is cancelled."""
+        self._task.cancel()
+
+    async def _run(self) -> None:
+        last: float | None = None
+        expected = self._clock.nanoseconds() / NANOSECONDS + self._rate.remaining
+        while await self._rate.sleep():
+            now = self._clock.nanoseconds() / NANOSECONDS
+            await self._call(TimerEvent(expected, now, last))
+            if self._oneshot:
+                return
+            last, expected = now, self._clock.nanoseconds() / NANOSECONDS + self._rate.remaining
+
+    async def _call(self, event: TimerEvent) -> None:
+        self.calls += 1
+        try:
+            result = self._callback(event)
+            if inspect.isawaitable(result):
+                await result
+        except Exception:  # noqa: BLE001 - the program's own fault, which must not stop the timer
+            _log.exception("the callback of a timer failed")

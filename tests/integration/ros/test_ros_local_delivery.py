@@ -1,0 +1,112 @@
+"""Messages between nodes of one process: the objects themselves, without connections."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import pytest
+
+from rce.ros.core import Core
+from rce.ros.node import Node
+from rce.ros.types import TypeRegistry
+from rce.ros.xmlrpc import RpcClient
+
+STRING = "std_msgs/String"
+
+
+@pytest.fixture
+def near(core: Core) -> Callable[..., Node]:
+    return partial(Node, argv=[], master_uri=core.uri)
+
+
+async def test_the_object_itself_is_delivered(near: Callable[..., Node]) -> None:
+    types = TypeRegistry()
+    async with near("a", types=types) as a, near("b", types=types) as b:
+        got: asyncio.Queue[Any] = asyncio.Queue()
+        raw: asyncio.Queue[tuple[bytes, bool]] = asyncio.Queue()
+        await b.subscribe("t", STRING, got.put_nowait)
+        publisher = await a.advertise("t", STRING)
+        await publisher.wait_for_subscribers(timeout=10)
+        message = publisher.type.new(data="hello")
+        publisher.publish(message)
+        assert got.empty(), "nothing is delivered within the call that publishes"
+        assert await asyncio.wait_for(got.get(), 10) is message
+        await b.subscribe_serialized("t", "*", lambda payload, latched: raw.put_nowait((payload, latched)))
+        publisher.publish(message)
+        assert await asyncio.wait_for(raw.get(), 10) == (b"\x05\0\0\0hello", False)
+        assert await got.get() is message
+        publisher.publish_serialized(bytearray(b"\x03\0\0\0raw"))
+        assert await asyncio.wait_for(raw.get(), 10) == (b"\x03\0\0\0raw", False)
+        assert (await got.get()).data == "raw"
+        publisher.publish({"data": "mapping"})
+        assert (await asyncio.wait_for(got.get(), 10)).data == "mapping"
+
+
+async def test_near_and_far_subscribers_get_the_same(core: Core, near: Callable[..., Node]) -> None:
+    async with near("a") as a, near("b") as b, near("far", intra_process=False) as far:
+        publisher = await a.advertise("t", STRING, latch=True)
+        nearby, distant = await b.subscribe("t", STRING), await far.subscribe("t", STRING)
+        await publisher.wait_for_subscribers(2, timeout=10)
+        assert publisher.connections == 2
+        publisher.publish(publisher.type.new(data="one"))
+        publisher.publish(data="two")
+        for subscriber in (nearby, distant):
+            async with asyncio.timeout(10):
+                assert [(await anext(aiter(subscriber))).data for _ in range(2)] == ["one", "two"]
+        late, later = await b.subscribe("t", STRING), await b.subscribe_serialized("t", "*", lambda *_: None)
+        assert (await asyncio.wait_for(anext(aiter(late)), 10)).data == "two"
+        await later.close()
+        async with RpcClient() as rpc:
+            _, _, info = await rpc.call(b.uri, "getBusInfo", ("/x",))
+            assert [entry[1:5] for entry in info] == [[a.uri, "i", "INTRAPROCESS", "/t"]]
+            _, _, (published, _, _) = await rpc.call(a.uri, "getBusStats", ("/x",))
+            assert [[link[2] for link in entry[2]] for entry in published if entry[0] == "/t"] == [[2, 2]]
+
+
+async def test_a_late_node_gets_the_latched_message(near: Callable[..., Node]) -> None:
+    async with near("a") as a, near("b") as b:
+        publisher = await a.advertise("t", STRING, latch=True)
+        publisher.publish(data="kept")
+        heard: asyncio.Queue[tuple[bytes, bool]] = asyncio.Queue()
+        await b.subscribe_serialized("t", STRING, lambda *message: heard.put_nowait(message))
+        assert await asyncio.wait_for(heard.get(), 10) == (b"\x04\0\0\0kept", True)
+
+
+async def test_too_many_at_once_lose_the_oldest(near: Callable[..., Node]) -> None:
+    async with near("a") as a:
+        publisher = await a.advertise("t", STRING, queue_size=3)
+        subscriber = await a.subscribe("t", STRING)
+        await publisher.wait_for_subscribers(timeout=10)
+        for number in range(10):
+            publisher.publish(data=str(number))
+        async with asyncio.timeout(10):
+            assert [(await anext(aiter(subscriber))).data for _ in range(3)] == ["7", "8", "9"]
+        assert publisher.dropped == 7
+
+
+async def test_types_must_agree(near: Callable[..., Node], caplog: pytest.LogCaptureFixture) -> None:
+    async with near("a") as a, near("b") as b:
+        publisher = await a.advertise("t", STRING)
+        wrong = await b.subscribe("t", "std_msgs/Bool")
+        with pytest.raises(TimeoutError):
+            await wrong.wait_for_publishers(timeout=0.2)
+        assert "md5 sum" in caplog.text
+        assert publisher.connections == 0
+
+
+async def test_publishers_come_and_go(near: Callable[..., Node]) -> None:
+    async with near("b") as b:
+        subscriber = await b.subscribe("t", STRING)
+        for incarnation in ("first", "second"):
+            async with near("a") as a:
+                publisher = await a.advertise("t", STRING)
+                await publisher.wait_for_subscribers(timeout=10)
+                publisher.publish(data=incarnation)
+                assert (await asyncio.wait_for(anext(aiter(subscriber)), 10)).data == incarnation
+        await subscriber.close()
+        async with near("a") as a:
+            publisher = await a.advertise("t", STRING)
+            assert publisher.connections == 0

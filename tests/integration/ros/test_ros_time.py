@@ -1,0 +1,117 @@
+"""ROS time: simulated and real, with rates, timers and sleeping."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+from rce.ros.core import Core
+from rce.ros.node import Node, Publisher, TimerEvent
+from rce.ros.node.clock import CLOCK
+from rce.ros.types import Time, TypeRegistry
+
+MakeNode = Callable[..., Node]
+
+
+def test_the_clock_has_the_checksum_of_its_type() -> None:
+    assert TypeRegistry().message(CLOCK.name).md5sum == CLOCK.md5sum
+
+
+async def tick(publisher: Publisher, node: Node, seconds: float) -> None:
+    """Set the time, and wait until a node knows."""
+    publisher.publish(clock=Time.from_sec(seconds))
+    async with asyncio.timeout(10):
+        while node.time() != seconds:
+            await asyncio.sleep(0)
+
+
+async def test_time_is_simulated(core: Core, make_node: MakeNode) -> None:
+    core.set_param("/use_sim_time", True)
+    async with make_node("sim") as sim, make_node("a") as a:
+        publisher = await sim.advertise("/clock", "rosgraph_msgs/Clock")
+        await publisher.wait_for_subscribers(2, timeout=10)
+        assert a.is_time_simulated
+        assert a.now() == Time(0, 0)
+        await tick(publisher, a, 10.5)
+        assert a.now() == Time(10, 500_000_000)
+
+        sleeper = asyncio.create_task(a.sleep(100.0))
+        beats: list[float] = []
+        calls: list[TimerEvent] = []
+
+        async def beat() -> None:
+            async for _ in a.rate(1.0):
+                beats.append(a.time())  # noqa: PERF401 - one by one, as they come
+
+        beating = asyncio.create_task(beat())
+        a.timer(2.0, calls.append)
+        once = a.timer(1.0, lambda event: None, oneshot=True)
+        await asyncio.sleep(0)
+        for second in range(11, 16):
+            await tick(publisher, a, float(second) + 0.5)
+            await asyncio.sleep(0)
+            await asyncio.sleep(0)
+        assert beats == [10.5, 11.5, 12.5, 13.5, 14.5, 15.5]
+        assert [(call.now, call.expected, call.last) for call in calls] == [
+            (12.5, 12.5, None),
+            (14.5, 14.5, 12.5),
+        ]
+        assert once.calls == 1
+        assert not sleeper.done()
+        await tick(publisher, a, 111.0)
+        assert await sleeper
+
+        long = asyncio.create_task(a.sleep(1000.0))
+        await asyncio.sleep(0)
+        await tick(publisher, a, 5.0)
+        assert await long, "time that jumps back wakes sleepers"
+        await tick(publisher, a, 6.0)
+        beating.cancel()
+        await asyncio.gather(beating, return_exceptions=True)
+
+        asleep = asyncio.create_task(a.sleep(1000.0))
+        await asyncio.sleep(0)
+        a.shutdown()
+        assert not await asleep
+        assert not await a.sleep(0)
+
+
+async def test_log_records_carry_simulated_time(core: Core, make_node: MakeNode) -> None:
+    core.set_param("/use_sim_time", True)
+    async with make_node("sim") as sim, make_node("a") as a:
+        publisher = await sim.advertise("/clock", "rosgraph_msgs/Clock")
+        await publisher.wait_for_subscribers(2, timeout=10)
+        await tick(publisher, a, 7.25)
+        heard = await sim.subscribe("/rosout", "rosgraph_msgs/Log")
+        a.log.info("hello")
+        async with asyncio.timeout(10):
+            async for record in heard:
+                if record.name == "/a":
+                    assert record.header.stamp == Time(7, 250_000_000)
+                    break
+
+
+async def test_real_time(make_node: MakeNode) -> None:
+    async with make_node("a") as a:
+        assert not a.is_time_simulated
+        assert abs(a.time() - Time.now().to_sec()) < 10
+        called = asyncio.Event()
+
+        async def fail_first(event: TimerEvent) -> None:
+            if event.last is None:
+                raise RuntimeError("as planned")
+            called.set()
+
+        timer = a.timer(0.01, fail_first)
+        await asyncio.wait_for(called.wait(), 10)
+        timer.stop()
+        rate = a.rate(200.0)
+        before = a.time()
+        for _ in range(3):
+            assert await rate.sleep()
+        assert a.time() - before >= 0.014
+        asleep = asyncio.create_task(a.sleep(1000.0))
+        await asyncio.sleep(0)
+        a.shutdown()
+        assert not await asyncio.wait_for(asleep, 10)
+        assert not await rate.sleep()
