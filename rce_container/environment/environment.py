@@ -78,7 +78,7 @@ class Environment:
         """Live; returns when every process, socket and task of the container has ended."""
         async with contextlib.AsyncExitStack() as stack:
             reaper = stack.enter_context(Reaper())
-            self._core = await stack.enter_async_context(Core("127.0.0.1", self._boot.ros_port))
+            self._core = await stack.enter_async_context(Core("127.0.0.1", self._boot.ros_port, rosout=True))
             types = TypeRegistry(self._packages)
             node = await stack.enter_async_context(
                 Node(NODE_NAME, argv=[], master_uri=self._core.uri, types=types)
