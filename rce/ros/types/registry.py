@@ -5,9 +5,10 @@ from __future__ import annotations
 import re
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from rce.ros.packages import PackageIndex
+from rce.ros.types.action import action_names, parse_action
 from rce.ros.types.definition import SEPARATOR, Definition, parse_message, parse_service, split_full_text
 from rce.ros.types.exceptions import BadDefinition, UnknownType
 from rce.ros.types.message import MessageType, ServiceType
@@ -16,14 +17,24 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 _NAME = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/([A-Za-z][A-Za-z0-9_]*)")
-_PART = re.compile(r"(MSG|SRV): (\S+)\n")
+_PART = re.compile(r"(MSG|SRV|ACTION): (\S+)\n")
+
+
+class _Text(NamedTuple):
+    """A definition that was found."""
+
+    text: str
+    source: str
+    first_line: int = 1
+    """Number of the text's first line in its source."""
 
 
 class TypeRegistry:
     """Finds types by name and makes each once.
 
-    A definition is looked for in the packages first (``PKG/msg/Type.msg``, ``PKG/srv/Type.srv``), then among
-    the built-in ones of the common ROS packages, then among those learned with :meth:`from_definition`.
+    A definition is looked for in the packages first (``PKG/msg/Type.msg``, ``PKG/srv/Type.srv``, and
+    ``PKG/action/Type.action`` for the message types of actions), then among the built-in ones of the common
+    ROS packages, then among those learned with :meth:`from_definition`.
 
     Args:
         packages: Where to look for packages; None: on the paths that the environment names
@@ -65,7 +76,7 @@ class TypeRegistry:
         """
         found = self._services.get(name)
         if found is None:
-            text, source = self._text(name, "srv")
+            text, source, _ = self._text(name, "srv")
             request, response = (
                 MessageType(part, self.message) for part in parse_service(name, text, source)
             )
@@ -97,11 +108,11 @@ class TypeRegistry:
         return kind
 
     def _definition(self, name: str) -> Definition:
-        text, source = self._text(name, "msg")
-        return parse_message(name, text, source)
+        text, source, first_line = self._text(name, "msg")
+        return parse_message(name, text, source, first_line)
 
-    def _text(self, name: str, kind: str) -> tuple[str, str]:
-        """Return the definition text of ``name`` and where it is from."""
+    def _text(self, name: str, kind: str) -> _Text:
+        """Return the definition text of ``name``."""
         match = _NAME.fullmatch(name)
         if match is None:
             raise UnknownType(name, "a type is named package/Type")
@@ -112,13 +123,16 @@ class TypeRegistry:
         else:
             file = folder / kind / f"{type_name}.{kind}"
             if file.is_file():
-                return _read(file.read_bytes(), str(file)), str(file)
+                return _Text(_read(file.read_bytes(), str(file)), str(file))
+            part = _action_text(folder, type_name) if kind == "msg" else None
+            if part is not None:
+                return part
             hint = f"there is no file {file}"
         text = builtin_definitions().get((kind, name))
         if text is None:
             builtin = "messages" if kind == "msg" else "services"
             raise UnknownType(name, f"{hint}, and it is not among the built-in {builtin}")
-        return text, name
+        return _Text(text, name)
 
 
 class _Builder:
@@ -145,6 +159,16 @@ class _Builder:
         return kind
 
 
+def _action_text(folder: Path, type_name: str) -> _Text | None:
+    """Return the text of a message type of an action that is defined in a package's folder."""
+    for action, suffix in action_names(type_name):
+        file = folder / "action" / f"{action}.action"
+        if file.is_file():
+            parts = parse_action(action, _read(file.read_bytes(), str(file)), str(file))
+            return _Text(parts[suffix].text, str(file), parts[suffix].first_line)
+    return None
+
+
 def _read(data: bytes, source: str) -> str:
     try:
         return data.decode()
@@ -156,9 +180,14 @@ def _read(data: bytes, source: str) -> str:
 def builtin_definitions() -> dict[tuple[str, str], str]:
     """Return the definitions that ship with the package: ``("msg" | "srv", name) -> text``."""
     text = Path(__file__).with_name("definitions.txt").read_text("utf-8")
-    found = {}
-    for part in text.split(SEPARATOR + "\n")[1:]:
-        match = _PART.match(part)
-        assert match is not None, part[:80]
-        found[match[1].lower(), match[2]] = part[match.end() :]
+    found: dict[tuple[str, str], str] = {}
+    for section in text.split(SEPARATOR + "\n")[1:]:
+        match = _PART.match(section)
+        assert match is not None, section[:80]
+        kind, name, definition = match[1], match[2], section[match.end() :]
+        if kind == "ACTION":
+            parts = parse_action(name.rpartition("/")[2], definition, name)
+            found |= {("msg", name + suffix): part.text for suffix, part in parts.items()}
+        else:
+            found[kind.lower(), name] = definition
     return found
