@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 from time import perf_counter
 from typing import Any
@@ -20,7 +19,7 @@ async def start_times(running: RunningEngine, *, count: int) -> list[dict[str, A
     async with robot(running.url, "starter") as client:
         for number in range(count):
             start = perf_counter()
-            await _create(client, f"start{number}")
+            await _create(client, [f"start{number}"])
             await client.wait_active(f"request{number}", f"response{number}")
             await client.send_forwarded(f"request{number}", serialized_string(5))
             await client.receive_binary()
@@ -33,8 +32,7 @@ async def many(running: RunningEngine, *, count: int) -> list[dict[str, Any]]:
     """Create many at once, until every one's node has answered; then what they weigh while idle."""
     async with robot(running.url, "crowd") as client:
         start = perf_counter()
-        for number in range(count):
-            await _create(client, f"crowd{number}")
+        await _create(client, [f"crowd{number}" for number in range(count)])
         await client.wait_active(
             *(f"request{n}" for n in range(count)), *(f"response{n}" for n in range(count)), timeout=300
         )
@@ -75,23 +73,22 @@ def _weight_of_each(running: RunningEngine, count: int) -> dict[str, float]:
     return {f"{kind} PSS MB": round(weight / count / 1e6, 1) for kind, weight in weights.items()}
 
 
-async def _create(client: Robot, container: str) -> None:
-    number = container.lstrip("abcdefghijklmnopqrstuvwxyz")
-    interfaces = []
-    for tag, inside, outside, address in (
-        ("request", "Publisher", "Subscriber", "/stringEchoReq"),
-        ("response", "Subscriber", "Publisher", "/stringEchoResp"),
-    ):
-        common = {"interfaceTag": f"{tag}{number}", "className": STRING}
-        interfaces += [
-            {"endpointTag": container, "interfaceType": f"{inside}Interface", "addr": address, **common},
-            {"endpointTag": client.name, "interfaceType": f"{outside}Forwarder", **common},
-        ]
-    node = {"containerTag": container, "nodeTag": "echo", "pkg": "Test", "exe": "stringEcho.py"}
-    await client.send("CC", {"containerTag": container})
-    await client.send("CN", {"addNodes": [node], "addInterfaces": interfaces})
-    tags = [f"{tag}{number}" for tag in ("request", "response")]
-    await client.send(
-        "CX", {"connect": [{"tagA": f"{client.name}/{t}", "tagB": f"{container}/{t}"} for t in tags]}
-    )
-    await asyncio.sleep(0)
+async def _create(client: Robot, containers: list[str]) -> None:
+    """Make containers with the echo node; the tags of its topics end in the number of the container."""
+    nodes, interfaces, pairs = [], [], []
+    for container in containers:
+        number = container.lstrip("abcdefghijklmnopqrstuvwxyz")
+        nodes.append({"containerTag": container, "nodeTag": "echo", "pkg": "Test", "exe": "stringEcho.py"})
+        for tag, inside, outside, address in (
+            (f"request{number}", "Publisher", "Subscriber", "/stringEchoReq"),
+            (f"response{number}", "Subscriber", "Publisher", "/stringEchoResp"),
+        ):
+            common = {"interfaceTag": tag, "className": STRING}
+            interfaces += [
+                {"endpointTag": container, "interfaceType": f"{inside}Interface", "addr": address, **common},
+                {"endpointTag": client.name, "interfaceType": f"{outside}Forwarder", **common},
+            ]
+            pairs.append({"tagA": f"{client.name}/{tag}", "tagB": f"{container}/{tag}"})
+        await client.send("CC", {"containerTag": container})
+    await client.send("CN", {"addNodes": nodes, "addInterfaces": interfaces})
+    await client.send("CX", {"connect": pairs})

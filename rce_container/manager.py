@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
@@ -34,6 +35,7 @@ from rce_container.environment.exceptions import ChannelError
 from rce_container.environment.process import strike_all
 from rce_container.exceptions import ContainerError, StateError
 from rce_container.folder import ContainerFolder, Record
+from rce_container.life import Phase
 from rce_container.logs import read_log
 from rce_container.runtimes.base import Handle, Order
 from rce_container.unit import Office, Unit
@@ -91,6 +93,9 @@ class Manager:
         self._office = Office(settings=settings, doorman=doorman, feed=self._feed)
         self._units: dict[str, Unit] = {}
         """All lives of which something may be left, by mark."""
+        self._queue: deque[str] = deque()
+        """Containers that are to be started when fewer are starting."""
+        self._starting: set[Unit] = set()
         self._tasks: asyncio.TaskGroup
         self._empty = asyncio.Event()
         self._meter = UsageMeter()
@@ -144,6 +149,7 @@ class Manager:
             usage = self._tasks.create_task(self._report_usage(), name="usage")
             await quit_.wait()
             self._feed(events.Quit())
+            self._start_waiting()
             if self._units:
                 await self._empty.wait()
             usage.cancel()
@@ -202,13 +208,26 @@ class Manager:
             case events.Tell(message=message):
                 self.send(message)
             case events.Start(id=id_):
-                self._start(id_)
+                self._queue.append(id_)
+                self._start_waiting()
             case events.Apply(mark=mark, spec=spec):
                 self._units[mark].apply(spec)
             case events.Stop(mark=mark):
                 self._units[mark].stop()
             case events.Wait(id=id_, ticket=ticket, delay=delay):
                 asyncio.get_running_loop().call_later(delay, self._feed, events.Due(id_, ticket))
+
+    def _start_waiting(self) -> None:
+        """Start the containers that wait for it, as far as there is room, and let go of those not wanted."""
+        waiting, self._queue = self._queue, deque()
+        for id_ in waiting:
+            container = self._core.containers.get(id_)
+            if container is None or container.phase is not Phase.STARTING:
+                self._feed(events.Lost(id_, "", "it is not wanted any more"))
+            elif len(self._starting) < self._settings.starts_at_once:
+                self._start(id_)
+            else:
+                self._queue.append(id_)
 
     def _start(self, id_: str) -> None:
         try:
@@ -222,8 +241,15 @@ class Manager:
             folder.remove()
             self._feed(events.Lost(id_, "", str(error)))
             return
-        self._own(id_, folder, handle, isolated=self._runtime.isolated)
+        unit = self._own(id_, folder, handle, isolated=self._runtime.isolated)
+        self._starting.add(unit)
+        self._tasks.create_task(self._await_start(unit), name=f"start of {id_}")
         self._feed(events.Made(id_, folder.mark, self._address(folder)))
+
+    async def _await_start(self, unit: Unit) -> None:
+        await unit.reported.wait()
+        self._starting.discard(unit)
+        self._start_waiting()
 
     def _launch(self, id_: str, folder: ContainerFolder) -> Handle:
         settings = self._settings

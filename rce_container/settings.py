@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +21,9 @@ class ContainerSettings:
     """A node has so long to end after SIGINT, before it gets SIGTERM."""
     terminate_timeout: float = 2.0
     """A node has so long to end after SIGTERM, before it gets SIGKILL."""
+    starts_at_once: int = 2 * (os.cpu_count() or 1)
+    """So many environments are started side by side; more would only take the processors from each other, and
+    from the engine and the containers that run."""
     start_timeout: float = 30.0
     """An environment that did not report for so long after its start is killed."""
     adopt_timeout: float = 3.0

@@ -279,3 +279,25 @@ async def test_containers_talk_to_each_other(machine: Machine) -> None:
         address = machine.status("user/far").address
         await machine.put(BOX, interfaces=(request,), peer="user/far", dial=address)
         await until(lambda: machine.status(BOX).interfaces == {"srv": True}, what="connected")
+
+
+async def test_only_so_many_containers_start_at_a_time(machine: Machine) -> None:
+    async with machine.engine(starts_at_once=1):
+        boxes = [f"user/box{number}" for number in range(3)]
+        for box in boxes:
+            await machine.put(box)
+        assert len(machine.shims()) == 1
+        await machine.drop(boxes[1])
+        for box in (boxes[0], boxes[2]):
+            await until(
+                lambda box=box: machine.status(box).state is EndpointState.RUNNING, what=f"{box} is running"
+            )
+        assert len(machine.shims()) == 2, "a container was made that was dropped before its turn came"
+        assert machine.faults == []
+
+
+async def test_a_manager_that_quits_starts_nothing_any_more(machine: Machine) -> None:
+    async with machine.engine(starts_at_once=1):
+        for number in range(3):
+            await machine.put(f"user/box{number}")
+    assert len(machine.marks) == 1
