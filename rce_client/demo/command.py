@@ -80,9 +80,9 @@ def demo(
             play = Play(scenario, seed, ports, folder, runtime.value if runtime is not None else "")
             show = typer.echo if verbose else _ignore
             if headless:
-                code = _run(_headless(play, timeout, report, show))
+                code = _run(_headless(play, timeout, report, show), stopped=1)
             else:
-                code = _run(_with_page(play, show, auto=auto))
+                code = _run(_with_page(play, show, auto=auto), stopped=0)
     except DemoError as error:
         typer.echo(f"rce demo: {error}", err=True)
         raise typer.Exit(1) from None
@@ -120,8 +120,13 @@ async def _for_ever() -> None:
     await asyncio.Event().wait()
 
 
-def _run(work: Coroutine[Any, Any, int]) -> int:
-    """Run until it is done, or SIGINT or SIGTERM came; a second signal ends this program at once."""
+def _run(work: Coroutine[Any, Any, int], *, stopped: int) -> int:
+    """Run until it is done, or SIGINT or SIGTERM came; a second signal ends this program at once.
+
+    Args:
+        work: Returns the exit code.
+        stopped: Exit code after a signal.
+    """
 
     async def until_signal() -> int:
         loop, task = asyncio.get_running_loop(), asyncio.current_task()
@@ -138,7 +143,7 @@ def _run(work: Coroutine[Any, Any, int]) -> int:
             return await work
         except asyncio.CancelledError:
             say("stopped")
-            return 0
+            return stopped
 
     return uvloop.run(until_signal())
 

@@ -15,6 +15,9 @@ from rce_client.demo.stage import Play, Stage, set_stage
 from rce_client.demo.station import StationApi
 from rce_client.simulation.report import read_report
 
+TAIL = 8
+"""How many of the last lines of each program are shown when the time is over."""
+
 
 async def run_headless(
     play: Play, timeout: float, say: Callable[[str], None], show: Callable[[str], None]
@@ -30,15 +33,23 @@ async def run_headless(
     run = _Run(play, say)
     problem = ""
     try:
-        async with asyncio.timeout(timeout):
-            async with set_stage(play, show) as stage:
-                await stage.children.while_alive(run.perform(stage))
+        async with asyncio.timeout(timeout) as limit, set_stage(play, show) as stage:
+            await stage.children.while_alive(run.perform(stage))
+            limit.reschedule(None)  # what was started is ended in peace
     except TimeoutError:
         problem = f"the time of {timeout:g} s is over"
+        _tell_tails(play, say)
     except (DemoError, OSError) as error:
         problem = str(error)
     # The world's last word comes at its end: what was touched until then counts.
     return Result(play.scenario, play.seed, run.mission, read_report(play.report), run.counters, problem)
+
+
+def _tell_tails(play: Play, say: Callable[[str], None]) -> None:
+    """Say what all programs printed last."""
+    for log in sorted(play.folder.glob("*.log")):
+        for line in log.read_text(encoding="utf-8", errors="replace").splitlines()[-TAIL:]:
+            say(f"[{log.stem}] {line}")
 
 
 class _Run:
