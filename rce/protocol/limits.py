@@ -14,6 +14,8 @@ class Limits:
 
     max_text: int = 64 * 2**20
     """Longest text frame: characters if given as ``str``, else bytes."""
+    max_request: int = 2**20
+    """The same for what is no data message: requests are carried out by the one master of all robots."""
     max_binary: int = 64 * 2**20
     """Longest binary frame in bytes, with its id."""
     max_depth: int = 64

@@ -81,7 +81,7 @@ class ContainerData(_Part, frozen=True, kw_only=True, omit_defaults=True, rename
     group: Text = ""
     group_ip: Text = ""
     size: Annotated[int, Meta(ge=0, le=2**31)] = 1
-    cpu: Annotated[float, Meta(ge=0)] = 0.0
+    cpu: Annotated[float, Meta(ge=0, le=2**31)] = 0.0
     """Cores."""
     memory: Annotated[int, Meta(ge=0, le=2**62)] = 0
     """Bytes."""

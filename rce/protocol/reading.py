@@ -88,6 +88,7 @@ _SHORT = 4096
 
 _PLACE = re.compile(r"(?s)(.*) - at `(?:key in )?\$(.*)`")
 _MISSING = re.compile(r"Object missing required field `([^`]+)`")
+_ESCAPED_SURROGATE = re.compile(rb"\\u[dD]")
 _REPR_PATTERNS = {repr(pattern): text for pattern, text in HUMAN_PATTERNS.items()}
 
 
@@ -174,6 +175,19 @@ def check_depth(value: Any, max_depth: int) -> None:
         ]
 
 
+def check_request_size(value: Any, size: int, limit: int) -> None:
+    """Check the size of what is no data message.
+
+    Raises:
+        MessageError: Its text is longer than ``limit``.
+    """
+    kind = value.get("type") if isinstance(value, dict) else None
+    if kind != "DM":
+        raise MessageError(
+            "", f"{_short(kind)}: a request of {size} bytes is longer than the limit of {limit}"
+        )
+
+
 def parse_json(text: str | bytes) -> Any:
     """Read JSON; ``NaN`` and ``Infinity``, which Python's own writer emits, are understood too.
 
@@ -186,9 +200,12 @@ def parse_json(text: str | bytes) -> Any:
         if not _may_hold_nan(text):
             raise MessageError("", f"no valid JSON: {error}") from error
     try:
-        return json.loads(text)
+        value = json.loads(text)
+        if _ESCAPED_SURROGATE.search(text.encode(errors="replace") if isinstance(text, str) else text):
+            json.dumps(value, ensure_ascii=False).encode()  # Python reads halves of characters, too
     except (ValueError, RecursionError) as error:
         raise MessageError("", f"no valid JSON: {error}") from error
+    return value
 
 
 def _may_hold_nan(text: str | bytes) -> bool:

@@ -23,6 +23,7 @@ from rce.protocol.messages import (
 from rce.protocol.reading import (
     SerializedData,
     check_depth,
+    check_request_size,
     decode_data,
     decode_serialized,
     is_shallow,
@@ -128,6 +129,8 @@ class ProtocolStream:
             value = parse_json(text)
             if not shallow:
                 check_depth(value, limits.max_depth)
+            if len(text) > limits.max_request:
+                check_request_size(value, len(text), limits.max_request)
             if not starred:
                 return [message_from_json(value, self._accept)]
             complete, dropped = self._assembler.add_message(value, len(text), now)
