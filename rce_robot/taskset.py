@@ -205,7 +205,7 @@ class RobotTaskSet:
         try:
             reply = await self._channel.client_request(str(id), type_, msgspec.to_builtins(request))
         except ControlError as error:
-            return (f"{type_}: not done, the master cannot be reached: {error}",)
+            return (f"{type_}: not done: {error}",)
         return reply.errors
 
     # Own

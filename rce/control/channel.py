@@ -18,7 +18,7 @@ import msgspec
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 
-from rce.control.exceptions import MasterUnavailableError
+from rce.control.exceptions import MasterUnavailableError, UnsendableError
 from rce.control.messages import (
     ClientReply,
     ClientRequest,
@@ -29,7 +29,7 @@ from rce.control.messages import (
     decode_to_task_set,
     encode,
 )
-from rce.control.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, MAX_QUEUED, ControlTimeouts
+from rce.control.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, MAX_QUEUED, MAX_TEXT, ControlTimeouts
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -51,8 +51,8 @@ class _RefusedError(Exception):
 class _Pending:
     """A request that waits for its answer."""
 
-    def __init__(self, message: Login | ClientRequest, reply: asyncio.Future[Any]) -> None:
-        self.message = message
+    def __init__(self, text: str, reply: asyncio.Future[Any]) -> None:
+        self.text = text
         self.reply = reply
 
 
@@ -85,7 +85,7 @@ class TaskSetChannel:
         self._timeouts = timeouts
         self._numbers = itertools.count(1)
         self._pending: dict[int, _Pending] = {}
-        self._outbox: asyncio.Queue[ToMaster] | None = None  # there is one while there is a connection
+        self._outbox: asyncio.Queue[str] | None = None  # there is one while there is a connection
         self._inbox: asyncio.Queue[ToTaskSet] = asyncio.Queue(MAX_QUEUED)
         self._socket: ClientConnection | None = None
         self._failures = 0
@@ -106,7 +106,15 @@ class TaskSetChannel:
         if self._outbox is None:
             return
         try:
-            self._outbox.put_nowait(message)
+            self._post(_written(message))
+        except UnsendableError:
+            _log.exception("a %s is left out", type(message).__name__)
+
+    def _post(self, text: str) -> None:
+        if self._outbox is None:
+            return
+        try:
+            self._outbox.put_nowait(text)
         except asyncio.QueueFull:
             self._abort(f"{MAX_QUEUED} messages wait for the master")
 
@@ -115,6 +123,7 @@ class TaskSetChannel:
 
         Raises:
             MasterUnavailableError: No answer in time.
+            UnsendableError: It holds something that cannot be sent.
         """
         message = Login(request=next(self._numbers), user=user, robot=robot, password=password)
         return await self._request(message, LoginReply)
@@ -129,6 +138,7 @@ class TaskSetChannel:
 
         Raises:
             MasterUnavailableError: No answer in time.
+            UnsendableError: It is too long, or holds something that cannot be sent.
         """
         message = ClientRequest(request=next(self._numbers), id=id, type=type, data=data)
         return await self._request(message, ClientReply)
@@ -142,9 +152,10 @@ class TaskSetChannel:
                 await asyncio.sleep(delay)
 
     async def _request(self, message: Login | ClientRequest, kind: type[Reply]) -> Reply:
-        pending = _Pending(message, asyncio.get_running_loop().create_future())
+        # Written before it is kept: one that cannot be sent must fail here, and not on every connection.
+        pending = _Pending(_written(message), asyncio.get_running_loop().create_future())
         self._pending[message.request] = pending
-        self.send(message)
+        self._post(pending.text)
         try:
             async with asyncio.timeout(self._timeouts.request):
                 reply: Reply = await pending.reply
@@ -195,7 +206,7 @@ class TaskSetChannel:
 
     async def _talk(self, socket: ClientConnection) -> None:
         self._socket = socket
-        outbox: asyncio.Queue[ToMaster] = asyncio.Queue(MAX_QUEUED)
+        outbox: asyncio.Queue[str] = asyncio.Queue(MAX_QUEUED)
         self._outbox = outbox
         failure: Exception | None = None
         try:
@@ -213,15 +224,15 @@ class TaskSetChannel:
         if failure is not None:
             raise failure
 
-    async def _write(self, socket: ClientConnection, outbox: asyncio.Queue[ToMaster]) -> None:
+    async def _write(self, socket: ClientConnection, outbox: asyncio.Queue[str]) -> None:
         # Hello is made in the same step in which sending begins to count, so no change falls between the two.
-        first = [self._hello(), *(pending.message for pending in self._pending.values())]
+        first = [encode(self._hello()), *(pending.text for pending in self._pending.values())]
         while not outbox.empty():
             outbox.get_nowait()
-        for message in first:
-            await socket.send(encode(message))
+        for text in first:
+            await socket.send(text)
         while True:
-            await socket.send(encode(await outbox.get()))
+            await socket.send(await outbox.get())
 
     async def _read(self, socket: ClientConnection) -> None:
         async for frame in socket:
@@ -264,3 +275,18 @@ class TaskSetChannel:
         _log.warning("dialing the master anew: %s", reason)
         if self._socket is not None:
             self._socket.transport.abort()
+
+
+def _written(message: ToMaster) -> str:
+    """Write a message as a frame that the master takes.
+
+    Raises:
+        UnsendableError: That is impossible.
+    """
+    try:
+        text = encode(message)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise UnsendableError(str(error)) from error
+    if len(text) > MAX_TEXT:
+        raise UnsendableError(f"its {len(text)} characters are more than {MAX_TEXT}")
+    return text

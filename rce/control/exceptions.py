@@ -4,6 +4,7 @@
 
     ControlError
     +-- MasterUnavailableError   the master did not answer in time
+    +-- UnsendableError          a message is too long, or holds what no frame can hold
     +-- PeerGoneError            a task set left before it answered
     +-- PeerTimeoutError         a task set did not answer in time
     +-- PeerRefusedError         raised by the master's ``on_hello``: the task set is not taken
@@ -29,6 +30,21 @@ class MasterUnavailableError(ControlError):
 
     def __str__(self) -> str:
         return f"the master did not answer within {self.waited:g} s; try again later"
+
+
+class UnsendableError(ControlError):
+    """A message is too long, or holds what no frame can hold.
+
+    Attributes:
+        problem: What is wrong with it.
+    """
+
+    def __init__(self, problem: str) -> None:
+        super().__init__(problem)
+        self.problem = problem
+
+    def __str__(self) -> str:
+        return f"the message cannot be sent: {self.problem}"
 
 
 class PeerGoneError(ControlError):

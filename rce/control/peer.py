@@ -26,7 +26,7 @@ class Peer:
         self.hello = hello
         self._socket = socket
         self._timeouts = timeouts
-        self._outbox: asyncio.Queue[ToTaskSet] = asyncio.Queue(MAX_QUEUED)
+        self._outbox: asyncio.Queue[str] = asyncio.Queue(MAX_QUEUED)
         self._numbers = itertools.count(1)
         self._reads: dict[int, asyncio.Future[LogChunk]] = {}
         self._left = False
@@ -51,7 +51,7 @@ class Peer:
         if self._left:
             return
         try:
-            self._outbox.put_nowait(message)
+            self._outbox.put_nowait(encode(message))
         except asyncio.QueueFull:
             _log.warning("%r takes no messages; cut off", self)
             self.abort()
@@ -101,7 +101,7 @@ class Peer:
             ConnectionClosed: The connection ended.
         """
         while True:
-            await self._socket.send(encode(await self._outbox.get()))
+            await self._socket.send(await self._outbox.get())
 
     def answer(self, chunk: LogChunk) -> None:
         """Take an answer to :meth:`read_log` (for the server)."""

@@ -28,7 +28,10 @@ class ControlTimeouts:
 
 DEFAULT_TIMEOUTS = ControlTimeouts()
 
-MAX_FRAME = 16 * 2**20
-"""Longest message, in bytes."""
+MAX_FRAME = 256 * 2**20
+"""Longest message, in bytes: ``Sync`` says all that a task set is to do, in one. Both ends have proven who
+they are; how much a user may ask for is limited by the master."""
+MAX_TEXT = MAX_FRAME // 4
+"""Most characters that surely fit."""
 MAX_QUEUED = 8192
 """How many messages may wait for a peer; one that is further behind is cut off and starts anew."""

@@ -19,6 +19,7 @@ from rce.control.exceptions import (
     PeerGoneError,
     PeerRefusedError,
     PeerTimeoutError,
+    UnsendableError,
 )
 from rce.control.messages import (
     CONTROL_VERSION,
@@ -43,7 +44,7 @@ from rce.control.messages import (
 )
 from rce.control.peer import Peer
 from rce.control.server import ControlServer
-from rce.control.timeouts import ControlTimeouts
+from rce.control.timeouts import MAX_TEXT, ControlTimeouts
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -406,3 +407,28 @@ async def test_large_messages_pass() -> None:
     async with master.server, TaskSet(master.server.port).running() as robots:
         reply = await robots.channel.client_request("u/r", "CN", "x" * (8 * 2**20))
         assert len(reply.errors[1]) == 8 * 2**20
+
+
+async def test_a_request_that_cannot_be_written_fails_alone() -> None:
+    master = Master()
+    async with master.server, TaskSet(master.server.port).running() as robots:
+        await robots.channel.wait_connected()
+        for data in ("\ud800", "x" * (MAX_TEXT + 1), object()):
+            with pytest.raises(UnsendableError):
+                await robots.channel.client_request("u/r", "CN", data)
+        robots.channel.send(Left(id="u/r", reason="\ud800"))
+        reply = await robots.channel.client_request("u/r", "CC", 1)
+        assert reply.errors == ("CC", "1")
+        assert master.seen["ClientRequest"] == 1
+        assert master.story == ["hello"]
+
+
+async def test_a_long_sync_arrives() -> None:
+    master = Master()
+    async with master.server, TaskSet(master.server.port).running() as robots:
+        peer, _ = await master.hellos.get()
+        text = "x" * (20 << 20)
+        peer.send(Notify(id="u", text=text))
+        while not isinstance(told := await robots.told.get(), Notify):
+            pass
+        assert told.text == text
