@@ -78,7 +78,9 @@ class Session:
         limits = Limits(max_text=settings.max_message, max_binary=settings.max_message)
         self._stream = ProtocolStream.for_engine(limits)
         self._outbox = Outbox(settings.outbox, dropped)
-        self._requests: asyncio.Queue[Request | None] = asyncio.Queue()
+        self._requests: asyncio.Queue[tuple[Request, int] | None] = asyncio.Queue()
+        self._waiting_bytes = 0
+        """Text bytes of the requests that wait or are being carried out."""
         self._tasks: asyncio.TaskGroup | None = None
         self._calls: set[asyncio.Task[None]] = set()
         self._now = asyncio.get_running_loop().time
@@ -179,7 +181,7 @@ class Session:
             if type(event) is Fault and not _is_utf8(text):
                 self._socket.fail(CloseCode.INVALID_DATA, "a text frame is not UTF-8")
                 return
-            self._handle(event)
+            self._handle(event, len(text))
 
     def on_binary(self, data: bytes) -> None:
         """Handle a binary frame."""
@@ -215,7 +217,7 @@ class Session:
         if rendered is not None:
             self._socket.write(rendered)
 
-    def _handle(self, event: Event) -> None:
+    def _handle(self, event: Event, size: int = 0) -> None:
         match event:
             case DataMessage():
                 try:
@@ -230,17 +232,22 @@ class Session:
             case ErrorReport() | InterfaceStatus():
                 self.report(f"type: {type_of(event)} is not for clients to send")
             case _:
-                self._request(event)
+                self._request(event, size)
 
-    def _request(self, request: Request) -> None:
+    def _request(self, request: Request, size: int) -> None:
         if isinstance(request, (ConfigureComponents, ConfigureConnections)):
             for fault in request.faults:
                 self.report(fault)
             request = msgspec.structs.replace(request, faults=())
-        if self._requests.qsize() >= self._settings.max_requests:
+        waiting = self._waiting_bytes + size
+        if (
+            self._requests.qsize() >= self._settings.max_requests
+            or waiting > self._settings.max_request_bytes
+        ):
             self.report(f"{type_of(request)}: too many requests wait; this one was dropped")
         else:
-            self._requests.put_nowait(request)
+            self._waiting_bytes = waiting
+            self._requests.put_nowait((request, size))
 
     async def _guard(self, work: Coroutine[Any, Any, None]) -> None:
         """Keep a fault of ours in one call from ending the session."""
@@ -252,9 +259,11 @@ class Session:
 
     async def _carry_out_requests(self) -> None:
         """Pass on requests to the master, one at a time and in order."""
-        while (request := await self._requests.get()) is not None:
+        while (item := await self._requests.get()) is not None:
+            request, size = item
             for error in await self._owner.ask_master(request):
                 self.report(error)
+            self._waiting_bytes -= size
 
 
 def _outgoing(message: ErrorReport | InterfaceStatus) -> Outgoing:

@@ -24,6 +24,8 @@ class SessionSettings:
     """Limits of what waits in the socket; the rest waits in the outbox, where it can be overtaken."""
     max_requests: int = 256
     """Requests to the master (``CC``, ``DC``, ``CN``, ``CX``) that may wait."""
+    max_request_bytes: int = 4 << 20
+    """The same in bytes of their text; more than a stream's ``max_request``."""
     max_calls: int = 1024
     """Service calls of the robot that may wait for their answers."""
     drain_timeout: float = 10.0
