@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hashlib
 import secrets
 import time
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 from argon2 import PasswordHasher
 from argon2.exceptions import InvalidHashError, VerificationError
 
-from rce_master.exceptions import TooManyFailures, WrongCredentials
+from rce_master.exceptions import TooManyFailures, TooManyLogins, WrongCredentials
 from rce_master.state.records import Token
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import AsyncIterator, Callable
 
     from rce_master.state.records import User
     from rce_master.state.tables import Tables
@@ -27,6 +28,8 @@ FAILURE_WINDOW_S = 60.0
 CACHE_SIZE = 4096
 HASH_WORKERS = 2
 """argon2 takes much memory and time on purpose; more at once would help an attacker only."""
+MAX_WAITING = 64
+"""Unknown passwords that wait to be hashed; what comes then is told to try later, and holds nobody up."""
 TOKEN_LIFETIME_S = 30 * 24 * 3600.0
 TOKEN_PREFIX = "rce_"  # noqa: S105 - it marks a token, it is none
 
@@ -69,6 +72,7 @@ class Authenticator:
         self._failures: OrderedDict[str, deque[float]] = OrderedDict()
         self._workers = ThreadPoolExecutor(HASH_WORKERS, thread_name_prefix="argon2")
         self._slots = asyncio.Semaphore(HASH_WORKERS)
+        self._waiting: Counter[bytes] = Counter()
         # Checked for unknown users, so that the time it takes does not tell who exists.
         self._nobody = self._hasher.hash(secrets.token_hex())
 
@@ -82,15 +86,18 @@ class Authenticator:
         Raises:
             WrongCredentials: The user is unknown or the password wrong.
             TooManyFailures: It was wrong too often lately.
+            TooManyLogins: Too many wait to be checked.
         """
         user = self._tables.users.get(name)
         stored = user.password if user else self._nobody
         mark = self._mark(name, stored, digest)
         if not self._is_known(mark):
             self._check_failures(name)
-            async with self._slots:
-                # Somebody who waited before us may have checked the same one.
-                right = self._is_known(mark) or await self._matches(stored, digest)
+            async with self._turn(mark):
+                right = self._is_known(mark)
+                if not right:  # nor did somebody who waited before us find out that it is
+                    self._check_failures(name)
+                    right = await self._matches(stored, digest)
             if not right or user is None:
                 self._note_failure(name)
                 raise WrongCredentials("unknown user or wrong password")
@@ -100,8 +107,12 @@ class Authenticator:
         return user
 
     async def hash(self, digest: str) -> str:
-        """Hash a password's digest for the store."""
-        async with self._slots:
+        """Hash a password's digest for the store.
+
+        Raises:
+            TooManyLogins: Too many wait for the same.
+        """
+        async with self._turn(secrets.token_bytes(8)):
             return await asyncio.get_running_loop().run_in_executor(self._workers, self._hasher.hash, digest)
 
     def bearer(self, token: str, now: float) -> User:
@@ -132,6 +143,20 @@ class Authenticator:
     def close(self) -> None:
         """Stop the worker threads."""
         self._workers.shutdown()
+
+    @contextlib.asynccontextmanager
+    async def _turn(self, mark: bytes) -> AsyncIterator[None]:
+        """Wait for a worker thread, unless too many others wait; those who wait for the same are one."""
+        if mark not in self._waiting and len(self._waiting) >= MAX_WAITING:
+            raise TooManyLogins
+        self._waiting[mark] += 1
+        try:
+            async with self._slots:
+                yield
+        finally:
+            self._waiting[mark] -= 1
+            if not self._waiting[mark]:
+                del self._waiting[mark]
 
     async def _matches(self, stored: str, digest: str) -> bool:
         return await asyncio.get_running_loop().run_in_executor(self._workers, self._compare, stored, digest)

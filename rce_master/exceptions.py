@@ -12,6 +12,7 @@
     +-- AuthError
     |   +-- WrongCredentials    unknown user, wrong password, unknown or expired token
     |   +-- TooManyFailures     too many wrong passwords; wait
+    |   +-- TooManyLogins       too many people log in just now; wait
     +-- InvalidTransition       an event that a life cycle does not know in its present state
     +-- StoreError              the store cannot be read or written
     |   +-- StoreBusy           another process owns the state folder
@@ -86,6 +87,13 @@ class TooManyFailures(AuthError):  # noqa: N818
 
     def __str__(self) -> str:
         return f"too many failed logins; try again in {self.retry_after:.0f} s"
+
+
+class TooManyLogins(AuthError):  # noqa: N818
+    """Too many logins wait to be checked."""
+
+    def __str__(self) -> str:
+        return "too many log in at the same time; try again in a moment"
 
 
 class InvalidTransition(MasterError):  # noqa: N818

@@ -21,6 +21,7 @@ from rce_master.exceptions import (
     StoreError,
     TaskSetAway,
     TooManyFailures,
+    TooManyLogins,
     WrongCredentials,
 )
 from rce_master.http import api_account, api_control, api_read, api_stream
@@ -181,10 +182,10 @@ def _status(error: MasterError) -> int:
             return error.status
         case TooManyFailures():
             return 429
+        case TooManyLogins() | StoreError() | TaskSetAway():
+            return 503
         case AuthError():
             return 401
-        case StoreError() | TaskSetAway():
-            return 503
         case _:
             return 500
 
@@ -193,6 +194,8 @@ def _headers(error: MasterError) -> dict[str, str]:
     match error:
         case TooManyFailures():
             return {hdrs.RETRY_AFTER: f"{error.retry_after:.0f}"}
+        case TooManyLogins():
+            return {hdrs.RETRY_AFTER: "1"}
         case AuthError():
             return {hdrs.WWW_AUTHENTICATE: "Bearer"}
         case _:
