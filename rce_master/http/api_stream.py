@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -19,6 +20,7 @@ routes = RouteTable("stream")
 
 MAX_LOG = 1 << 20
 HEARTBEAT_S = 15.0
+_EVENT_ID = re.compile(r"[0-9]{1,18}")
 
 _LOG_QUERY = (
     OF_USER,
@@ -71,7 +73,7 @@ async def _read_log(call: Call, node: str) -> models.LogOut:
     ),
 )
 async def stream_events(call: Call) -> web.StreamResponse:
-    """Stream events until the client or the server ends it."""
+    """Stream events until the client or the server ends it, or the token is worth nothing any more."""
     scope, last = call.scope, _start(call)
     response = web.StreamResponse(
         headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store", "X-Accel-Buffering": "no"}
@@ -82,6 +84,8 @@ async def stream_events(call: Call) -> web.StreamResponse:
     try:
         while True:
             news = await events.wait(last, HEARTBEAT_S)
+            if not call.is_still_valid:
+                return response
             # A comment now and then keeps proxies from giving up, and finds out that a client is gone.
             frames = [_frame(event) for event in news if scope is None or event.user == scope]
             await response.write(b"".join(frames) or b":\n\n")
@@ -93,7 +97,7 @@ async def stream_events(call: Call) -> web.StreamResponse:
 
 def _start(call: Call) -> int:
     resumed = call.request.headers.get("Last-Event-ID", "")
-    if resumed.isascii() and resumed.isdigit():
+    if _EVENT_ID.fullmatch(resumed):
         return int(resumed)
     return call.number("since", call.services.events.last_id)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from rce.web.openapi import Operation, Query
-from rce_master.exceptions import Forbidden, Invalid, NotFound
+from rce_master.exceptions import Forbidden, Invalid, NotFound, WrongCredentials
 from rce_master.state.records import UserRole
 
 if TYPE_CHECKING:
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from rce_master.state.records import User
 
 M = TypeVar("M", bound=BaseModel)
+
+_NUMBER = re.compile(r"-?[0-9]{1,18}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +63,14 @@ class Call:
     def is_admin(self) -> bool:
         """Whether an administrator asks."""
         return self.user is not None and self.user.role is UserRole.ADMIN
+
+    @property
+    def is_still_valid(self) -> bool:
+        """Whether the caller could ask for the same now; for answers that go on for long."""
+        try:
+            return self.services.authenticator.bearer(self.token, self.services.clock()) == self.user
+        except WrongCredentials:
+            return False
 
     @property
     def owner(self) -> str:
@@ -100,13 +111,12 @@ class Call:
         """A query parameter that is a whole number.
 
         Raises:
-            Invalid: It is none.
+            Invalid: It is none, or one that no counter reaches.
         """
         text = self.request.query.get(name, str(default))
-        try:
-            return int(text)
-        except ValueError:
-            raise Invalid(f"query parameter {name!r} must be a whole number, not {text!r}") from None
+        if not _NUMBER.fullmatch(text):
+            raise Invalid(f"query parameter {name!r} must be a whole number of at most 18 digits")
+        return int(text)
 
     def read(self, model: type[M]) -> M:
         """The body, which the route declared to be of this model."""

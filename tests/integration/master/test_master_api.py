@@ -174,7 +174,8 @@ async def test_logs_are_followed_by_offset(site: Site) -> None:
         assert (await site.api("GET", "/containers/c/log"))["text"] == "hello world"
         await site.api("GET", "/containers/c/nodes/none/log", status=404)
         await site.api("GET", "/containers/c/log", status=422, limit=0)
-        await site.api("GET", "/containers/c/log", status=422, offset="x")
+        for offset in ("x", "9" * 40, "-" + "9" * 40, "9" * 5000):
+            await site.api("GET", "/containers/c/log", status=422, offset=offset)
     while (await site.api("GET", "/machines"))["machines"][0]["connected"]:
         await asyncio.sleep(0)
     assert "cannot be reached" in (await site.api("GET", "/containers/c/log", status=503))["error"]
@@ -206,6 +207,17 @@ async def test_events_are_followed_and_resumed(site: Site) -> None:
     waiting = asyncio.ensure_future(read_events(site, 1, site.token, last=resumed[0]["id"]))
     await site.api("DELETE", "/containers/first", status=204)
     assert [e["kind"] for e in await waiting] == ["container_destroyed"]
+
+
+async def test_a_stream_ends_with_the_token(site: Site) -> None:
+    await site.api("POST", "/users", {"name": "anna", "password": "one"}, status=201)
+    anna = await site.login("anna", "one")
+    headers = {"Authorization": f"Bearer {anna}", "Last-Event-ID": "9" * 5000}
+    async with site.session.get(f"{site.url}api/v1/events", headers=headers) as reply:
+        assert await reply.content.readline() == b": hello\n"
+        await site.api("PUT", "/users/anna/password", {"password": "two"}, status=204)
+        await site.api("POST", "/containers", {"tag": "c"}, status=204, user="anna")
+        assert (await reply.content.read()).strip() == b""
 
 
 async def test_the_document_describes_every_route(site: Site) -> None:
