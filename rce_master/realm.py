@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rce_master.exceptions import MasterError, Refused, StoreError
+from rce_master.state.changes import make_row
 from rce_master.state.core import State
 
 if TYPE_CHECKING:
@@ -132,14 +133,16 @@ class Realm:
         except StoreError as error:
             await self._stand_alone(jobs, error)
             return
+        _touch_once(done)
         for changes in done:
             for listener in self.listeners:
                 listener(changes)
         self._answer(jobs, None)
 
     async def _save(self, done: list[Changes]) -> None:
-        # Of a key that several commands wrote, every row holds the newest record.
-        rows = [row for changes in done for row in changes.rows()]
+        # Of a key that several commands wrote, only the newest record counts; nothing is encoded twice.
+        keys = {key: table for changes in done for key, table in changes.written().items()}
+        rows = [make_row(table, key) for (_, key), table in keys.items()]
         try:
             if rows:
                 await self._store.save(rows)
@@ -173,3 +176,12 @@ class Realm:
         for job in jobs:
             if not job.done.done():
                 job.done.set_result([outcome or error for outcome in job.outcomes])
+
+
+def _touch_once(done: Sequence[Changes]) -> None:
+    """Leave each endpoint touched by the last of several changes only: its spec holds them all by now."""
+    later: set[str] = set()
+    for changes in reversed(done):
+        once = {id_: None for id_ in changes.touched if id_ not in later}
+        later.update(changes.touched)
+        changes.touched = once

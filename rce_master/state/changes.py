@@ -85,10 +85,13 @@ class Changes:
     """Id of an endpoint whose spec goes out with the answer to the command, so that it needs no ``Put``."""
     _writes: list[_Write] = field(default_factory=list)
 
+    def written(self) -> dict[tuple[str, str], Table[Any]]:
+        """Tell which records the store has to keep: name of the table and key, to the table."""
+        return {(w.table.name, w.key): w.table for w in self._writes if w.table.persistent}
+
     def rows(self) -> list[Row]:
-        """Tell what the store has to keep, each key once."""
-        keys = {(w.table.name, w.key): w for w in self._writes if w.table.persistent}
-        return [_row(write) for write in keys.values()]
+        """Write what the store has to keep, each key once."""
+        return [make_row(table, key) for (_, key), table in self.written().items()]
 
     def revert(self) -> None:
         """Undo everything. Changes must be reverted in the reverse order of their making."""
@@ -101,9 +104,10 @@ class Changes:
         self._writes.append(_Write(table, key, before))
 
 
-def _row(write: _Write) -> Row:
-    record = write.table.get(write.key)
-    return Row(write.table.name, write.key, None if record is None else write.table.encode(record))
+def make_row(table: Table[Any], key: str) -> Row:
+    """Write a record as the store keeps it; one that is gone as its removal."""
+    record = table.get(key)
+    return Row(table.name, key, None if record is None else table.encode(record))
 
 
 class Transaction:

@@ -60,7 +60,8 @@ def create_container(tx: Transaction, command: CreateContainer) -> None:
         raise Conflict(f"{command.tag!r} is a robot already; a container needs another tag")
     if len(tx.tables.containers(command.user)) >= tx.settings.max_containers:
         raise LimitReached(f"you have {tx.settings.max_containers} containers already; destroy one first")
-    tx.put(Container(id=id_, resources=command.resources))
+    made = Container(id=id_, resources=command.resources)
+    tx.put(replace(made, size=endpoints.grown(tx, made, command.resources)))
     tx.put(ContainerLive(id=id_, phase=ContainerPhase.REQUESTED, since=tx.now))
     tx.touch(id_)
     tx.happen("container_requested", id_)
@@ -86,7 +87,8 @@ def add_node(tx: Transaction, command: AddNode) -> None:
         )
     if len(container.nodes) >= tx.settings.max_nodes:
         raise LimitReached(f"container {container.tag!r} has {tx.settings.max_nodes} nodes already")
-    tx.put(replace(container, nodes={**container.nodes, node.tag: node}))
+    size = endpoints.grown(tx, container, node)
+    tx.put(replace(container, nodes={**container.nodes, node.tag: node}, size=size))
     tx.touch(container.id)
 
 
@@ -95,7 +97,9 @@ def remove_node(tx: Transaction, command: RemoveNode) -> None:
     container = _find(tx, command.user, command.container)
     if command.tag not in container.nodes:
         raise NotFound(f"container {container.tag!r} has no node {command.tag!r}")
-    tx.put(replace(container, nodes={t: n for t, n in container.nodes.items() if t != command.tag}))
+    kept = {t: n for t, n in container.nodes.items() if t != command.tag}
+    size = container.size - endpoints.size_of(container.nodes[command.tag])
+    tx.put(replace(container, nodes=kept, size=size))
     tx.touch(container.id)
 
 
@@ -108,10 +112,12 @@ def set_parameter(tx: Transaction, command: SetParameter) -> None:
         return
     if there is None and len(container.parameters) >= tx.settings.max_parameters:
         raise LimitReached(f"container {container.tag!r} has {tx.settings.max_parameters} parameters already")
+    before = None if there is None else (command.name, there)
+    size = endpoints.grown(tx, container, (command.name, command.value), before)
     # Taken out first: 1 and True are equal, and an equal value must still replace the old one.
     kept = {n: v for n, v in container.parameters.items() if n != command.name}
     tx.put(replace(container, parameters=kept))
-    tx.put(replace(container, parameters={**kept, command.name: command.value}))
+    tx.put(replace(container, parameters={**kept, command.name: command.value}, size=size))
     tx.touch(container.id)
 
 
@@ -121,7 +127,8 @@ def delete_parameter(tx: Transaction, command: DeleteParameter) -> None:
     if command.name not in container.parameters:
         raise NotFound(f"container {container.tag!r} has no parameter {command.name!r}")
     kept = {n: v for n, v in container.parameters.items() if n != command.name}
-    tx.put(replace(container, parameters=kept))
+    size = container.size - endpoints.size_of((command.name, container.parameters[command.name]))
+    tx.put(replace(container, parameters=kept, size=size))
     tx.touch(container.id)
 
 

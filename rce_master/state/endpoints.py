@@ -4,14 +4,43 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import msgspec
 from msgspec.structs import replace
 
 from rce.control.model import EndpointKind, LinkAddress
+from rce_master.exceptions import LimitReached
 from rce_master.state.records import Container, Endpoint, Link, Robot, Tombstone
 
 if TYPE_CHECKING:
     from rce_master.state.changes import Transaction
     from rce_master.state.tables import Tables
+
+_SMALL = 32 * 2**10
+"""Endpoints up to this size are so small that their number limits them well enough."""
+
+
+def size_of(part: object) -> int:
+    """Tell how many bytes a node, a parameter or an interface takes when it is written down."""
+    return len(msgspec.json.encode(part))
+
+
+def grown(tx: Transaction, endpoint: Endpoint, part: object, instead_of: object = None) -> int:
+    """Tell an endpoint's size when a part is put into it.
+
+    Raises:
+        LimitReached: It, or all endpoints of its user, would be too large.
+    """
+    settings = tx.settings
+    size = endpoint.size + size_of(part) - (0 if instead_of is None else size_of(instead_of))
+    if size > settings.max_endpoint_bytes:
+        raise LimitReached(f"{endpoint.tag!r} would hold more than {settings.max_endpoint_bytes} bytes")
+    if size > _SMALL:
+        others = sum(e.size for e in tx.tables.endpoints.by("user", endpoint.user) if e.id != endpoint.id)
+        if others + size > settings.max_user_bytes:
+            raise LimitReached(
+                f"your robots and containers would hold more than {settings.max_user_bytes} bytes"
+            )
+    return size
 
 
 def remove(tx: Transaction, id_: str, reason: str) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from rce.control.messages import TaskSetKind
 from rce.protocol.names import EndpointId, Form, InterfaceType, Role
+from rce_master.state import endpoints
 from rce_master.state.lifecycle import RobotSession
 from rce_master.state.records import Container, ContainerLive, Endpoint, Link, Robot, RobotLive
 
@@ -49,10 +50,18 @@ def _check_endpoint(tables: Tables, endpoint: Endpoint) -> None:
         in_container = isinstance(endpoint, Container)
         assert (form is Form.INTERFACE) == in_container, f"{id_}/{tag}: {interface.type} is of the wrong form"
         assert bool(interface.addr) == in_container, f"{id_}/{tag}: addr {interface.addr!r}"
+    assert endpoint.size == _size(endpoint), f"{id_}: size {endpoint.size}, not {_size(endpoint)}"
     if endpoint.task_set:
         task_set = tables.task_sets.get(endpoint.task_set)
         assert task_set is not None, f"{id_}: placed at an unknown task set"
         assert task_set.kind.value == endpoint.kind.value, f"{id_}: placed at a task set of the wrong kind"
+
+
+def _size(endpoint: Endpoint) -> int:
+    parts: list[object] = [*endpoint.interfaces.values()]
+    if isinstance(endpoint, Container):
+        parts += [endpoint.resources, *endpoint.nodes.values(), *endpoint.parameters.items()]
+    return sum(map(endpoints.size_of, parts))
 
 
 def _check_link(tables: Tables, link: Link) -> None:

@@ -65,6 +65,8 @@ class _Endpoint(Struct, frozen=True, kw_only=True):
     """Process name of the task set that is responsible; empty: none."""
     interfaces: dict[str, InterfaceSpec] = {}
     """By tag."""
+    size: int = 0
+    """Bytes of all that its user put into it, as :func:`rce_master.state.endpoints.size_of` counts them."""
 
     @property
     def user(self) -> str:

@@ -29,3 +29,8 @@ class StateSettings:
     """Of one endpoint."""
     max_connections: int = 4000
     """Of one endpoint."""
+    max_endpoint_bytes: int = 2 * 2**20
+    """What the nodes, parameters and interfaces of one endpoint take when they are written down. A change of
+    any of them is stored and sent with all the others."""
+    max_user_bytes: int = 32 * 2**20
+    """The same of all of a user's endpoints together."""

@@ -9,6 +9,7 @@ from msgspec.structs import replace
 
 from rce.protocol.names import Form, InterfaceType, Role
 from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
+from rce_master.state import endpoints
 from rce_master.state.records import Connection, Container, Endpoint, Link
 
 if TYPE_CHECKING:
@@ -30,7 +31,8 @@ def add_interface(tx: Transaction, command: AddInterface) -> None:
         )
     if len(endpoint.interfaces) >= tx.settings.max_interfaces:
         raise LimitReached(f"{endpoint.tag!r} has {tx.settings.max_interfaces} interfaces already")
-    tx.put(replace(endpoint, interfaces={**endpoint.interfaces, interface.tag: interface}))
+    size = endpoints.grown(tx, endpoint, interface)
+    tx.put(replace(endpoint, interfaces={**endpoint.interfaces, interface.tag: interface}, size=size))
     tx.touch(endpoint.id)
 
 
@@ -63,7 +65,8 @@ def remove_interface(tx: Transaction, command: RemoveInterface) -> None:
     if command.tag not in endpoint.interfaces:
         raise NotFound(f"there is no interface {_path(endpoint, command.tag)!r}")
     kept = {t: i for t, i in endpoint.interfaces.items() if t != command.tag}
-    tx.put(replace(endpoint, interfaces=kept))
+    size = endpoint.size - endpoints.size_of(endpoint.interfaces[command.tag])
+    tx.put(replace(endpoint, interfaces=kept, size=size))
     tx.touch(endpoint.id)
     for link in tx.tables.links.by("endpoint", endpoint.id):
         rest = {

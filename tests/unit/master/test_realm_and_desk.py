@@ -467,3 +467,19 @@ async def test_a_restarted_master_takes_over_what_runs() -> None:
         assert (await containers.get(Put)).endpoint.id == "anna/second"
         twice = await robots.login()
         assert twice.status == 409
+
+
+async def test_a_request_of_many_parts_is_stored_and_sent_once(cloud: Cloud) -> None:
+    robots, containers = cloud.robots(), cloud.containers()
+    await robots.hello()
+    await containers.hello()
+    await wire(robots)
+    await cloud.flush()
+    while not containers.inbox.empty():
+        containers.inbox.get_nowait()
+    parts = [{"containerTag": "c", "name": f"p{number}", "value": number} for number in range(50)]
+    assert await robots.ask("CN", {"setParam": parts}) == ()
+    put = await containers.get(Put)
+    assert len(put.endpoint.parameters) == 50
+    assert put.endpoint.revision == cloud.realm.spec("anna/c").revision
+    assert containers.inbox.empty()
