@@ -35,9 +35,34 @@ _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
         lambda: _runs("/usr/bin/python3", "-c", "import rospy"),
         "ROS 1 is not installed (Debian: python3-rospy ros-core)",
     ),
+    "actionlib": (
+        lambda: _runs("/usr/bin/python3", "-c", "import actionlib.msg"),
+        "ROS's actionlib is not installed (Debian: python3-actionlib)",
+    ),
+    "tf2": (
+        lambda: _runs("/usr/bin/python3", "-c", "import tf2_ros"),
+        "ROS's tf2 is not installed (Debian: python3-tf2-ros)",
+    ),
     "rostopic": (
         lambda: shutil.which("rostopic") is not None,
         "rostopic is missing (Debian: python3-rostopic)",
+    ),
+    "roscpp": (
+        lambda: _runs("pkg-config", "--exists", "roscpp") and shutil.which("g++") is not None,
+        "roscpp cannot be compiled against (Debian: g++ pkg-config libroscpp-dev libstd-srvs-dev)",
+    ),
+    "roslaunch": (
+        lambda: _runs("/usr/bin/python3", "-c", "import roslaunch, rosmaster, rostest, roswtf"),
+        "roslaunch is missing (Debian: ros-core python3-rostest python3-roswtf)",
+    ),
+    "rosbag": (
+        lambda: shutil.which("rosbag") is not None and _runs("/usr/bin/python3", "-c", "import rosbag"),
+        "rosbag is missing (Debian: python3-rosbag rosbag)",
+    ),
+    "rosmsg": (lambda: shutil.which("rosmsg") is not None, "rosmsg is missing (Debian: python3-rosmsg)"),
+    "topic_tools": (
+        lambda: Path("/usr/lib/topic_tools/relay").exists(),
+        "topic_tools is missing (Debian: topic-tools)",
     ),
     "chromium": (lambda: chromium_path() is not None, "Chromium is not installed (Debian: chromium)"),
     "pymunk": (
