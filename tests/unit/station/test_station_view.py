@@ -12,7 +12,16 @@ from rce_client.station.view import FleetView
 
 
 def robot(name: str, **changes: Any) -> dict[str, Any]:
-    known = {"id": name, "state": "idle", "reason": "", "cell": 3, "goal": -1, "plan": [], "granted": [], "replans": 0}
+    known = {
+        "id": name,
+        "state": "idle",
+        "reason": "",
+        "cell": 3,
+        "goal": -1,
+        "plan": [],
+        "granted": [],
+        "replans": 0,
+    }
     return known | changes
 
 
