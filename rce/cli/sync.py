@@ -1,0 +1,115 @@
+"""``rce sync``: registers what other ROS masters have at the local one, as master_sync does."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import signal
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+import uvloop
+import yaml
+
+from rce.ros.errors import RosError
+from rce.ros.multimaster.errors import MultimasterError
+from rce.ros.multimaster.filters import SyncLists
+from rce.ros.multimaster.settings import local_master
+from rce.ros.multimaster.sync import MasterSync, SyncSettings
+
+
+
+def _names(help_: str, *flags: str) -> Any:
+    return typer.Option(*flags, help=f"{help_} May be repeated or hold commas; * stands for anything.")
+
+
+def sync(
+    topics: Annotated[list[str] | None, _names("Topics to take.", "--topics", "--sync-topics")] = None,
+    services: Annotated[
+        list[str] | None, _names("Services to take.", "--services", "--sync-services")
+    ] = None,
+    nodes: Annotated[list[str] | None, _names("Nodes to take.", "--nodes", "--sync-nodes")] = None,
+    hosts: Annotated[list[str] | None, _names("Masters to take from.", "--hosts", "--sync-hosts")] = None,
+    ignore: Annotated[
+        list[str] | None, _names("Topics and services to leave out; wins over the others.", "--ignore")
+    ] = None,
+    ignore_topics: Annotated[list[str] | None, _names("Topics to leave out.")] = None,
+    ignore_services: Annotated[list[str] | None, _names("Services to leave out.")] = None,
+    ignore_nodes: Annotated[list[str] | None, _names("Nodes to leave out.")] = None,
+    ignore_hosts: Annotated[list[str] | None, _names("Masters to leave out.")] = None,
+    sync_remote_nodes: Annotated[
+        bool, typer.Option(help="Take also nodes that run on another machine than their master.")
+    ] = False,
+    interface: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True, dir_okay=False, help="YAML file with these lists, as master_sync reads it."
+        ),
+    ] = None,
+    distinct_names: Annotated[
+        bool, typer.Option(help="Register nodes as NODE_at_MASTER, so that equal names do not clash.")
+    ] = False,
+    master_uri: Annotated[str, typer.Option(help="The local master; default: ROS_MASTER_URI.")] = "",
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what happens.")] = False,
+) -> None:
+    """Have topics and services of other ROS masters at the local one; needs a discovery."""
+    logging.basicConfig(
+        level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s %(message)s"
+    )
+    chosen = {
+        "sync_topics": _split(topics),
+        "sync_services": _split(services),
+        "sync_nodes": _split(nodes),
+        "sync_hosts": _split(hosts),
+        "ignore_topics": _split(ignore, ignore_topics),
+        "ignore_services": _split(ignore, ignore_services),
+        "ignore_nodes": _split(ignore_nodes),
+        "ignore_hosts": _split(ignore_hosts),
+    }
+    if not nodes:
+        # Who names topics wants no services with them, and the reverse.
+        chosen["ignore_services"] += ["*"] if topics and not services else []
+        chosen["ignore_topics"] += ["*"] if services and not topics else []
+    try:
+        lists = _read_lists(interface, chosen)
+        lists.sync_remote_nodes = lists.sync_remote_nodes or sync_remote_nodes
+        uvloop.run(_run(SyncSettings(master_uri, lists=lists, distinct_names=distinct_names)))
+    except (RosError, ValueError) as error:
+        typer.echo(f"rce sync: {error}", err=True)
+        raise typer.Exit(1) from error
+
+
+def _split(*options: list[str] | None) -> list[str]:
+    """Take options that were given several times or with commas, or both."""
+    return [name for option in options for text in option or () for name in text.split(",") if name]
+
+
+def _read_lists(file: Path | None, options: Mapping[str, list[str]]) -> SyncLists:
+    values: dict[str, Any] = {}
+    if file is not None:
+        try:
+            values = yaml.safe_load(file.read_text("utf-8")) or {}
+        except (OSError, yaml.YAMLError) as error:
+            raise MultimasterError(f"{file} cannot be read: {error}") from error
+        if not isinstance(values, dict):
+            raise MultimasterError(f"{file} must hold 'key: value' lines")
+    for name, patterns in options.items():
+        if patterns:
+            before = values.get(name) or []
+            values[name] = [*(before if isinstance(before, list) else [before]), *patterns]
+    return SyncLists.read(values)
+
+
+async def _run(settings: SyncSettings) -> None:
+    main = asyncio.current_task()
+    assert main is not None
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, main.cancel)
+    with contextlib.suppress(asyncio.CancelledError):
+        typer.echo(f"waiting for the master at {local_master(settings.master_uri)}")
+        async with MasterSync(settings):
+            typer.echo("rce sync ready")
+            await asyncio.Event().wait()

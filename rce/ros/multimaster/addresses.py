@@ -1,0 +1,105 @@
+"""This machine's addresses, and which of them others shall use."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Mapping
+from urllib.parse import urlsplit
+
+import psutil
+
+from rce.ros.multimaster.errors import NoSuchInterface
+from rce.ros.node.settings import LOOPBACK, is_loopback
+
+DEFAULT_GROUP = "226.0.0.0"
+DEFAULT_PORT = 11511
+RPC_PORT_OFFSET = 300
+"""A discovery's RPC server has its master's port plus this."""
+
+DEFAULT_MASTER_PORT = 11311
+
+
+def split_group(text: str) -> tuple[str, str]:
+    """Split ``group@interface``; either part may be missing."""
+    group, _, interface = text.partition("@")
+    return group or DEFAULT_GROUP, interface
+
+
+def address_of(interface: str) -> str:
+    """Return the IPv4 address of an interface, given by its name, address or host name.
+
+    Raises:
+        NoSuchInterface: There is no such interface, or it has no IPv4 address.
+    """
+    for entry in psutil.net_if_addrs().get(interface, ()):
+        if entry.family == socket.AF_INET:
+            return entry.address
+    try:
+        address = socket.gethostbyname(interface)
+    except OSError as error:
+        raise NoSuchInterface(
+            f"{interface!r} is neither an interface with an IPv4 address nor a host"
+        ) from error
+    if address not in local_addresses() and not is_loopback(address):
+        raise NoSuchInterface(f"{interface!r} is not an address of this machine")
+    return address
+
+
+def own_address(interface: str, group: str, environ: Mapping[str, str] | None = None) -> str:
+    """Return the address under which others see this machine.
+
+    Args:
+        interface: The interface to use; if empty, ``ROS_IP`` or ``ROS_HOSTNAME``, else the one that the
+            routing table chooses for ``group``, else loopback.
+        group: The multicast group.
+        environ: The environment.
+
+    Raises:
+        NoSuchInterface: The interface is not there.
+    """
+    environ = os.environ if environ is None else environ
+    named = interface or environ.get("ROS_IP", "") or environ.get("ROS_HOSTNAME", "")
+    if named:
+        return address_of(named)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((group, 9))  # a lookup in the routing table: nothing is sent
+            address: str = probe.getsockname()[0]
+        except OSError:
+            return LOOPBACK
+    return address
+
+
+def local_addresses() -> frozenset[str]:
+    """Return this machine's IPv4 addresses."""
+    return frozenset(
+        entry.address
+        for entries in psutil.net_if_addrs().values()
+        for entry in entries
+        if entry.family == socket.AF_INET
+    )
+
+
+def local_hosts(*more: str) -> frozenset[str]:
+    """Return all names and addresses that mean this machine."""
+    return local_addresses() | {"localhost", LOOPBACK, socket.gethostname(), *more}
+
+
+def public_uri(master_uri: str, address: str) -> str:
+    """Return a master's URI as other machines can use it, with a slash at its end.
+
+    A master that calls itself ``localhost`` would have the same URI as everybody else's.
+    """
+    parts = urlsplit(master_uri)
+    host = parts.hostname or LOOPBACK
+    if is_loopback(host) and not is_loopback(address):
+        host = address
+    return f"http://{host}:{parts.port or DEFAULT_MASTER_PORT}/"
+
+
+def master_name(uri: str) -> str:
+    """Return the name that a master has if nobody gives it one: its host, and its port if that is unusual."""
+    parts = urlsplit(uri)
+    host, port = parts.hostname or LOOPBACK, parts.port or DEFAULT_MASTER_PORT
+    return host if port == DEFAULT_MASTER_PORT else f"{host}_{port}"

@@ -1,0 +1,82 @@
+"""What a discovery shows in its own graph, under the names of master_discovery."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from rce.ros.multimaster import messages
+from rce.ros.multimaster.neighbourhood import Link, Neighbour, PeerEvent
+from rce.ros.node import Node, Publisher
+from rce.ros.types.values import Time
+
+NAME_PARAMETER = "/mastername"
+"""Set by master_discovery too."""
+
+URI_PARAMETER = "~masteruri"
+"""The master's URI as other machines are told."""
+
+
+class Announcements:
+    """The topics and services of a discovery node."""
+
+    def __init__(self, changes: Publisher, link_stats: Publisher) -> None:
+        self._changes = changes
+        self._link_stats = link_stats
+
+    @classmethod
+    async def open(
+        cls,
+        node: Node,
+        masters: Callable[[], Iterable[Neighbour]],
+        refresh: Callable[[], None],
+        *,
+        name: str,
+        uri: str,
+    ) -> Announcements:
+        """Advertise everything.
+
+        Args:
+            node: The discovery node.
+            masters: Tells the known masters.
+            refresh: Asks all masters for their state.
+            name: The local master's name.
+            uri: The local master's URI as others are told.
+
+        Raises:
+            MasterError: The master cannot be told.
+        """
+        changes = await node.advertise("~changes", messages.MASTER_STATE)
+        link_stats = await node.advertise("~linkstats", messages.LINK_STATES)
+
+        def list_masters(_request: Any) -> dict[str, Any]:
+            return {"masters": [messages.ros_master(master) for master in masters()]}
+
+        def refresh_all(_request: Any) -> None:
+            refresh()
+
+        await node.advertise_service("~list_masters", messages.DISCOVER_MASTERS, list_masters)
+        await node.advertise_service("~refresh", messages.EMPTY, refresh_all)
+        announcements = cls(changes, link_stats)
+        await announcements.set_parameters(node, name, uri)
+        return announcements
+
+    @staticmethod
+    async def set_parameters(node: Node, name: str, uri: str) -> None:
+        """Leave the master's name and URI at the master."""
+        await node.set_param(NAME_PARAMETER, name)
+        await node.set_param(URI_PARAMETER, uri)
+
+    def tell(self, event: PeerEvent) -> None:
+        """Publish a change."""
+        self._changes.publish(messages.master_state(event))
+
+    def tell_links(self, name: str, links: Iterable[Link], now: float) -> None:
+        """Publish the quality of all links, seen from the master ``name`` at ``now`` (seconds since 1970)."""
+        if self._link_stats.connections == 0:
+            return
+        secs, fraction = divmod(now, 1)
+        self._link_stats.publish(
+            header={"stamp": Time(int(secs), int(fraction * 1e9)), "frame_id": name},
+            links=[{"destination": link.name, "quality": link.quality} for link in links],
+        )

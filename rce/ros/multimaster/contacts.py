@@ -1,0 +1,92 @@
+"""Questions to other discoveries and to synchronizations."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Any
+
+from rce.ros.errors import MasterError, ServiceError, XmlRpcError
+from rce.ros.multimaster import messages
+from rce.ros.multimaster.errors import MalformedState
+from rce.ros.multimaster.filters import SyncFilter
+from rce.ros.multimaster.monitor import Origins
+from rce.ros.multimaster.neighbourhood import Contact, PeerKey
+from rce.ros.multimaster.source import Snapshot
+from rce.ros.multimaster.state import MasterInfo, host_of
+from rce.ros.node import Node, ServiceClient
+from rce.ros.types.exceptions import SerializationError
+from rce.ros.xmlrpc import RpcClient
+
+_log = logging.getLogger(__name__)
+
+CONTACT_TIMEOUT = 5.0
+STATE_TIMEOUT = 20.0
+ORIGINS_TIMEOUT = 3.0
+"""Seconds that others get to answer."""
+
+SYNC_INFO = "get_sync_info"
+
+
+async def ask_contact(rpc: RpcClient, key: PeerKey) -> Contact:
+    """Ask a discovery who it is.
+
+    Raises:
+        MalformedState: It does not answer, or not in the known form, or does not know its master yet.
+    """
+    try:
+        answer = await rpc.call(key.monitor_uri, "masterContacts", (), timeout=CONTACT_TIMEOUT)
+        stamp, master_uri, name, node, _ = answer
+        if float(stamp) == 0:
+            raise MalformedState(f"the discovery at {key.monitor_uri} does not know its master yet")
+    except (XmlRpcError, TypeError, ValueError) as error:
+        raise MalformedState(f"the discovery at {key.monitor_uri} does not say who it is: {error}") from error
+    return Contact(str(master_uri), str(name), str(node))
+
+
+async def ask_state(rpc: RpcClient, monitor_uri: str, chosen: SyncFilter) -> MasterInfo:
+    """Ask a discovery for its master's state, as far as it passes a filter.
+
+    Raises:
+        XmlRpcError: No answer, or the discovery refuses one.
+        MalformedState: The answer is not of the known form.
+    """
+    answer = await rpc.call(monitor_uri, "masterInfoFiltered", (chosen.to_wire(),), timeout=STATE_TIMEOUT)
+    return MasterInfo.from_wire(answer)
+
+
+class OriginsReader:
+    """Asks the synchronizations at a master where what they registered came from."""
+
+    def __init__(self, node: Node, hosts: Callable[[], frozenset[str]]) -> None:
+        """Prepare to ask.
+
+        Args:
+            node: Asks.
+            hosts: Tells all names and addresses of this machine: other machines' synchronizations are not
+                asked.
+        """
+        self._node = node
+        self._hosts = hosts
+        self._clients: dict[str, ServiceClient] = {}
+
+    async def read(self, snapshot: Snapshot) -> Origins:
+        """Ask all that are among the registrations in ``snapshot``."""
+        hosts = self._hosts()
+        found: list[Any] = []
+        for service, uri in snapshot.service_uris.items():
+            if service.endswith(SYNC_INFO) and host_of(uri) in hosts:
+                found += await self._ask(service)
+        return messages.read_origins(found)
+
+    async def _ask(self, service: str) -> list[Any]:
+        client = self._clients.get(service)
+        if client is None:
+            client = self._node.service_client(service, messages.GET_SYNC_INFO, persistent=False)
+            self._clients[service] = client
+        try:
+            answer = await client.call({}, timeout=ORIGINS_TIMEOUT)
+        except (ServiceError, MasterError, SerializationError) as error:
+            _log.warning("what is registered by others is not known: %s", error)
+            return []
+        return list(answer.hosts)

@@ -1,0 +1,65 @@
+"""Finding the discovery that runs at a master, and asking it for all masters."""
+
+from __future__ import annotations
+
+from rce.ros.errors import MasterRefused
+from rce.ros.multimaster import messages
+from rce.ros.multimaster.errors import NoDiscovery
+from rce.ros.multimaster.neighbourhood import Neighbour
+from rce.ros.node import Node
+from rce.ros.node.master import MasterClient
+from rce.ros.xmlrpc import RpcClient
+
+LIST_SERVICE = "/list_masters"
+ASK_TIMEOUT = 5.0
+
+
+async def list_masters(master_uri: str) -> list[Neighbour]:
+    """Return the masters that the discovery at ``master_uri`` knows, fkie's or ours.
+
+    Raises:
+        NoDiscovery: None runs there.
+        MasterError: The master does not answer.
+        ServiceError: The discovery does not answer.
+    """
+    asker = Node(
+        "list_masters",
+        argv=[],
+        master_uri=master_uri,
+        types=messages.registry(),
+        anonymous=True,
+        master_timeout=0,
+    )
+    async with RpcClient() as rpc, asker as node:
+        return await masters_known_at(node, MasterClient(master_uri, node.name, node.uri, rpc))
+
+
+async def masters_known_at(node: Node, master: MasterClient) -> list[Neighbour]:
+    """Return the masters that the discovery in a node's graph knows.
+
+    Raises:
+        NoDiscovery: None runs there.
+        MasterError: The master does not answer.
+        ServiceError: The discovery does not answer.
+    """
+    service = await find_service(master, LIST_SERVICE)
+    client = node.service_client(service, messages.DISCOVER_MASTERS, persistent=False)
+    answer = await client.call({}, timeout=ASK_TIMEOUT)
+    return [messages.read_ros_master(entry) for entry in answer.masters]
+
+
+async def find_service(master: MasterClient, ending: str) -> str:
+    """Return the first service whose name ends so.
+
+    Raises:
+        NoDiscovery: There is none.
+        MasterUnreachable: The master does not answer.
+    """
+    try:
+        state = await master.call("getSystemState")
+    except MasterRefused as error:
+        raise NoDiscovery(str(error)) from error
+    names: list[str] = [name for name, _ in state[2] if name.endswith(ending)]
+    if not names:
+        raise NoDiscovery(f"no discovery runs at {master.uri}: start 'rce discovery' there")
+    return min(names)

@@ -1,0 +1,207 @@
+"""A synchronization: what other masters have, as far as the user wants it, is here too."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from contextlib import AsyncExitStack
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any, Self
+
+from rce.ros.errors import MasterError, ServiceError
+from rce.ros.multimaster import messages
+from rce.ros.multimaster.errors import NoDiscovery
+from rce.ros.multimaster.filters import SyncLists
+from rce.ros.multimaster.listing import masters_known_at
+from rce.ros.multimaster.neighbourhood import Neighbour, PeerChange
+from rce.ros.multimaster.registrar import Registrar
+from rce.ros.multimaster.remote import DirectRemote, Remote
+from rce.ros.multimaster.settings import local_master
+from rce.ros.node import Node
+from rce.ros.node.master import MasterClient
+from rce.ros.tasks import TaskScope
+from rce.ros.xmlrpc import RpcClient
+
+_log = logging.getLogger(__name__)
+
+DISCOVERY_URI = "/master_discovery/masteruri"
+REFRESH = 5.0
+"""Seconds between complete looks at the discovery's list, besides the changes that it tells."""
+
+LOOK_FOR_DISCOVERY = 0.5
+WATCH_MASTER = 1.0
+GOODBYE_TIMEOUT = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class SyncSettings:
+    """Settings of one synchronization."""
+
+    master_uri: str = ""
+    """The local master; if empty, ``ROS_MASTER_URI``."""
+    node_name: str = "master_sync"
+    lists: SyncLists = field(default_factory=SyncLists)
+    distinct_names: bool = False
+    """Register remote nodes as ``NODE_at_MASTER``."""
+
+
+class MasterSync:
+    """Registers what other masters have at the local one. An async context manager, working inside its block.
+
+    It needs a discovery at the local master, ours or fkie's, and waits for one. Leaving the block takes
+    everything back.
+    """
+
+    def __init__(self, settings: SyncSettings | None = None) -> None:
+        self.settings = settings or SyncSettings()
+        self._master_uri = local_master(self.settings.master_uri)
+        self._remotes: dict[str, Remote] = {}
+        self._own_uri = ""
+        self._changes_topics: set[str] = set()
+        self._stack = AsyncExitStack()
+        self._node: Node
+        self._master: MasterClient
+        self._tasks: TaskScope
+        self._rpc: RpcClient
+        self.registrar: Registrar
+
+    @property
+    def masters(self) -> list[str]:
+        """Names of the masters that are synchronized with and online."""
+        return sorted(remote.master.name for remote in self._remotes.values() if remote.is_online)
+
+    # ------------------------------------------------------------------ life
+
+    async def __aenter__(self) -> Self:
+        async with AsyncExitStack() as stack:
+            self._rpc = await stack.enter_async_context(RpcClient())
+            self._node = await stack.enter_async_context(
+                Node(
+                    self.settings.node_name,
+                    argv=[],
+                    master_uri=self._master_uri,
+                    types=messages.registry(),
+                    master_timeout=None,
+                )
+            )
+            self._master = MasterClient(self._master_uri, self._node.name, self._node.uri, self._rpc)
+            background = await stack.enter_async_context(TaskScope())
+            self.registrar = Registrar(self._node, self._master, background)
+            await self.registrar.take_back_leftovers()
+            await self._node.advertise_service("~get_sync_info", messages.GET_SYNC_INFO, self._sync_info)
+            stack.push_async_callback(self._take_back)
+            self._tasks = await stack.enter_async_context(TaskScope())
+            self._tasks.start(self._follow_discovery(), name="follow the discovery")
+            self._tasks.start(self._watch_master(), name="watch the master")
+            self._stack = stack.pop_all()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._stack.aclose()
+
+    async def _take_back(self) -> None:
+        try:
+            async with asyncio.timeout(GOODBYE_TIMEOUT):
+                for origin in list(self.registrar.held):
+                    await self.registrar.release(origin)
+        except (MasterError, TimeoutError) as error:
+            _log.warning("not everything is taken back: %s", str(error) or "it took too long")
+
+    def _sync_info(self, _request: Any) -> dict[str, Any]:
+        return {
+            "hosts": [
+                messages.sync_master_info(origin, entries) for origin, entries in self.registrar.held.items()
+            ]
+        }
+
+    # ------------------------------------------------------------------ the discovery
+
+    async def _follow_discovery(self) -> None:
+        """Keep the remotes as the discovery's list has them; its changes come in between."""
+        has_discovery = True
+        while True:
+            try:
+                masters = await masters_known_at(self._node, self._master)
+                await self._listen_for_changes()
+                self._own_uri = await self._ask_own_uri()
+            except (NoDiscovery, ServiceError, MasterError) as error:
+                if has_discovery:
+                    _log.warning("%s", error)
+                has_discovery = False
+            else:
+                has_discovery = True
+                self._take_list(masters)
+            await asyncio.sleep(REFRESH if has_discovery else LOOK_FOR_DISCOVERY)
+
+    async def _ask_own_uri(self) -> str:
+        """Return the local master's URI as its discovery tells others."""
+        uri: str = await self._node.get_param(DISCOVERY_URI, "") or await self._master.call("getUri")
+        return uri
+
+    async def _listen_for_changes(self) -> None:
+        types = await self._master.call("getTopicTypes")
+        found = {topic for topic, kind in types if kind == messages.MASTER_STATE} - self._changes_topics
+        for topic in found:
+            await self._node.subscribe(topic, messages.MASTER_STATE, self._take_change)
+            self._changes_topics.add(topic)
+
+    def _take_list(self, masters: list[Neighbour]) -> None:
+        for master in masters:
+            self._take(master)
+        for gone in self._remotes.keys() - {master.uri for master in masters}:
+            self._remotes[gone].leave()
+
+    def _take_change(self, message: Any) -> None:
+        try:
+            event = messages.read_master_state(message)
+        except ValueError as error:
+            _log.warning("a change that is not understood: %s", error)
+            return
+        if event.change is not PeerChange.REMOVED:
+            self._take(event.master)
+        elif event.master.uri in self._remotes:
+            self._remotes[event.master.uri].leave()
+
+    def _take(self, master: Neighbour) -> None:
+        remote = self._remotes.get(master.uri)
+        if remote is not None:
+            remote.update(master)
+        elif self._own_uri not in ("", master.uri) and self.settings.lists.takes_host(master.name):
+            remote = self._remotes[master.uri] = self._make_remote(master)
+            self._tasks.start(self._run(remote), name=f"synchronize with {master.name}")
+
+    def _make_remote(self, master: Neighbour) -> Remote:
+        chosen = self.settings.lists.filter_for(master.name, never_nodes=(master.discoverer, self._node.name))
+        return DirectRemote(
+            master,
+            own_uri=self._own_uri,
+            chosen=chosen,
+            registrar=self.registrar,
+            rpc=self._rpc,
+            distinct_names=self.settings.distinct_names,
+        )
+
+    async def _run(self, remote: Remote) -> None:
+        try:
+            await remote.run()
+        finally:
+            del self._remotes[remote.master.uri]
+
+    # ------------------------------------------------------------------ the own master
+
+    async def _watch_master(self) -> None:
+        """Register everything again when another process stands in the master's place."""
+        known = None
+        while True:
+            try:
+                pid = await self._master.call("getPid")
+                if known not in (None, pid):
+                    _log.warning("the master at %s was restarted", self._master_uri)
+                    await self.registrar.restore()
+                known = pid
+            except MasterError as error:
+                _log.debug("%s", error)
+            await asyncio.sleep(WATCH_MASTER)

@@ -1,0 +1,158 @@
+"""Synchronization between our cores, each with discovery and sync of its own."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+from support.multimaster import STRING, Neighbourhood
+
+from rce.ros.multimaster.filters import SyncLists
+from rce.ros.node import Node
+
+
+def node(name: str, uri: str, **more: Any) -> Node:
+    return Node(name, argv=[], master_uri=uri, **more)
+
+
+async def test_a_topic_reaches_the_other_master(neighbourhood: Neighbourhood) -> None:
+    async with neighbourhood.machine() as a, neighbourhood.machine() as b:
+        async with node("talker", a.uri) as talker, node("listener", b.uri) as listener:
+            heard = await listener.subscribe("chatter", STRING)
+            publisher = await talker.advertise("chatter", STRING)
+            await heard.wait_for_publishers(timeout=20)
+            publisher.publish(data="hello")
+            assert (await anext(aiter(heard))).data == "hello"
+            await b.until(lambda graph: graph.publishers("/chatter") == {"/talker": talker.uri})
+            await a.until(lambda graph: graph.subscribers("/chatter") == {"/listener": listener.uri})
+        await b.until(lambda graph: "/chatter" not in graph.topic_types)
+        await a.until(lambda graph: "/chatter" not in graph.topic_types)
+
+
+async def test_a_service_can_be_called_from_the_other_master(neighbourhood: Neighbourhood) -> None:
+    async with neighbourhood.machine() as a, neighbourhood.machine() as b:
+        async with node("server", a.uri) as server, node("caller", b.uri) as caller:
+            await server.advertise_service("add", "roscpp/GetLoggers", lambda _: {"loggers": [{"name": "x"}]})
+            await b.until(lambda graph: graph.service("/add") is not None)
+            answer = await caller.service_client("add", "roscpp/GetLoggers")()
+            assert [logger.name for logger in answer.loggers] == ["x"]
+        await b.until(lambda graph: graph.service("/add") is None)
+
+
+async def test_only_what_was_chosen_is_synchronized(neighbourhood: Neighbourhood) -> None:
+    lists = SyncLists.read({"sync_topics": ["/robot/*"], "ignore_topics": ["/robot/secret"]})
+    async with (
+        neighbourhood.machine() as a,
+        neighbourhood.machine(lists=lists) as b,
+        node("talker", a.uri) as talker,
+    ):
+        for topic in ("/robot/secret", "/other", "/rosout_agg", "/robot/pose"):
+            await talker.advertise(topic, STRING)
+        await b.until(lambda graph: "/robot/pose" in graph.topic_types)
+        topics = {name for name in b.graph.topic_types if not name.startswith("/master_")}
+        assert topics == {"/robot/pose", "/rosout"}
+
+
+async def test_three_masters_do_not_pass_things_on_in_a_circle(neighbourhood: Neighbourhood) -> None:
+    async with (
+        neighbourhood.machine() as a,
+        neighbourhood.machine() as b,
+        neighbourhood.machine() as c,
+        node("talker", a.uri) as talker,
+    ):
+        await talker.advertise("chatter", STRING)
+        for machine in (b, c):
+            await machine.until(lambda graph: graph.publishers("/chatter") == {"/talker": talker.uri})
+        assert a.sync.registrar.held == {}
+        assert list(b.sync.registrar.held) == list(c.sync.registrar.held) == [a.uri]
+        assert a.discovery.info is not None
+        stamp = a.discovery.info.stamp_local
+        await asyncio.sleep(1)  # nothing may happen
+        assert a.discovery.info.stamp_local == stamp
+        await talker.advertise("more", STRING)
+        await c.until(lambda graph: "/more" in graph.topic_types)
+        assert b.discovery.info is not None
+        assert b.discovery.info.nodes["/talker"].master_uri == a.uri
+
+
+async def test_what_a_vanished_master_had_is_taken_back(neighbourhood: Neighbourhood) -> None:
+    async with (
+        neighbourhood.machine() as b,
+        neighbourhood.machine() as a,
+        node("talker", a.uri) as talker,
+    ):
+        await talker.advertise("chatter", STRING)
+        await b.until(lambda graph: "/chatter" in graph.topic_types)
+        a.discovery._socket.send_to = lambda *_: None  # type: ignore[method-assign] # no good-bye either
+        await b.until(lambda graph: "/chatter" not in graph.topic_types)
+        assert [master.online for master in b.discovery.masters if master.uri == a.uri] == [False]
+
+
+async def test_nodes_of_one_name_do_not_kill_each_other(
+    neighbourhood: Neighbourhood, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with (
+        neighbourhood.machine() as a,
+        neighbourhood.machine() as b,
+        node("camera", a.uri) as one,
+        node("camera", b.uri) as other,
+        node("talker", a.uri) as talker,
+    ):
+        await one.advertise("left", STRING)
+        await other.advertise("right", STRING)
+        await talker.advertise("chatter", STRING)
+        await b.until(lambda graph: "/chatter" in graph.topic_types)
+        await asyncio.sleep(0.5)
+        assert not one.is_shutdown
+        assert not other.is_shutdown
+        assert "/left" not in b.graph.topic_types
+        assert "node /camera" in caplog.text
+
+
+async def test_nodes_of_one_name_can_be_told_apart(neighbourhood: Neighbourhood) -> None:
+    async with (
+        neighbourhood.machine() as a,
+        neighbourhood.machine(distinct_names=True) as b,
+        node("camera", a.uri) as one,
+        node("camera", b.uri) as other,
+    ):
+        await one.advertise("left", STRING)
+        await other.advertise("right", STRING)
+        await b.until(lambda graph: "/left" in graph.topic_types)
+        (name,) = b.graph.publishers("/left")
+        assert name.startswith("/camera_at_127_0_0_1_")
+        assert not one.is_shutdown
+        assert not other.is_shutdown
+
+
+async def test_a_restarted_node_is_registered_anew(neighbourhood: Neighbourhood) -> None:
+    async with (
+        neighbourhood.machine() as a,
+        neighbourhood.machine() as b,
+        node("listener", b.uri) as listener,
+    ):
+        heard = await listener.subscribe("chatter", STRING)
+        for word in ("first", "second"):
+            async with node("talker", a.uri) as talker:
+                publisher = await talker.advertise("chatter", STRING)
+                await publisher.wait_for_subscribers(timeout=20)
+                publisher.publish(data=word)
+                async with asyncio.timeout(20):
+                    assert (await anext(aiter(heard))).data == word
+
+
+async def test_what_a_killed_synchronization_left_is_taken_back_by_the_next(
+    neighbourhood: Neighbourhood,
+) -> None:
+    from rce.ros.multimaster.sync import MasterSync, SyncSettings
+
+    async with neighbourhood.machine() as b:
+        async with neighbourhood.machine() as a, node("talker", a.uri) as talker:
+            await talker.advertise("chatter", STRING)
+            await b.until(lambda graph: "/chatter" in graph.topic_types)
+            b.sync.registrar.held.clear()  # as if it were killed: it takes nothing back
+        await b.sync.__aexit__(None, None, None)
+        assert "/chatter" in b.graph.topic_types
+        async with MasterSync(SyncSettings(b.uri)):
+            await b.until(lambda graph: "/chatter" not in graph.topic_types)
