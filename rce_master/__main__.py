@@ -51,6 +51,7 @@ def command(
 ) -> None:
     """Run the Master Task Set: HTTP for clients on 9000, control of task sets on 8080."""
     logging.basicConfig(level=log_level.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    logging.getLogger("websockets").setLevel(logging.WARNING)
     given = {
         "bind": bind,
         "http_port": http_port,

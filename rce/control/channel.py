@@ -180,7 +180,10 @@ class TaskSetChannel:
                 close_timeout=self._timeouts.close,
                 max_size=MAX_FRAME,
             ) as socket:
-                await self._talk(socket)
+                try:
+                    await self._talk(socket)
+                finally:
+                    await socket.close()  # a cancelled context manager would report an internal error
         except InvalidStatus as error:
             status = error.response.status_code
             if status in (HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN):

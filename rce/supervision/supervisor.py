@@ -53,7 +53,8 @@ class Supervisor:
                 await asyncio.Event().wait()
             finally:
                 for task, _ in reversed(keepers):
-                    task.cancel()
+                    if not task.cancelling():  # a second time would cut short how it ends its program
+                        task.cancel()
                     await asyncio.wait([task])
 
     async def _until_ready(self, program: Program, ready: asyncio.Event) -> None:
