@@ -15,8 +15,9 @@ from rce.config.folders import default_state_dir
 from rce_master.auth import Authenticator, client_digest
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
-from rce_master.cli.exceptions import NotLoggedIn
+from rce_master.cli.exceptions import CliError, NotLoggedIn
 from rce_master.cli.session import read_password
+from rce_master.exceptions import StoreBusy
 from rce_master.state import commands
 from rce_master.state.core import State
 from rce_master.state.records import User, UserRole
@@ -172,7 +173,10 @@ async def _open_store(state_dir: Path) -> AsyncIterator[_StoreDirectory]:
     # Of `rce up`'s state folder, the master's part is a folder in it.
     inner = state_dir / "master"
     folder = inner if inner.is_dir() or state_dir == default_state_dir() else state_dir
-    store = await SqliteStore.open(folder)
+    try:
+        store = await SqliteStore.open(folder)
+    except StoreBusy as error:
+        raise CliError(f"{error}; to work over its API, log in there: rce login") from error
     try:
         directory = _StoreDirectory(State.load(await store.load(), time.monotonic()), store)
         try:
