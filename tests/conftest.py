@@ -8,15 +8,22 @@ import shutil
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from functools import cache
 from pathlib import Path
 
+import hypothesis
 import psutil
 import pytest
 
 REQUIRE_ALL = os.environ.get("RCE_REQUIRE_ALL") == "1"
 LEAK_PATIENCE_S = 3.0
+
+# Nothing fails for being slow: not on a busy machine, nor at the first run, which makes hypothesis's tables.
+hypothesis.settings.register_profile(
+    "rce", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
+hypothesis.settings.load_profile("rce")
 
 
 def _runs(*argv: str) -> bool:
@@ -105,19 +112,26 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     for marker in item.iter_markers("needs"):
         for tool in marker.args:
             reason = missing(tool)
-            if reason is None:
-                continue
-            if REQUIRE_ALL:
-                pytest.fail(f"{reason}; a skip is a failure here (RCE_REQUIRE_ALL=1)", pytrace=False)
-            pytest.skip(reason)
+            if reason is not None:
+                pytest.skip(reason)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Where everything has to be there, a skip is a failure, whoever asked for it."""
+    report = yield
+    if REQUIRE_ALL and report.skipped and not hasattr(report, "wasxfail"):
+        reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr
+        report.outcome = "failed"
+        report.longrepr = f"{reason}; a skip is a failure here (RCE_REQUIRE_ALL=1)"
+    return report
 
 
 @pytest.fixture(scope="session")
 def rce_data() -> Path:
-    """The folder of public maps and lidar logs."""
+    """The folder of public maps and lidar logs, for tests that are marked with ``needs("data")``."""
     folder = data_folder()
-    if folder is None:
-        pytest.skip("the folder of public maps and logs is absent (set RCE_DATA)")
+    assert folder is not None
     return folder
 
 
