@@ -13,7 +13,7 @@ from rce.ros.actions.tracker import GoalTracker
 from rce.ros.node.queue import DropOldest
 
 if TYPE_CHECKING:
-    from rce.ros.types import Message
+    from rce.ros.types import Message, Time
 
 FEEDBACK_QUEUE = 100
 """How many feedbacks wait for an iteration before the oldest is dropped."""
@@ -57,6 +57,11 @@ class ClientGoal:
     def id(self) -> str:
         """The goal's name, unique in the graph."""
         return self.goal_id.id
+
+    @property
+    def stamp(self) -> Time:
+        """When it was made; what :meth:`~rce.ros.actions.ActionClient.cancel_before` goes by."""
+        return self.goal_id.time
 
     @property
     def state(self) -> GoalState:

@@ -42,6 +42,11 @@ class GoalId:
         return cls(message.id, message.stamp.to_nsec())
 
     @property
+    def time(self) -> Time:
+        """The stamp as messages carry it."""
+        return Time(*divmod(self.stamp, NANOSECONDS))
+
+    @property
     def fields(self) -> dict[str, Any]:
         """The fields of an ``actionlib_msgs/GoalID``."""
-        return {"stamp": Time(*divmod(self.stamp, NANOSECONDS)), "id": self.id}
+        return {"stamp": self.time, "id": self.id}

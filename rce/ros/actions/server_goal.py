@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 from rce.ros.actions.goal_id import GoalId
 from rce.ros.actions.ledger import Entry
 from rce.ros.actions.states import GoalEvent, GoalState
-from rce.ros.types.values import NANOSECONDS, Time
 
 if TYPE_CHECKING:
-    from rce.ros.types import Message
+    from rce.ros.types import Message, Time
 
 Content = Mapping[str, Any]
 """The fields of a message."""
@@ -57,7 +56,7 @@ class ServerGoal:
     @property
     def stamp(self) -> Time:
         """When the client made the goal."""
-        return Time(*divmod(self._entry.goal_id.stamp, NANOSECONDS))
+        return self._entry.goal_id.time
 
     @property
     def state(self) -> GoalState:
