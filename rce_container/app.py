@@ -22,7 +22,7 @@ from rce.config.secret import Secret
 from rce.control.channel import TaskSetChannel
 from rce.control.messages import MachineInfo
 from rce.link.handover import Doorman
-from rce.ros.packages import PackageIndex
+from rce.ros.packages import PackageIndex, installed_shares
 from rce_container.dial import own_address
 from rce_container.exceptions import RuntimeUnavailableError
 from rce_container.folder import StateFolder
@@ -142,10 +142,11 @@ def choose_runtime(wish: str, runtimes: dict[str, Runtime]) -> tuple[Runtime, st
 
 
 def package_path(given: Sequence[Path]) -> tuple[Path, ...]:
-    """All folders with packages: those given, those of the environment variables, the shipped examples."""
+    """All folders with packages: given, of the environment variables, the examples, the machine's ROS."""
     paths = [*given, *PackageIndex.from_environ().path]
     with contextlib.suppress(ShippedFileError):
         paths.append(examples_dir())
+    paths += installed_shares()
     return tuple(dict.fromkeys(path.absolute() for path in paths))
 
 

@@ -149,6 +149,12 @@ class PackageIndex:
         return os.pathsep.join(map(str, self.path)) or "empty"
 
 
+def installed_shares() -> list[Path]:
+    """Return the folders in which this machine's ROS distributions keep their packages."""
+    candidates = [*sorted(Path("/opt/ros").glob("*/share")), Path("/usr/share")]
+    return [share for share in candidates if (share / "std_msgs").is_dir()]
+
+
 def _child(root: Path, name: str) -> Path | None:
     folder = root / name
     if _is_package(folder):
@@ -167,7 +173,12 @@ def _itself(root: Path, name: str) -> Path | None:
 
 
 def _renamed(root: Path, name: str) -> Path | None:
-    """Find a package whose manifest gives it another name than its folder has."""
+    """Find a package whose manifest gives it another name than its folder has.
+
+    Distributions install no such packages, but hundreds of others.
+    """
+    if root.name == "share":
+        return None
     try:
         folders = sorted(entry for entry in root.iterdir() if _manifest(entry) is not None)
     except OSError:

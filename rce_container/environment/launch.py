@@ -9,6 +9,7 @@ from rce.control.model import NodeSpec
 from rce.ros.packages import PackageIndex
 from rce.ros.substitution import split_arguments
 from rce_container.environment.exceptions import NodeError
+from rce_container.environment.system import system_environ
 
 NODE_MARK = "RCE_NODE"
 """Environment variable that every process of a node carries; its value names one life of one node."""
@@ -36,11 +37,14 @@ def prepare(spec: NodeSpec, packages: PackageIndex, environ: Mapping[str, str], 
         NodeError: It cannot be started; the text says what to do.
     """
     try:
-        executable = packages.find(spec.pkg).executable(spec.exe)
+        package = packages.find(spec.pkg)
+        executable = package.executable(spec.exe)
         arguments = split_arguments(spec.args, packages, environ)
     except (LookupError, ValueError, OSError) as error:
         raise NodeError(str(error)) from error
     namespace = spec.namespace.strip("/")
+    if package.python == "system":
+        environ = system_environ(environ, package.path)
     env = {**environ, NODE_MARK: mark}
     if spec.name:
         arguments.append(f"__name:={spec.name}")

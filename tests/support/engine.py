@@ -119,9 +119,23 @@ class Engine:
     """Master, robot and container task sets on ports of their own."""
 
     def __init__(
-        self, folder: Path, *, runtime: str = "process", robots: int = 1, apart: bool = False
+        self,
+        folder: Path,
+        *,
+        runtime: str = "process",
+        robots: int = 1,
+        apart: bool = False,
+        packages: Path | None = None,
     ) -> None:
-        """``apart``: every task set takes itself to be on a machine of its own, so that links go over TCP."""
+        """Prepare an engine.
+
+        Args:
+            folder: For state and logs.
+            runtime: Of the containers.
+            robots: How many robot task sets.
+            apart: Every task set takes itself to be on a machine of its own, so that links go over TCP.
+            packages: A folder with more packages.
+        """
         self.folder = folder
         self.http_port, self.control_port, *rest = free_ports(3 + 2 * robots)
         self.runtime = runtime
@@ -132,6 +146,7 @@ class Engine:
             "PYTHONUNBUFFERED": "1",
             "XDG_RUNTIME_DIR": str(folder),
             "RCE_SECRET": "a secret for the tests",
+            **({"RCE_PACKAGE_PATH": str(packages)} if packages else {}),
         }
         self.master = self._program(
             "rce-master",

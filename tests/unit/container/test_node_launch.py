@@ -10,6 +10,7 @@ import pytest
 
 from rce.control.model import NodeSpec
 from rce.ros.packages import PackageIndex
+from rce_container.environment import system
 from rce_container.environment.exceptions import NodeError
 from rce_container.environment.launch import NODE_MARK, prepare
 from rce_container.environment.nodes import describe_exit
@@ -63,6 +64,35 @@ def test_a_node_may_choose_its_name(packages: PackageIndex) -> None:
 def test_faults_say_what_is_wrong(packages: PackageIndex, spec: NodeSpec, text: str) -> None:
     with pytest.raises(NodeError, match=text):
         prepare(spec, packages, {}, "mark")
+
+
+def test_a_node_of_a_ros_package_gets_the_machines_python(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    engine = str(Path(sys.executable).parent)
+    environ = {"PATH": f"{engine}:/usr/bin", "PYTHONPATH": "/engine", "VIRTUAL_ENV": engine, "HOME": "/h"}
+    for name, manifest in (("real", "package.xml"), ("maps", "package.yaml")):
+        (tmp_path / name / "scripts").mkdir(parents=True)
+        (tmp_path / name / manifest).write_text("<package/>" if manifest.endswith("xml") else "")
+        (tmp_path / name / "scripts" / "node.py").touch(0o755)
+    packages = PackageIndex([tmp_path])
+    monkeypatch.setattr(system, "ROS_PREFIXES", tmp_path / "none")
+    real = prepare(NodeSpec(tag="n", pkg="real", exe="node.py"), packages, environ, "mark")
+    assert real.argv == [str(tmp_path / "real" / "scripts" / "node.py")]
+    assert real.env == {"PATH": "/usr/bin", "HOME": "/h", NODE_MARK: "mark"}
+    ours = prepare(NodeSpec(tag="n", pkg="maps", exe="node.py"), packages, environ, "mark")
+    assert ours.env == {**environ, NODE_MARK: "mark"}
+
+
+def test_a_distribution_in_opt_is_set_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("kinetic", "noetic"):
+        (tmp_path / name / "share" / "talker").mkdir(parents=True)
+    monkeypatch.setattr(system, "ROS_PREFIXES", tmp_path)
+    noetic = tmp_path / "noetic"
+    env = system.system_environ({"PATH": "/bin"}, noetic / "share" / "talker")
+    assert env["ROS_DISTRO"] == "noetic"
+    assert env["PATH"] == f"{noetic}/bin:/bin"
+    assert env["PYTHONPATH"] == f"{noetic}/lib/python3/dist-packages"
 
 
 def test_exits_in_words() -> None:

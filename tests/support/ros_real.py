@@ -1,0 +1,185 @@
+"""A real ROS 1 beside ours: its tools and nodes as processes, at our core or at its own."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from rce.ros.core import Core
+from rce.ros.errors import XmlRpcError
+from rce.ros.xmlrpc import RpcClient
+
+PATIENCE_S = 45.0
+"""Seconds that a program of a real ROS may take: some start slowly."""
+
+
+def ros_environment(uri: str, home: Path) -> dict[str, str]:
+    """What programs of a real ROS need; without this project's Python."""
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("PYTHON", "VIRTUAL_ENV", "ROS_", "RCE_"))
+    }
+    return kept | {
+        "ROS_MASTER_URI": uri,
+        "ROS_IP": "127.0.0.1",
+        "ROS_PACKAGE_PATH": f"{home}:/usr/share",
+        "PATH": "/usr/bin:/bin",
+        "HOME": str(home),
+        "PYTHONUNBUFFERED": "1",
+    }
+
+
+class Graph:
+    """A ROS graph with a core of either kind."""
+
+    def __init__(self, uri: str, home: Path, kind: str) -> None:
+        self.uri = uri
+        self.kind = kind
+        self.home = home
+        self.env = ros_environment(uri, home)
+
+    async def tool(self, *argv: str, check: bool = True, stdin: str = "") -> str:
+        """Run a command line tool to its end; return what it prints."""
+        process = await asyncio.create_subprocess_exec(
+            *argv,
+            env=self.env,
+            cwd=self.home,
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.STDOUT,
+            start_new_session=True,
+        )
+        try:
+            async with asyncio.timeout(PATIENCE_S):
+                output, _ = await process.communicate(stdin.encode())
+        finally:
+            await end(process, signal.SIGKILL)
+        text = output.decode(errors="replace")
+        assert not check or process.returncode == 0, f"{' '.join(argv)}: {text}"
+        return text
+
+    @contextlib.asynccontextmanager
+    async def program(self, *argv: str, node: str = "") -> AsyncIterator[asyncio.subprocess.Process]:
+        """Run a program until the block ends; with ``node``, wait until a node of this name is there."""
+        process = await asyncio.create_subprocess_exec(
+            *argv, env=self.env, cwd=self.home, stdin=asyncio.subprocess.DEVNULL, start_new_session=True
+        )
+        try:
+            if node:
+                await self.until(lambda: self.node(node), what=f"{node} is registered")
+            yield process
+        finally:
+            await end(process, signal.SIGINT)
+
+    async def says(self, *argv: str, text: str, count: int = 1) -> str:
+        """Run a program until it has printed ``text`` so many times; return what it printed."""
+        process = await asyncio.create_subprocess_exec(
+            *argv,
+            env=self.env,
+            cwd=self.home,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.STDOUT,
+            start_new_session=True,
+        )
+        assert process.stdout is not None
+        printed = ""
+        try:
+            async with asyncio.timeout(PATIENCE_S):
+                while printed.count(text) < count:
+                    line = await process.stdout.readline()
+                    assert line, f"{argv} ended and printed {printed!r}"
+                    printed += line.decode(errors="replace")
+        finally:
+            await end(process, signal.SIGKILL)
+            await process.stdout.read()
+        return printed
+
+    async def ask(self, method: str, *arguments: Any) -> Any:
+        """Call the master; None if it does not answer or refuses."""
+        async with RpcClient() as rpc:
+            try:
+                status, _, value = await rpc.call(self.uri, method, ("/test", *arguments))
+            except XmlRpcError:
+                return None
+        return value if status == 1 else None
+
+    async def node(self, name: str) -> str | None:
+        """The slave API of a node."""
+        found: str | None = await self.ask("lookupNode", name)
+        return found
+
+    async def service(self, name: str) -> str | None:
+        """The URI of a service."""
+        found: str | None = await self.ask("lookupService", name)
+        return found
+
+    async def publishers(self, topic: str) -> list[str]:
+        """The nodes that publish a topic."""
+        state = await self.ask("getSystemState") or [[], [], []]
+        return next((nodes for name, nodes in state[0] if name == topic), [])
+
+    async def until(self, condition: Callable[[], Awaitable[Any]], *, what: str) -> Any:
+        """Wait until ``condition`` gives something true."""
+        try:
+            async with asyncio.timeout(PATIENCE_S):
+                while not (found := await condition()):
+                    await asyncio.sleep(0.05)
+        except TimeoutError:
+            raise AssertionError(f"{what}: not within {PATIENCE_S:g} s") from None
+        return found
+
+
+async def end(process: asyncio.subprocess.Process, number: signal.Signals) -> None:
+    """End a process that has a session of its own, and all of its children."""
+    if process.returncode is None:
+        family: list[psutil.Process] = []
+        with contextlib.suppress(psutil.NoSuchProcess):
+            family = psutil.Process(process.pid).children(recursive=True)
+        with contextlib.suppress(ProcessLookupError):
+            process.send_signal(number)
+        try:
+            async with asyncio.timeout(20):
+                await process.wait()
+        except TimeoutError:
+            process.kill()
+            await process.wait()
+        for child in family:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                child.kill()
+
+
+def free_port() -> int:
+    """A port that nobody uses now."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port: int = taken.getsockname()[1]
+    return port
+
+
+@contextlib.asynccontextmanager
+async def our_graph(home: Path, port: int = 0) -> AsyncIterator[Graph]:
+    """A graph with a core of ours, in this process."""
+    async with Core(port=port, rosout=True) as core:
+        yield Graph(core.uri, home, "ours")
+        core.graph.validate()
+
+
+@contextlib.asynccontextmanager
+async def real_graph(home: Path, port: int = 0) -> AsyncIterator[Graph]:
+    """A graph with a real ``roscore``."""
+    port = port or free_port()
+    graph = Graph(f"http://127.0.0.1:{port}/", home, "roscore")
+    async with graph.program("/usr/bin/roscore", "-p", str(port), node="/rosout"):
+        await graph.until(lambda: graph.ask("getParam", "/run_id"), what="roscore is up")
+        yield graph
+
+
+GRAPHS = {"ours": our_graph, "roscore": real_graph}
