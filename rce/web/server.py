@@ -12,6 +12,10 @@ SHUTDOWN_S = 0.5
 """How long open requests may go on when the server ends."""
 
 
+IDLE_S = 30.0
+"""A connection that sends no request, or does not come to its end, for so long is closed."""
+
+
 class HttpServer:
     """Serves an application. Use it as an asynchronous context manager.
 
@@ -19,8 +23,18 @@ class HttpServer:
         url: Where it listens, once it does.
     """
 
-    def __init__(self, app: web.Application, host: str, port: int, ssl: SSLContext | None = None) -> None:
-        self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=SHUTDOWN_S)
+    def __init__(
+        self,
+        app: web.Application,
+        host: str,
+        port: int,
+        ssl: SSLContext | None = None,
+        *,
+        idle_timeout: float = IDLE_S,
+    ) -> None:
+        self._runner = web.AppRunner(
+            app, access_log=None, shutdown_timeout=SHUTDOWN_S, keepalive_timeout=idle_timeout
+        )
         self._host = host
         self._port = port
         self._ssl = ssl

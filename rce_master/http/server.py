@@ -13,6 +13,7 @@ from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
 from rce.web.openapi import PREFIX, build_document
 from rce.web.origin import is_foreign
+from rce.web.server import IDLE_S
 from rce_master.exceptions import (
     AuthError,
     Forbidden,
@@ -81,7 +82,7 @@ def _adapt(route: Route, services: Services) -> Handler:
             raise WrongCredentials("a bearer token is needed; get one at /api/v1/login")
         if route.admin and (user is None or user.role is not UserRole.ADMIN):
             raise Forbidden("only an administrator may do this")
-        body = read_body(route.body, await request.read()) if route.body else None
+        body = read_body(route.body, await _read(request)) if route.body else None
         reply = await route.handler(Call(request, services, user, token, body))
         if isinstance(reply, web.StreamResponse):
             return reply
@@ -92,6 +93,15 @@ def _adapt(route: Route, services: Services) -> Handler:
         )
 
     return handle
+
+
+async def _read(request: web.Request) -> bytes:
+    """Read the body, which must come in good time."""
+    try:
+        async with asyncio.timeout(IDLE_S):
+            return await request.read()
+    except TimeoutError:
+        raise web.HTTPRequestTimeout from None
 
 
 def _bearer(request: web.Request, services: Services) -> tuple[str, User | None]:
