@@ -142,8 +142,9 @@ class RobotTaskSet:
                     self._report_usage()
         finally:
             self._tasks = None
-            for namespace in list(self._namespaces.values()):
-                await namespace.close("the robot endpoint is shutting down")
+            async with asyncio.TaskGroup() as tasks:
+                for namespace in self._namespaces.values():
+                    tasks.create_task(_end(namespace, "the robot endpoint is shutting down"))
             self._namespaces.clear()
 
     # What the gate asks: rce_robot.gate.House
@@ -250,9 +251,7 @@ class RobotTaskSet:
 
     async def _close(self, namespace: Namespace, reason: str, revision: int) -> None:
         try:
-            await namespace.close(reason)
-        except Exception:  # noqa: BLE001 - logged; it must not end anything else
-            _log.exception("closing robot %s", namespace.id)
+            await _end(namespace, reason)
         finally:
             self._closing.pop(namespace.id).set()
         self._channel.send(Gone(id=str(namespace.id), revision=revision))
@@ -261,3 +260,10 @@ class RobotTaskSet:
         for id_, namespace in self._namespaces.items():
             if message.id in (str(id_), id_.user):
                 namespace.report(message.text)
+
+
+async def _end(namespace: Namespace, reason: str) -> None:
+    try:
+        await namespace.close(reason)
+    except Exception:  # noqa: BLE001 - logged; it must not end anything else
+        _log.exception("closing robot %s", namespace.id)
