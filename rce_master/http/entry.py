@@ -21,6 +21,10 @@ EXPECTED_S = 5.0
 """How long a robot that was sent somewhere counts there before it has logged in."""
 
 
+MAX_EXPECTED = 10_000
+"""How many are expected at most: anybody may ask, and need not come."""
+
+
 class Entry:
     """Hands out the least loaded robot task set.
 
@@ -36,6 +40,7 @@ class Entry:
         self._tables = tables
         self._clock = clock
         self._sent: deque[tuple[float, str]] = deque()
+        self._expected: Counter[str] = Counter()
 
     async def handle(self, request: web.Request) -> web.Response:
         """Answer a client with the WebSocket URL that it is to use."""
@@ -55,17 +60,19 @@ class Entry:
     def choose(self) -> TaskSet | None:
         """Choose the least loaded robot task set, and expect a robot there."""
         now = self._clock()
-        while self._sent and self._sent[0][0] <= now - EXPECTED_S:
-            self._sent.popleft()
-        expected = Counter(process for _, process in self._sent)
+        while self._sent and (self._sent[0][0] <= now - EXPECTED_S or len(self._sent) >= MAX_EXPECTED):
+            self._expected[self._sent.popleft()[1]] -= 1
         there = [
             s
             for s in self._tables.task_sets
             if s.kind is TaskSetKind.ROBOT and s.url and self._tables.is_connected(s.process)
         ]
-        chosen = min(there, key=lambda s: (self._load(s) + expected[s.process], s.process), default=None)
+        chosen = min(
+            there, key=lambda s: (self._load(s) + self._expected[s.process], s.process), default=None
+        )
         if chosen is not None:
             self._sent.append((now, chosen.process))
+            self._expected[chosen.process] += 1
         return chosen
 
     def _load(self, task_set: TaskSet) -> int:
