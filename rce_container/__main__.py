@@ -47,6 +47,10 @@ def container(
         list[Path] | None,
         typer.Option("--package-path", help="Folder with packages of nodes; may be repeated."),
     ] = None,
+    label: Annotated[
+        list[str] | None,
+        typer.Option(help="What this machine has (special features of containers); may be repeated."),
+    ] = None,
     name: Annotated[str, typer.Option(help="Name of this task set [default: made up once, then kept]")] = "",
     machine: Annotated[str, typer.Option(help="Name of this machine [default: its host name]")] = "",
     secret_file: Annotated[Path | None, typer.Option(help="File with the engine's shared secret.")] = None,
@@ -60,7 +64,10 @@ def container(
     )
     logging.getLogger("websockets").setLevel(logging.WARNING)
     settings = ContainerSettings(
-        machine=machine or socket.gethostname(), packages=package_path(package_path_ or ()), grace=grace
+        machine=machine or socket.gethostname(),
+        packages=package_path(package_path_ or ()),
+        labels=tuple(label or ()),
+        grace=grace,
     )
     try:
         program = App(

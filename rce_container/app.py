@@ -21,9 +21,9 @@ from rce.config.resources import examples_dir
 from rce.config.secret import Secret
 from rce.control.channel import TaskSetChannel
 from rce.control.messages import MachineInfo
+from rce.link.address import in_url, is_any, own_address
 from rce.link.handover import Doorman
-from rce.ros.packages import PackageIndex, installed_shares
-from rce_container.dial import own_address
+from rce.ros.packages import PackageIndex
 from rce_container.exceptions import RuntimeUnavailableError
 from rce_container.folder import StateFolder
 from rce_container.manager import Manager
@@ -38,7 +38,6 @@ LINK_PORT = 10030
 AUTO = "auto"
 RUNTIMES = (NamespaceRuntime.name, ProcessRuntime.name)
 
-_ALL = ("", "0.0.0.0", "::")  # noqa: S104 - compared, not bound
 _NOT_ISOLATED = "containers are NOT isolated: nodes may do all that this user may"
 
 
@@ -79,10 +78,10 @@ class App:
             async with contextlib.AsyncExitStack() as stack:
                 stack.push_async_callback(doorman.close)
                 port = await _listen(doorman, self.host, self.link_port)
-                reach = own_address(self.master, self.control_port) if self.host in _ALL else self.host
+                reach = own_address(self.master, self.control_port) if is_any(self.host) else self.host
                 manager = Manager(
                     name=name,
-                    info=_machine(self.settings.machine, runtime.name, detail),
+                    info=_machine(self.settings, runtime.name, detail),
                     settings=self.settings,
                     runtimes=runtimes,
                     runtime=runtime,
@@ -93,7 +92,7 @@ class App:
                 await self._manage(manager, lambda: ready(name, runtime.name))
 
     async def _manage(self, manager: Manager, ready: Callable[[], None]) -> None:
-        url = f"ws://{_in_url(self.master)}:{self.control_port}"
+        url = f"ws://{in_url(self.master)}:{self.control_port}"
         channel = TaskSetChannel(url, self.secret, manager.hello, manager.handle)
         manager.send = channel.send
         async with asyncio.TaskGroup() as tasks:
@@ -175,16 +174,18 @@ def _quit_by_signal(manager: Manager) -> asyncio.Event:
     return quit_
 
 
-def _machine(name: str, runtime: str, detail: str) -> MachineInfo:
-    memory = psutil.virtual_memory().total
-    return MachineInfo(name=name, cores=os.cpu_count() or 0, memory=memory, runtime=runtime, detail=detail)
+def _machine(settings: ContainerSettings, runtime: str, detail: str) -> MachineInfo:
+    return MachineInfo(
+        name=settings.machine,
+        cores=os.cpu_count() or 0,
+        memory=psutil.virtual_memory().total,
+        runtime=runtime,
+        labels=settings.labels,
+        detail=detail,
+    )
 
 
 def _compile_engine() -> None:
     """Compile what containers import: they see it read-only, and could never keep the result."""
     for package in ("rce", "rce_container"):
         compileall.compile_dir(source_root() / package, quiet=2)
-
-
-def _in_url(host: str) -> str:
-    return f"[{host}]" if ":" in host else host

@@ -38,14 +38,3 @@ async def _connect(family: int, target: object) -> socket.socket:
         sock.close()
         raise
     return sock
-
-
-def own_address(host: str, port: int) -> str:
-    """The address of this machine on the way to ``host``; nothing is sent for it."""
-    try:
-        family, _, _, _, target = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-        with socket.socket(family, socket.SOCK_DGRAM) as probe:
-            probe.connect(target)
-            return str(probe.getsockname()[0])
-    except OSError:
-        return "127.0.0.1"

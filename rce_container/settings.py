@@ -15,6 +15,8 @@ class ContainerSettings:
     """See :class:`rce.control.model.LinkAddress`."""
     packages: tuple[Path, ...] = ()
     """Folders with packages, the more important first; containers see them read-only."""
+    labels: tuple[str, ...] = ()
+    """What this machine has; containers ask for it as special features."""
     grace: float = 30.0
     """A container without a manager ends itself after so long."""
     interrupt_timeout: float = 15.0

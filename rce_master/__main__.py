@@ -47,17 +47,22 @@ def command(
     container_grace: Annotated[
         float | None, typer.Option(help="Seconds until containers of a machine that is away move [30].")
     ] = None,
+    token_lifetime: Annotated[
+        float | None, typer.Option(help="Seconds that an API token is valid [2592000].")
+    ] = None,
     log_level: Annotated[str, typer.Option(help="debug, info, warning or error.")] = "info",
 ) -> None:
     """Run the Master Task Set: HTTP for clients on 9000, control of task sets on 8080."""
     logging.basicConfig(level=log_level.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    logging.getLogger("websockets").setLevel(logging.WARNING)
+    for name in ("websockets", "aiosqlite"):  # what these tell in detail holds the secret, tokens and hashes
+        logging.getLogger(name).setLevel(logging.WARNING)
     given = {
         "bind": bind,
         "http_port": http_port,
         "control_port": control_port,
         "robot_grace": robot_grace,
         "container_grace": container_grace,
+        "token_lifetime": token_lifetime,
     }
     faults: tuple[BaseException, ...] = ()
     try:

@@ -31,6 +31,9 @@ def robot(
         typer.Option(help="Port for data links; 0 takes a free one [default: 10030, or a free one]"),
     ] = None,
     bind: Annotated[str, typer.Option(help="Address to listen on [default: all]")] = "",
+    public_host: Annotated[
+        str, typer.Option(help="Name or address of this machine for others [default: found out]")
+    ] = "",
     public_url: Annotated[
         str, typer.Option(help="WebSocket URL that robots are sent to, if it is another.")
     ] = "",
@@ -55,6 +58,7 @@ def robot(
         host=bind or (_LOOPBACK if dev else _DEFAULTS.host),
         ws_port=ws_port,
         link_port=link_port,
+        public_host=public_host,
         public_url=public_url,
         machine=machine,
         origins=tuple(origin or ()),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
-import ipaddress
 import os
 import secrets
 import signal
@@ -22,6 +21,7 @@ from rce.control.channel import TaskSetChannel
 from rce.control.messages import MachineInfo
 from rce.control.model import LinkAddress
 from rce.link import LinkHub
+from rce.link.address import in_url, is_any, own_address
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce_robot.factory import FormFactory
@@ -37,9 +37,6 @@ if TYPE_CHECKING:
     from rce.config.secret import Secret
 
 DEFAULT_LINK_PORT = 10030
-
-_SOMEWHERE = "192.0.2.1"
-"""An address that nobody has (RFC 5737); the way to it is the way to everybody outside."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +71,9 @@ class App:
         """Run for as long as the context lasts."""
         settings = self.settings
         machine = settings.machine or socket.gethostname()
-        reach = _own_address(self.master, self.control_port) if _is_any(settings.host) else settings.host
+        reach = settings.public_host or settings.host
+        if is_any(reach):
+            reach = own_address(self.master, self.control_port)
         name = f"robot_{secrets.token_hex(4)}"
         types = TypeRegistry(_package_index(self.packages))
         hub = LinkHub(machine)
@@ -82,12 +81,12 @@ class App:
             address = await _listen(hub, machine, name, reach, settings)
             listener = await _bind(settings.host, settings.ws_port)
             port: int = listener.getsockname()[1]
-            url = settings.public_url or f"ws://{_in_url(reach)}:{port}/"
+            url = settings.public_url or f"ws://{in_url(reach)}:{port}/"
             info = MachineInfo(name=machine, cores=os.cpu_count() or 0, memory=psutil.virtual_memory().total)
             task_set = RobotTaskSet(
                 hub, FormFactory(types), settings, name=name, machine=info, url=url, address=address
             )
-            control = f"ws://{_in_url(self.master)}:{self.control_port}"
+            control = f"ws://{in_url(self.master)}:{self.control_port}"
             channel = TaskSetChannel(control, self.secret, task_set.hello, task_set.handle)
             task_set.use(channel)
             gate = Gate(task_set, settings.session, settings.origins)
@@ -151,31 +150,3 @@ async def _bind(host: str, port: int) -> socket.socket:
         raise
     listener.setblocking(False)
     return listener
-
-
-def _is_any(host: str) -> bool:
-    return host in ("", "0.0.0.0", "::")  # noqa: S104 - compared, not bound
-
-
-def _own_address(master: str, port: int) -> str:
-    """Return the address of this machine on the way to the master, or outside if the master is here.
-
-    Nothing is sent for it.
-    """
-    found = _address_towards(master, port)
-    if found is None or ipaddress.ip_address(found).is_loopback:
-        found = _address_towards(_SOMEWHERE, port)
-    return found or "127.0.0.1"
-
-
-def _address_towards(host: str, port: int) -> str | None:
-    with contextlib.suppress(OSError):
-        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-        with socket.socket(family, socket.SOCK_DGRAM) as probe:
-            probe.connect(address)
-            return str(probe.getsockname()[0]).partition("%")[0]
-    return None
-
-
-def _in_url(host: str) -> str:
-    return f"[{host}]" if ":" in host else host

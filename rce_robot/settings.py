@@ -41,6 +41,8 @@ class RobotSettings:
     ws_port: int = 9010
     link_port: int | None = None
     """Port for data links; None is 10030, or a free one where that is taken. The master tells it to peers."""
+    public_host: str = ""
+    """Where clients and links of other machines find this one; found out if empty."""
     public_url: str = ""
     """Where clients are sent; made of this machine's address and the port if empty."""
     machine: str = ""

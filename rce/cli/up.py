@@ -111,6 +111,7 @@ def programs(settings: EngineSettings) -> Iterable[Program]:
         *_options({"bind": settings.master.bind, "http-port": settings.master.http_port}),
         *_options({"state-dir": state / "master", "robot-grace": settings.master.robot_grace}),
         *_options({"container-grace": settings.master.container_grace}),
+        *_options({"token-lifetime": settings.master.token_lifetime}),
         *(control + common),
     )
     packages = _repeat("package-path", settings.container.package_path)
@@ -121,7 +122,7 @@ def programs(settings: EngineSettings) -> Iterable[Program]:
             settings.master_host,
             *_options({"bind": settings.robot.bind, "ws-port": _next(settings.robot.ws_port, index)}),
             *_options({"link-port": _next(settings.robot.link_port, 2 * index)}),
-            *_options({"public-url": settings.robot.public_url}),
+            *_options({"public-host": settings.robot.public_host, "public-url": settings.robot.public_url}),
             *_repeat("origin", settings.robot.origins),
             *(packages + control + common),
         )

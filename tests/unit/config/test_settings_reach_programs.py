@@ -1,0 +1,53 @@
+"""Everything that can be set for ``rce up`` is understood by the programs that it starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer.main
+from typer import Typer
+
+from rce.cli.up import programs
+from rce.config.settings import (
+    ContainerSettings,
+    EngineSettings,
+    MasterSettings,
+    RobotSettings,
+    Runtime,
+)
+from rce_container.__main__ import app as container
+from rce_master.__main__ import app as master
+from rce_robot.__main__ import app as robot
+
+APPS: dict[str, Typer] = {"rce_master": master, "rce_robot": robot, "rce_container": container}
+SETTINGS = EngineSettings(
+    dev=True,
+    state_dir=Path("/state"),
+    secret_file=Path("/secret"),
+    master=MasterSettings(bind="127.0.0.2", http_port=1, control_port=2, token_lifetime=3.0),
+    robot=RobotSettings(count=2, public_host="robots.example.org", origins=("https://a.example",)),
+    container=ContainerSettings(runtime=Runtime.PROCESS, labels=("gpu", "lidar"), package_path=(Path("/p"),)),
+)
+
+
+def parsed(settings: EngineSettings) -> dict[str, Any]:
+    found = {}
+    for program in programs(settings):
+        _, _, module, *arguments = program.argv
+        command = typer.main.get_command(APPS[module])
+        found[program.name] = command.make_context(module, arguments)
+    return found
+
+
+@pytest.mark.parametrize("settings", [SETTINGS, EngineSettings()])
+def test_every_option_is_known(settings: EngineSettings) -> None:
+    assert {"master", "container"} < set(parsed(settings))
+
+
+def test_what_is_set_arrives() -> None:
+    contexts = parsed(SETTINGS)
+    assert contexts["master"].params["token_lifetime"] == 3.0
+    assert contexts["robot2"].params["public_host"] == "robots.example.org"
+    assert list(contexts["container"].params["label"]) == ["gpu", "lidar"]
