@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import json
 import os
 import signal
+import socket
 import stat
 import sys
 from collections.abc import AsyncIterator
@@ -13,6 +15,7 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
 import aiohttp
+from websockets.asyncio.client import connect
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -60,22 +63,24 @@ async def rce(folder: Path, command: str, *args: str, text: str = "", code: int 
 @asynccontextmanager
 async def master(folder: Path, *args: str, end: signal.Signals = signal.SIGTERM) -> AsyncIterator[str]:
     """Run ``rce-master`` and give its address."""
-    process = await asyncio.create_subprocess_exec(
-        sys.executable,
-        *(
-            "-m",
-            "rce_master",
-            "--http-port",
-            "0",
-            "--control-port",
-            "0",
-            "--state-dir",
-            str(folder / "state"),
-        ),
-        *args,
-        stdout=asyncio.subprocess.PIPE,
-        env=environment(folder),
-    )
+    with (folder / "master.log").open("ab") as log:
+        process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            *(
+                "-m",
+                "rce_master",
+                "--http-port",
+                "0",
+                "--control-port",
+                "0",
+                "--state-dir",
+                str(folder / "state"),
+            ),
+            *args,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=log,
+            env=environment(folder),
+        )
     try:
         assert process.stdout is not None
         line = (await asyncio.wait_for(process.stdout.readline(), 30)).decode()
@@ -154,3 +159,24 @@ async def test_a_master_that_cannot_start_says_why(tmp_path: Path) -> None:
         assert process.returncode == 1
         assert b"a master is running" in errors
         assert b"Traceback" not in errors
+
+
+async def test_the_log_tells_no_secret_however_much_it_tells(tmp_path: Path) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    secret = environment(tmp_path)["RCE_SECRET"]
+    options = ("--dev", "--log-level", "debug", "--control-port", str(port))
+    async with master(tmp_path, *options) as url, aiohttp.ClientSession() as session:
+        async with connect(
+            f"ws://127.0.0.1:{port}", additional_headers={"Authorization": f"Bearer {secret}"}, proxy=None
+        ):
+            pass
+        account = {"userID": "testUser", "password": "testUser"}
+        async with session.post(f"{url}api/v1/login", json=account) as reply:
+            token = (await reply.json())["token"]
+    log = (tmp_path / "master.log").read_text()
+    assert "DEBUG" in log
+    assert [
+        word for word in (secret, token, hashlib.sha256(b"testUser").hexdigest(), "argon2") if word in log
+    ] == []
