@@ -23,7 +23,7 @@ from rce.control.channel import TaskSetChannel
 from rce.control.messages import MachineInfo
 from rce.link.address import in_url, is_any, own_address
 from rce.link.handover import Doorman
-from rce.ros.packages import PackageIndex
+from rce.ros.packages import PackageIndex, installed_shares
 from rce_container.exceptions import RuntimeUnavailableError
 from rce_container.folder import StateFolder
 from rce_container.manager import Manager
