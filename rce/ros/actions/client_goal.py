@@ -28,7 +28,8 @@ ChangeCallback = Callable[["ClientGoal"], None]
 class ClientGoal:
     """One goal of an action client. Made by :meth:`rce.ros.actions.ActionClient.send`.
 
-    An async iterator over the feedback; it ends when the goal is over.
+    An async iterator over the feedback; it ends when the goal is over. The result has a connection of its
+    own and may overtake the last feedback, which is dropped then, as in all of actionlib.
     """
 
     def __init__(

@@ -104,7 +104,7 @@ class TransformListener:
         Raises:
             TransformError: It is not known.
         """
-        return self.buffer.lookup(self.resolve(target), self.resolve(source), time)
+        return self._fresh_buffer().lookup(self.resolve(target), self.resolve(source), time)
 
     def lookup_full(
         self, target: str, target_time: Time | None, source: str, source_time: Time | None, fixed: str
@@ -114,13 +114,13 @@ class TransformListener:
         Raises:
             TransformError: It is not known.
         """
-        return self.buffer.lookup_full(
+        return self._fresh_buffer().lookup_full(
             self.resolve(target), target_time, self.resolve(source), source_time, self.resolve(fixed)
         )
 
     def can_transform(self, target: str, source: str, time: Time | None = None) -> bool:
         """Tell whether :meth:`lookup` has an answer."""
-        return self.buffer.can_transform(self.resolve(target), self.resolve(source), time)
+        return self._fresh_buffer().can_transform(self.resolve(target), self.resolve(source), time)
 
     async def wait_for(
         self, target: str, source: str, time: Time | None = None, *, timeout: float | None = None
@@ -135,7 +135,7 @@ class TransformListener:
 
         Raises:
             TransformTimeout: It did not become known in time; the cause says why.
-            ExtrapolationError: The time is past the buffer: waiting does not help.
+            ExtrapolationError: ``time`` is before what the buffer holds: waiting does not help.
             FrameLoopError: The frames are no tree.
             NodeClosed: The node stops.
         """
@@ -145,7 +145,7 @@ class TransformListener:
                     try:
                         return self.lookup(target, source, time)
                     except (UnknownFrameError, ConnectivityError, ExtrapolationError) as error:
-                        if isinstance(error, ExtrapolationError) and not error.is_future:
+                        if time and isinstance(error, ExtrapolationError) and not error.is_future:
                             raise
                         reason = error
                     await self._next_change()
@@ -166,21 +166,23 @@ class TransformListener:
         await self._changed.wait()
 
     def _received(self, message: Message, *, static: bool) -> None:
-        self._forget_after_jump()
+        buffer = self._fresh_buffer()
         for transform in message.transforms:
             try:
-                self.buffer.insert(StampedTransform.read(transform), static=static)
+                buffer.insert(StampedTransform.read(transform), static=static)
             except BadTransformError as error:
                 self._complain(transform.child_frame_id, error)
         self._changed.set()
 
-    def _forget_after_jump(self) -> None:
+    def _fresh_buffer(self) -> Buffer:
+        """Return the buffer, without what is from before a jump of time."""
         now = self._node.time()
         if now < self._latest - JUMP:
             _log.warning("time jumped back by %.3f s: transforms are forgotten", self._latest - now)
             self.buffer.clear()
             self._latest = now
         self._latest = max(self._latest, now)
+        return self.buffer
 
     def _complain(self, child: str, error: BadTransformError) -> None:
         if child not in self._complaints and len(self._complaints) < MAX_COMPLAINTS:

@@ -1,0 +1,253 @@
+"""Actions between our nodes and those of ROS's own actionlib, both ways."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rce.ros.actions import ActionClient, ActionServer, GoalFailed, GoalState, ServerGoal, SimpleActionServer
+from rce.ros.core import Core
+from rce.ros.node import Node
+
+pytestmark = pytest.mark.needs("actionlib")
+
+TEST = "actionlib/TestAction"
+
+SERVERS = """
+import threading
+import actionlib, rospy
+from actionlib.msg import TestAction, TestFeedback, TestResult
+
+def execute(goal):
+    simple.publish_feedback(TestFeedback(goal.goal + 1))
+    if goal.goal < 0:
+        simple.set_aborted(TestResult(goal.goal), "negative")
+    elif goal.goal == 0:
+        while not simple.is_preempt_requested():
+            rospy.sleep(0.01)
+        simple.set_preempted(TestResult(-1), "as asked")
+    else:
+        simple.set_succeeded(TestResult(2 * goal.goal), "doubled")
+
+handles = {}
+
+def goal_came(handle):
+    number = handle.get_goal().goal
+    if number < 0:
+        handle.set_rejected(TestResult(number), "negative")
+    elif number < 100:
+        handle.set_accepted("on it")
+        handles[handle.get_goal_id().id] = handle
+        if number == 10:
+            for key in list(handles):
+                handles.pop(key).set_succeeded(TestResult(number), "all done")
+
+def cancel_came(handle):
+    handles.pop(handle.get_goal_id().id, None)
+    handle.set_canceled(TestResult(-2), "cancelled")
+
+rospy.init_node("real")
+simple = actionlib.SimpleActionServer("simple", TestAction, execute, auto_start=False)
+full = actionlib.ActionServer("full", TestAction, goal_came, cancel_came, auto_start=False)
+simple.start()
+full.start()
+rospy.spin()
+"""
+
+CLIENT = """
+import json, sys
+import actionlib, rospy
+from actionlib.msg import TestAction, TestGoal
+from actionlib_msgs.msg import GoalStatus
+
+rospy.init_node("real")
+report = {}
+
+simple = actionlib.SimpleActionClient("simple", TestAction)
+assert simple.wait_for_server(rospy.Duration(20))
+
+def run(number, cancel=False):
+    heard = []
+    def feedback(message):
+        heard.append(message.feedback)
+    simple.send_goal(TestGoal(number), feedback_cb=feedback)
+    if cancel:
+        while not heard:
+            rospy.sleep(0.01)
+        simple.cancel_goal()
+    assert simple.wait_for_result(rospy.Duration(20))
+    status = simple.get_state()
+    return [heard, GoalStatus.to_string(status), simple.get_goal_status_text(), simple.get_result().result]
+
+report["succeeded"] = run(3)
+report["aborted"] = run(-1)
+report["preempted"] = run(0, cancel=True)
+
+many = actionlib.ActionClient("full", TestAction)
+assert many.wait_for_server(rospy.Duration(20))
+changes = {}
+def changed(handle):
+    changes.setdefault(handle.comm_state_machine.action_goal.goal.goal, []).append(
+        actionlib.CommState.to_string(handle.get_comm_state()))
+goals = {number: many.send_goal(TestGoal(number), changed) for number in (0, 1, 5, -1)}
+def until(condition):
+    end = rospy.Time.now() + rospy.Duration(20)
+    while not condition():
+        assert rospy.Time.now() < end, (changes, {n: g.get_goal_status() for n, g in goals.items()})
+        rospy.sleep(0.01)
+until(lambda: all(goals[n].get_comm_state() == actionlib.CommState.DONE for n in (5, -1)))
+until(lambda: all(goals[n].get_goal_status() == GoalStatus.ACTIVE for n in (0, 1)))
+goals[0].cancel()
+until(lambda: goals[0].get_comm_state() == actionlib.CommState.DONE)
+many.cancel_all_goals()
+until(lambda: goals[1].get_comm_state() == actionlib.CommState.DONE)
+report["full"] = {n: [GoalStatus.to_string(g.get_terminal_state()), g.get_goal_status_text()]
+                  for n, g in goals.items()}
+report["changes"] = changes
+print(json.dumps(report))
+"""
+
+
+def environment(core: Core, folder: Path) -> dict[str, str]:
+    kept = {
+        name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))
+    }
+    return kept | {
+        "ROS_MASTER_URI": core.uri,
+        "ROS_IP": "127.0.0.1",
+        "PATH": "/usr/bin:/bin",
+        "HOME": str(folder),
+    }
+
+
+@asynccontextmanager
+async def rospy_program(core: Core, folder: Path, text: str) -> AsyncIterator[asyncio.subprocess.Process]:
+    script = folder / "program.py"
+    script.write_text(text)
+    process = await asyncio.create_subprocess_exec(
+        "/usr/bin/python3",
+        str(script),
+        env=environment(core, folder),
+        stdout=asyncio.subprocess.PIPE,
+        start_new_session=True,
+    )
+    try:
+        yield process
+    finally:
+        if process.returncode is None:
+            process.kill()
+        await process.communicate()
+
+
+@pytest.fixture
+def node(core: Core) -> Node:
+    return Node("ours", argv=[], master_uri=core.uri)
+
+
+async def test_our_client_at_a_simple_server_of_rospy(core: Core, node: Node, tmp_path: Path) -> None:
+    async with (
+        rospy_program(core, tmp_path, SERVERS),
+        node,
+        ActionClient(node, "simple", TEST) as client,
+        asyncio.timeout(50),
+    ):
+        goal = await client.send(goal=3)
+        assert (await goal.result()).result == 6
+        assert goal.text == "doubled"
+
+        with pytest.raises(GoalFailed, match="aborted: negative") as caught:
+            await (await client.send(goal=-5)).result()
+        assert caught.value.result is not None
+        assert caught.value.result.result == -5
+
+        first = await client.send(goal=0)
+        assert (await anext(aiter(first))).feedback == 1
+        first.cancel()
+        assert (await first.wait(), first.text) == (GoalState.PREEMPTED, "as asked")
+
+        second = await client.send(goal=0)
+        await anext(aiter(second))
+        third = await client.send(goal=1)
+        assert await second.wait() is GoalState.PREEMPTED
+        assert (await third.result()).result == 2
+
+
+async def test_our_client_at_a_full_server_of_rospy(core: Core, node: Node, tmp_path: Path) -> None:
+    async with (
+        rospy_program(core, tmp_path, SERVERS) as process,
+        node,
+        ActionClient(node, "full", TEST, patience=2) as client,
+        asyncio.timeout(50),
+    ):
+        goals = [await client.send(goal=number) for number in (1, 2, 3, 4)]
+        rejected = await client.send(goal=-1)
+        assert (await rejected.wait(), rejected.text) == (GoalState.REJECTED, "negative")
+        goals[1].cancel()
+        assert (await goals[1].wait(), goals[1].text) == (GoalState.PREEMPTED, "cancelled")
+        client.cancel_before(goals[0].stamp)
+        assert await goals[0].wait() is GoalState.PREEMPTED
+        waiting = await client.send(goal=100)
+        waiting.cancel()
+        assert await waiting.wait() is GoalState.RECALLED
+        last = await client.send(goal=10)
+        assert [(await goal.result()).result for goal in (goals[2], goals[3], last)] == [10, 10, 10]
+
+        dying = await client.send(goal=5)
+        process.kill()
+        with pytest.raises(GoalFailed, match="the server is silent"):
+            await dying.result()
+        assert dying.state is GoalState.LOST
+
+
+async def answer(goal: ServerGoal) -> dict[str, Any] | None:
+    number = goal.request.goal
+    goal.publish_feedback(feedback=number + 1)
+    if number < 0:
+        goal.abort("negative", {"result": number})
+        return None
+    if number < 2:
+        await goal.wait_for_cancel()
+        goal.cancel("as asked", {"result": -1})
+        return None
+    return {"result": 2 * number}
+
+
+async def choose(goal: ServerGoal) -> dict[str, Any] | None:
+    if goal.request.goal < 0:
+        goal.reject("negative")
+        return None
+    goal.accept()
+    return await answer(goal)
+
+
+async def test_rospys_clients_at_our_servers(core: Core, node: Node, tmp_path: Path) -> None:
+    async with (
+        node,
+        SimpleActionServer(node, "simple", TEST, answer),
+        ActionServer(node, "full", TEST, choose, auto_accept=False),
+        rospy_program(core, tmp_path, CLIENT) as process,
+        asyncio.timeout(50),
+    ):
+        output, _ = await process.communicate()
+    assert process.returncode == 0
+    report = json.loads(output)
+    # Feedback may be overtaken by the result, which has a connection of its own.
+    assert report["succeeded"][1:] == ["SUCCEEDED", "", 6]
+    assert report["aborted"][1:] == ["ABORTED", "negative", -1]
+    assert report["preempted"] == [[1], "PREEMPTED", "as asked", -1]
+    assert report["full"] == {
+        "0": ["PREEMPTED", "as asked"],
+        "1": ["PREEMPTED", "as asked"],
+        "5": ["SUCCEEDED", ""],
+        "-1": ["REJECTED", "negative"],
+    }
+    for changes in report["changes"].values():
+        assert changes[-1] == "DONE"
+    assert "PREEMPTING" in report["changes"]["1"]
