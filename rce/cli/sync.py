@@ -17,9 +17,10 @@ import yaml
 from rce.ros.errors import RosError
 from rce.ros.multimaster.errors import MultimasterError
 from rce.ros.multimaster.filters import SyncLists
+from rce.ros.multimaster.relay.link import DEFAULT_PORT as RELAY_PORT
 from rce.ros.multimaster.settings import local_master
 from rce.ros.multimaster.sync import MasterSync, SyncSettings
-
+from rce.ros.names import is_graph_name, is_private
 
 
 def _names(help_: str, *flags: str) -> Any:
@@ -52,6 +53,25 @@ def sync(
     distinct_names: Annotated[
         bool, typer.Option(help="Register nodes as NODE_at_MASTER, so that equal names do not clash.")
     ] = False,
+    as_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--as",
+            help="NAMESPACE, or MASTER=NAMESPACE: have the master's names in a namespace here, by relaying.",
+        ),
+    ] = None,
+    relay: Annotated[
+        list[str] | None,
+        typer.Option(help="HOST[:PORT]: relay everything over one connection to the rce sync there."),
+    ] = None,
+    relay_listen: Annotated[
+        int | None, typer.Option(help=f"Take relay connections on this port (usual: {RELAY_PORT}).")
+    ] = None,
+    relay_addr: Annotated[str, typer.Option(help="Address to take relay connections on; default: all.")] = "",
+    relay_token: Annotated[
+        str, typer.Option(envvar="RCE_RELAY_TOKEN", help="Secret that both ends of a relay must have.")
+    ] = "",
+    relay_name: Annotated[str, typer.Option(help="This side's name on relays; default: the master's.")] = "",
     master_uri: Annotated[str, typer.Option(help="The local master; default: ROS_MASTER_URI.")] = "",
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what happens.")] = False,
 ) -> None:
@@ -76,7 +96,21 @@ def sync(
     try:
         lists = _read_lists(interface, chosen)
         lists.sync_remote_nodes = lists.sync_remote_nodes or sync_remote_nodes
-        uvloop.run(_run(SyncSettings(master_uri, lists=lists, distinct_names=distinct_names)))
+        settings = SyncSettings(
+            master_uri,
+            lists=lists,
+            distinct_names=distinct_names,
+            namespaces=_namespaces(_split(as_)),
+            relay_to=tuple(_address(text) for text in _split(relay)),
+            relay_listen=relay_listen,
+            relay_addr=relay_addr,
+            relay_token=relay_token,
+            relay_name=relay_name,
+        )
+        uvloop.run(_run(settings))
+    except OSError as error:
+        typer.echo(f"rce sync: cannot take relay connections: {error.strerror or error}", err=True)
+        raise typer.Exit(1) from error
     except (RosError, ValueError) as error:
         typer.echo(f"rce sync: {error}", err=True)
         raise typer.Exit(1) from error
@@ -85,6 +119,22 @@ def sync(
 def _split(*options: list[str] | None) -> list[str]:
     """Take options that were given several times or with commas, or both."""
     return [name for option in options for text in option or () for name in text.split(",") if name]
+
+
+def _namespaces(texts: list[str]) -> dict[str, str]:
+    pairs = (text.rpartition("=") for text in texts)
+    found = {master or "*": namespace for master, _, namespace in pairs}
+    for namespace in found.values():
+        if not is_graph_name(namespace) or is_private(namespace):
+            raise MultimasterError(f"{namespace!r} is no namespace")
+    return found
+
+
+def _address(text: str) -> tuple[str, int]:
+    host, _, port = text.partition(":")
+    if not host or not (port or "0").isdigit():
+        raise MultimasterError(f"{text!r} is not HOST or HOST:PORT")
+    return host, int(port) if port else RELAY_PORT
 
 
 def _read_lists(file: Path | None, options: Mapping[str, list[str]]) -> SyncLists:
@@ -110,6 +160,7 @@ async def _run(settings: SyncSettings) -> None:
         asyncio.get_running_loop().add_signal_handler(number, main.cancel)
     with contextlib.suppress(asyncio.CancelledError):
         typer.echo(f"waiting for the master at {local_master(settings.master_uri)}")
-        async with MasterSync(settings):
-            typer.echo("rce sync ready")
+        async with MasterSync(settings) as running:
+            port = f", relay port {running.relay_port}" if running.relay_port else ""
+            typer.echo(f"rce sync ready{port}")
             await asyncio.Event().wait()

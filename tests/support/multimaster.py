@@ -8,17 +8,23 @@ import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import Any
 
 from rce.ros.core import Core, Graph
 from rce.ros.multimaster.discovery import Discovery
 from rce.ros.multimaster.filters import SyncLists
 from rce.ros.multimaster.settings import DiscoverySettings
 from rce.ros.multimaster.sync import MasterSync, SyncSettings
+from rce.ros.node import Node
 from support.engine import free_ports
 
 STRING = "std_msgs/String"
 FAST = 10.0
 """Heartbeats and questions per second in tests."""
+
+
+def node(name: str, uri: str, **more: Any) -> Node:
+    return Node(name, argv=[], master_uri=uri, **more)
 
 
 class Neighbourhood:
@@ -55,7 +61,7 @@ class Neighbourhood:
     async def _joined(
         self, uri: str, lists: SyncLists | None, more: dict[str, object]
     ) -> AsyncIterator[Machine]:
-        sync_more = {name: more.pop(name) for name in ("distinct_names",) if name in more}
+        sync_more = {name: more.pop(name) for name in ("distinct_names", "namespaces") if name in more}
         settings = SyncSettings(uri, lists=lists or SyncLists(), **sync_more)  # type: ignore[arg-type]
         async with Discovery(self.settings(uri, **more)) as discovery, MasterSync(settings) as sync:
             yield Machine(uri, discovery, sync)

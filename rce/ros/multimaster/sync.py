@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
 from types import TracebackType
@@ -11,11 +12,17 @@ from typing import Any, Self
 
 from rce.ros.errors import MasterError, ServiceError
 from rce.ros.multimaster import messages
+from rce.ros.multimaster.addresses import master_name
 from rce.ros.multimaster.errors import NoDiscovery
 from rce.ros.multimaster.filters import SyncLists
 from rce.ros.multimaster.listing import masters_known_at
 from rce.ros.multimaster.neighbourhood import Neighbour, PeerChange
 from rce.ros.multimaster.registrar import Registrar
+from rce.ros.multimaster.relay.exporter import Exporter
+from rce.ros.multimaster.relay.frames import Frame
+from rce.ros.multimaster.relay.importer import Importer
+from rce.ros.multimaster.relay.link import LinkIdentity, RelayLinks
+from rce.ros.multimaster.relay.namespace import NamespaceRemote, add_namespace
 from rce.ros.multimaster.remote import DirectRemote, Remote
 from rce.ros.multimaster.settings import local_master
 from rce.ros.node import Node
@@ -44,6 +51,22 @@ class SyncSettings:
     lists: SyncLists = field(default_factory=SyncLists)
     distinct_names: bool = False
     """Register remote nodes as ``NODE_at_MASTER``."""
+    namespaces: Mapping[str, str] = field(default_factory=dict)
+    """Master's name (``*``: every other) -> namespace that its names get here, which takes a relay."""
+    relay_to: tuple[tuple[str, int], ...] = ()
+    """Where to make relay links to: hosts and ports."""
+    relay_listen: int | None = None
+    """Port on which to take relay links; None: none, 0: a free one."""
+    relay_addr: str = ""
+    """Address on which to take relay links; if empty, all."""
+    relay_token: str = field(default="", repr=False)
+    """What both sides of a relay link must know."""
+    relay_name: str = ""
+    """This side's name on relay links; if empty, the local master's."""
+
+    def namespace_of(self, master: str) -> str:
+        """Return the namespace for a master; empty: its names stay."""
+        return self.namespaces.get(master, self.namespaces.get("*", ""))
 
 
 class MasterSync:
@@ -60,6 +83,9 @@ class MasterSync:
         self._own_uri = ""
         self._changes_topics: set[str] = set()
         self._stack = AsyncExitStack()
+        self._links = RelayLinks(LinkIdentity(""), self._make_ends)
+        self.relay_port = 0
+        """The port on which relay links are taken."""
         self._node: Node
         self._master: MasterClient
         self._tasks: TaskScope
@@ -94,6 +120,7 @@ class MasterSync:
             self._tasks = await stack.enter_async_context(TaskScope())
             self._tasks.start(self._follow_discovery(), name="follow the discovery")
             self._tasks.start(self._watch_master(), name="watch the master")
+            await self._start_links()
             self._stack = stack.pop_all()
         return self
 
@@ -169,12 +196,28 @@ class MasterSync:
         remote = self._remotes.get(master.uri)
         if remote is not None:
             remote.update(master)
-        elif self._own_uri not in ("", master.uri) and self.settings.lists.takes_host(master.name):
+        elif self._is_wanted(master):
             remote = self._remotes[master.uri] = self._make_remote(master)
             self._tasks.start(self._run(remote), name=f"synchronize with {master.name}")
 
+    def _is_wanted(self, master: Neighbour) -> bool:
+        if self._own_uri in ("", master.uri) or master.name in self._links.connected:
+            return False
+        return self.settings.lists.takes_host(master.name)
+
     def _make_remote(self, master: Neighbour) -> Remote:
-        chosen = self.settings.lists.filter_for(master.name, never_nodes=(master.discoverer, self._node.name))
+        own_nodes = (master.discoverer, self._node.name)
+        chosen = self.settings.lists.filter_for(master.name, never_nodes=own_nodes)
+        if namespace := self.settings.namespace_of(master.name):
+            return NamespaceRemote(
+                master,
+                namespace=namespace,
+                chosen=chosen,
+                node=self._node,
+                local=self._master,
+                rpc=self._rpc,
+                tasks=self._tasks,
+            )
         return DirectRemote(
             master,
             own_uri=self._own_uri,
@@ -189,6 +232,43 @@ class MasterSync:
             await remote.run()
         finally:
             del self._remotes[remote.master.uri]
+
+    # ------------------------------------------------------------------ relay links
+
+    async def _start_links(self) -> None:
+        settings = self.settings
+        if not settings.relay_to and settings.relay_listen is None:
+            return
+        name = settings.relay_name or master_name(await self._ask_own_uri())
+        self._links = RelayLinks(LinkIdentity(name, settings.relay_token), self._make_ends)
+        for host, port in settings.relay_to:
+            self._tasks.start(self._links.dial(host, port), name=f"relay link to {host}:{port}")
+        if settings.relay_listen is not None:
+            server = await self._links.open_server(settings.relay_addr or None, settings.relay_listen)
+            self.relay_port = server.sockets[0].getsockname()[1]
+            self._tasks.start(self._links.serve(server), name="take relay links")
+
+    def _make_ends(
+        self, send: Callable[[Frame], None], tasks: TaskScope, name: str
+    ) -> tuple[Exporter, Importer]:
+        """Make the ends of a link; the master at its other side is no longer registered directly."""
+        for remote in self._remotes.values():
+            if remote.master.name == name:
+                remote.leave()
+        chosen = self.settings.lists.filter_for(name, never_nodes=(self._node.name,))
+        namespace = self.settings.namespace_of(name)
+        takes = self.settings.lists.takes_host(name)
+
+        def rename(offered: str) -> str | None:
+            return add_namespace(offered, namespace) if takes else None
+
+        return (
+            Exporter(self._node, self._master, chosen, send, tasks, foreign=self._registered_nodes),
+            Importer(self._node, self._master, chosen, send, rename=rename),
+        )
+
+    def _registered_nodes(self) -> set[str]:
+        return {entry.node for entries in self.registrar.held.values() for entry in entries}
 
     # ------------------------------------------------------------------ the own master
 

@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
 
 import pytest
-from support.multimaster import STRING, Neighbourhood
+from support.multimaster import STRING, Neighbourhood, node
 
 from rce.ros.multimaster.filters import SyncLists
-from rce.ros.node import Node
-
-
-def node(name: str, uri: str, **more: Any) -> Node:
-    return Node(name, argv=[], master_uri=uri, **more)
 
 
 async def test_a_topic_reaches_the_other_master(neighbourhood: Neighbourhood) -> None:

@@ -1,0 +1,228 @@
+"""One end of a relay: offers what a graph has, sends what the other end wants."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from rce.ros.errors import MasterError, ServiceError
+from rce.ros.multimaster.errors import NothingToRelay
+from rce.ros.multimaster.filters import SyncFilter
+from rce.ros.multimaster.relay.frames import Answer, Call, Data, Frame, Offer, Want
+from rce.ros.multimaster.relay.kinds import ServiceKind, TopicKind, learn_service, learn_topic
+from rce.ros.multimaster.source import RpcSource, Snapshot
+from rce.ros.node import Node, ServiceClient, Subscriber
+from rce.ros.node.master import MasterClient
+from rce.ros.tasks import TaskScope
+
+_log = logging.getLogger(__name__)
+
+PERIOD = 1.0
+"""Seconds between looks at the graph."""
+
+CALL_TIMEOUT = 60.0
+MAX_CALLS = 256
+"""How many calls of the other end are under way at once; more are refused."""
+
+Rename = Callable[[str], str | None]
+"""Turns a name of this graph into the one to offer; None: not offered."""
+
+
+class Exporter:
+    """Offers the topics and services of one graph, as far as they pass a filter."""
+
+    def __init__(
+        self,
+        node: Node,
+        master: MasterClient,
+        chosen: SyncFilter,
+        send: Callable[[Frame], None],
+        tasks: TaskScope,
+        *,
+        rename: Rename = str,
+        foreign: Callable[[], Iterable[str]] = tuple,
+    ) -> None:
+        """Prepare an end.
+
+        Args:
+            node: Subscribes and calls.
+            master: The node's master.
+            chosen: What is offered, by the names that it is offered under.
+            send: Takes frames for the other end.
+            tasks: Owns the calls.
+            rename: Gives the names to offer.
+            foreign: Tells nodes that were registered by a synchronization: what they have is not offered.
+        """
+        self._node = node
+        self._master = master
+        self._chosen = chosen
+        self._send = send
+        self._tasks = tasks
+        self._rename = rename
+        self._foreign = foreign
+        self._source = RpcSource(master)
+        self._topics: dict[str, tuple[int, TopicKind]] = {}
+        self._services: dict[str, tuple[int, ServiceKind]] = {}
+        self._names: dict[int, str] = {}
+        self._offered = Offer()
+        self._next = 0
+        self._wanted: frozenset[int] = frozenset()
+        self._subscribers: dict[int, Subscriber] = {}
+        self._clients: dict[int, ServiceClient] = {}
+        self._changed = asyncio.Event()
+        self._calls = 0
+
+    async def run(self) -> None:
+        """Offer what there is, and what is wanted of it, until cancelled."""
+        loop = asyncio.get_running_loop()
+        next_look = loop.time()
+        try:
+            while True:
+                try:
+                    if loop.time() >= next_look:
+                        next_look = loop.time() + PERIOD
+                        await self._look()
+                    await self._serve_wants()
+                except MasterError as error:
+                    _log.info("%s", error)
+                try:
+                    async with asyncio.timeout_at(next_look):
+                        await self._changed.wait()
+                except TimeoutError:
+                    continue
+                self._changed.clear()
+        finally:
+            await self._close()
+
+    def take(self, frame: Frame) -> None:
+        """Take a frame of the other end, if it is for this one."""
+        if isinstance(frame, Want):
+            self._wanted = frame.topics
+            self._changed.set()
+        elif isinstance(frame, Call):
+            if self._calls >= MAX_CALLS:
+                self._send(Answer(frame.call, ok=False, payload=b"too many calls at once"))
+                return
+            self._calls += 1
+            self._tasks.start(self._call(frame), name="relayed call")
+
+    # ------------------------------------------------------------------ what there is
+
+    async def _look(self) -> None:
+        snapshot = await self._source.read()
+        foreign = {self._node.name, *self._foreign()}
+        await self._look_at_topics(snapshot, foreign)
+        await self._look_at_services(snapshot, foreign)
+        offer = Offer(
+            {key: (self._offered_name(name), kind) for name, (key, kind) in self._topics.items()},
+            {key: (self._offered_name(name), kind) for name, (key, kind) in self._services.items()},
+        )
+        if offer != self._offered:
+            self._offered = offer
+            self._send(offer)
+
+    async def _look_at_topics(self, snapshot: Snapshot, foreign: set[str]) -> None:
+        found: dict[str, list[str]] = {}
+        for topic, nodes in snapshot.publishers.items():
+            name, kind = self._rename(topic), snapshot.topic_types.get(topic, "")
+            uris = [
+                snapshot.node_uris[node]
+                for node in nodes
+                if name is not None
+                and node in snapshot.node_uris
+                and node not in foreign
+                and self._chosen.takes_publisher(node, name, kind)
+            ]
+            if uris:
+                found[topic] = uris
+        self._forget(self._topics, found)
+        for topic in found.keys() - self._topics.keys():
+            try:
+                learned = await learn_topic(self._master.rpc, self._node.name, topic, found[topic])
+            except NothingToRelay as error:
+                _log.debug("%s", error)
+                continue
+            self._topics[topic] = (self._number(topic), learned)
+
+    async def _look_at_services(self, snapshot: Snapshot, foreign: set[str]) -> None:
+        found: dict[str, str] = {}
+        for service, nodes in snapshot.services.items():
+            name, address = self._rename(service), snapshot.service_uris.get(service)
+            if name is None or address is None or foreign & set(nodes):
+                continue
+            if all(self._chosen.takes_service(node, name) for node in nodes):
+                found[service] = address
+        self._forget(self._services, found)
+        for service in found.keys() - self._services.keys():
+            try:
+                learned = await learn_service(self._node.name, service, found[service])
+            except NothingToRelay as error:
+                _log.debug("%s", error)
+                continue
+            self._services[service] = (self._number(service), learned)
+
+    def _forget(self, known: dict[str, Any], found: Mapping[str, object]) -> None:
+        for name in known.keys() - found.keys():
+            number, _ = known.pop(name)
+            del self._names[number]
+            self._changed.set()
+
+    def _number(self, name: str) -> int:
+        self._next += 1
+        self._names[self._next] = name
+        return self._next
+
+    def _offered_name(self, name: str) -> str:
+        return self._rename(name) or name
+
+    # ------------------------------------------------------------------ what is wanted
+
+    async def _serve_wants(self) -> None:
+        for number in self._subscribers.keys() - (self._wanted & self._names.keys()):
+            await self._subscribers.pop(number).close()
+        for number in self._clients.keys() - self._names.keys():
+            await self._clients.pop(number).close()
+        kinds = {number: (topic, kind) for topic, (number, kind) in self._topics.items()}
+        for number in (self._wanted & kinds.keys()) - self._subscribers.keys():
+            topic, kind = kinds[number]
+            self._subscribers[number] = await self._node.subscribe_serialized(
+                topic, kind.as_type(), self._sender(number)
+            )
+
+    def _sender(self, number: int) -> Callable[[bytes, bool], None]:
+        def send(payload: bytes, latched: bool) -> None:
+            self._send(Data(number, latched, payload))
+
+        return send
+
+    async def _call(self, call: Call) -> None:
+        try:
+            response = await self._client(call.service).call_serialized(call.payload, timeout=CALL_TIMEOUT)
+            self._send(Answer(call.call, ok=True, payload=response))
+        except (ServiceError, MasterError, NothingToRelay) as error:
+            text = error.text if isinstance(error, ServiceError) else str(error)
+            self._send(Answer(call.call, ok=False, payload=text.encode()))
+        finally:
+            self._calls -= 1
+
+    def _client(self, number: int) -> ServiceClient:
+        client = self._clients.get(number)
+        if client is None:
+            for service, (key, kind) in self._services.items():
+                if key == number:
+                    client = self._clients[number] = self._node.service_client(service, kind.as_type())
+                    break
+            else:
+                raise NothingToRelay("the service is not offered any longer")
+        return client
+
+    async def _close(self) -> None:
+        for client in self._clients.values():
+            await client.close()
+        try:
+            for subscriber in self._subscribers.values():
+                await subscriber.close()
+        except MasterError as error:
+            _log.info("the master does not learn that a relay ended: %s", error)

@@ -1,0 +1,211 @@
+"""What two ends of a relay tell each other, and its bytes. Sans-I/O.
+
+A frame on the wire is its length (uint32, little-endian, of all that follows), one byte for its kind, and its
+body: JSON for what is rare, a fixed head and the untouched message for what is many::
+
+    H  hello     {"protocol": 1, "name": ..., "token": ...}
+    O  offer     {"topics": [[id, name, type, md5sum, definition], ...],
+                  "services": [[id, name, type, md5sum, request type, response type], ...]}: all there is now
+    W  want      [topic id, ...]: all topics whose messages shall come now
+    D  data      uint32 topic id, uint8 latched, message
+    C  call      uint32 service id, uint32 call id, request
+    A  answer    uint32 call id, uint8 success, response (or the error's text)
+    P  ping      nothing: the sender is there
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from rce.ros.multimaster.errors import LinkBroken
+from rce.ros.multimaster.relay.kinds import ServiceKind, TopicKind
+from rce.ros.tcpros.framing import MAX_FRAME
+
+PROTOCOL = 1
+
+_HEAD = struct.Struct("<IB")
+_DATA = struct.Struct("<IB")
+_CALL = struct.Struct("<II")
+_ANSWER = struct.Struct("<IB")
+_MOST = MAX_FRAME + 64
+
+
+@dataclass(frozen=True, slots=True)
+class Hello:
+    """Who is at this end."""
+
+    CODE: ClassVar[bytes] = b"H"
+    name: str
+    token: str = field(default="", repr=False)
+    protocol: int = PROTOCOL
+
+    def body(self) -> tuple[bytes, ...]:
+        """Write the body."""
+        return (_json({"protocol": self.protocol, "name": self.name, "token": self.token}),)
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """Everything that this end has, by the numbers that the other end may ask for."""
+
+    CODE: ClassVar[bytes] = b"O"
+    topics: dict[int, tuple[str, TopicKind]] = field(default_factory=dict)
+    services: dict[int, tuple[str, ServiceKind]] = field(default_factory=dict)
+
+    def body(self) -> tuple[bytes, ...]:
+        """Write the body."""
+        topics = [
+            [key, name, kind.name, kind.md5sum, kind.definition] for key, (name, kind) in self.topics.items()
+        ]
+        services = [
+            [key, name, kind.name, kind.md5sum, kind.request_type, kind.response_type]
+            for key, (name, kind) in self.services.items()
+        ]
+        return (_json({"topics": topics, "services": services}),)
+
+
+@dataclass(frozen=True, slots=True)
+class Want:
+    """The topics whose messages shall come."""
+
+    CODE: ClassVar[bytes] = b"W"
+    topics: frozenset[int]
+
+    def body(self) -> tuple[bytes, ...]:
+        """Write the body."""
+        return (_json(sorted(self.topics)),)
+
+
+@dataclass(frozen=True, slots=True)
+class Data:
+    """A message."""
+
+    CODE: ClassVar[bytes] = b"D"
+    topic: int
+    latched: bool
+    payload: bytes
+
+    def body(self) -> tuple[bytes, ...]:
+        """Write the body."""
+        return _DATA.pack(self.topic, self.latched), self.payload
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """A request to a service."""
+
+    CODE: ClassVar[bytes] = b"C"
+    service: int
+    call: int
+    payload: bytes
+
+    def body(self) -> tuple[bytes, ...]:
+        """Write the body."""
+        return _CALL.pack(self.service, self.call), self.payload
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a service answered."""
+
+    CODE: ClassVar[bytes] = b"A"
+    call: int
+    ok: bool
+    payload: bytes
+
+    def body(self) -> tuple[bytes, ...]:
+        """Write the body."""
+        return _ANSWER.pack(self.call, self.ok), self.payload
+
+
+@dataclass(frozen=True, slots=True)
+class Ping:
+    """A sign of life."""
+
+    CODE: ClassVar[bytes] = b"P"
+
+    def body(self) -> tuple[bytes, ...]:
+        """Write the body."""
+        return ()
+
+
+Frame = Hello | Offer | Want | Data | Call | Answer | Ping
+
+
+def encode(frame: Frame) -> tuple[bytes, ...]:
+    """Write a frame as pieces to be sent one after the other; a message in it is not copied."""
+    body = frame.body()
+    return _HEAD.pack(1 + sum(map(len, body)), frame.CODE[0]), *body
+
+
+class Decoder:
+    """Cuts a byte stream into frames."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> Iterator[Frame]:
+        """Take bytes; return the frames that are complete.
+
+        Raises:
+            LinkBroken: This is not the protocol.
+        """
+        self._buffer += data
+        position = 0
+        while len(self._buffer) - position >= _HEAD.size:
+            length, code = _HEAD.unpack_from(self._buffer, position)
+            if not 1 <= length <= _MOST:
+                raise LinkBroken(f"a frame of {length} bytes")
+            end = position + _HEAD.size + length - 1
+            if end > len(self._buffer):
+                break
+            body = bytes(memoryview(self._buffer)[position + _HEAD.size : end])
+            position = end
+            yield _decode(bytes([code]), body)
+        del self._buffer[:position]
+
+
+def _decode(code: bytes, body: bytes) -> Frame:
+    try:
+        match code:
+            case Data.CODE:
+                topic, latched = _DATA.unpack_from(body)
+                return Data(topic, bool(latched), body[_DATA.size :])
+            case Call.CODE:
+                service, call = _CALL.unpack_from(body)
+                return Call(service, call, body[_CALL.size :])
+            case Answer.CODE:
+                call, ok = _ANSWER.unpack_from(body)
+                return Answer(call, bool(ok), body[_ANSWER.size :])
+            case Ping.CODE:
+                return Ping()
+            case _:
+                return _decode_json(code, json.loads(body))
+    except (struct.error, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise LinkBroken(f"a frame {code!r} that cannot be read: {error}") from error
+
+
+def _decode_json(code: bytes, values: Any) -> Frame:
+    match code:
+        case Hello.CODE:
+            return Hello(str(values["name"]), str(values["token"]), int(values["protocol"]))
+        case Want.CODE:
+            return Want(frozenset(map(int, values)))
+        case Offer.CODE:
+            topics = {
+                int(key): (str(name), TopicKind(*map(str, kind))) for key, name, *kind in values["topics"]
+            }
+            services = {
+                int(key): (str(name), ServiceKind(*map(str, kind))) for key, name, *kind in values["services"]
+            }
+            return Offer(topics, services)
+        case _:
+            raise ValueError("an unknown kind of frame")
+
+
+def _json(values: Any) -> bytes:
+    return json.dumps(values, separators=(",", ":")).encode()

@@ -1,0 +1,196 @@
+"""The other end of a relay: has in its graph what was offered, asks for what is used of it."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+from collections.abc import Callable
+
+from rce.ros.errors import MasterError, RosError, ServiceFault
+from rce.ros.multimaster.filters import SyncFilter
+from rce.ros.multimaster.relay.exporter import CALL_TIMEOUT, Rename
+from rce.ros.multimaster.relay.frames import Answer, Call, Data, Frame, Offer, Want
+from rce.ros.multimaster.relay.kinds import ServiceKind, TopicKind
+from rce.ros.node import Node, Publisher, Service
+from rce.ros.node.master import MasterClient
+
+_log = logging.getLogger(__name__)
+
+RETRY = 1.0
+"""Seconds until something that could not be advertised is tried again."""
+
+
+class Importer:
+    """Publishes and provides in one graph what the other end offers. Messages come while somebody listens."""
+
+    def __init__(
+        self,
+        node: Node,
+        master: MasterClient,
+        chosen: SyncFilter,
+        send: Callable[[Frame], None],
+        *,
+        rename: Rename = str,
+    ) -> None:
+        """Prepare an end.
+
+        Args:
+            node: Publishes and provides.
+            master: The node's master.
+            chosen: What is taken of the offer, by the names that it is offered under.
+            send: Takes frames for the other end.
+            rename: Gives the names of this graph.
+        """
+        self._node = node
+        self._master = master
+        self._chosen = chosen
+        self._send = send
+        self._rename = rename
+        self._offer = Offer()
+        self._topics: dict[int, tuple[str, TopicKind, Publisher]] = {}
+        self._services: dict[int, tuple[str, ServiceKind, Service]] = {}
+        self._calls: dict[int, asyncio.Future[bytes]] = {}
+        self._numbers = itertools.count(1)
+        self._wanted: frozenset[int] = frozenset()
+        self._changed = asyncio.Event()
+        self._complained: set[str] = set()
+
+    async def run(self) -> None:
+        """Keep the graph as the offers have it, until cancelled."""
+        try:
+            while True:
+                self._changed.clear()
+                is_complete = await self._keep_topics() and await self._keep_services()
+                self._tell_wants()
+                try:
+                    async with asyncio.timeout(None if is_complete else RETRY):
+                        await self._changed.wait()
+                except TimeoutError:
+                    continue
+        finally:
+            await self._close()
+
+    def take(self, frame: Frame) -> None:
+        """Take a frame of the other end, if it is for this one."""
+        if isinstance(frame, Data):
+            self._publish(frame)
+        elif isinstance(frame, Answer):
+            waiting = self._calls.get(frame.call)
+            if waiting is not None and not waiting.done():
+                if frame.ok:
+                    waiting.set_result(frame.payload)
+                else:
+                    waiting.set_exception(ServiceFault("", frame.payload.decode(errors="replace")))
+        elif isinstance(frame, Offer):
+            self._offer = frame
+            self._changed.set()
+
+    # ------------------------------------------------------------------ topics
+
+    def _publish(self, data: Data) -> None:
+        known = self._topics.get(data.topic)
+        if known is None:
+            return
+        publisher = known[2]
+        publisher.publish_serialized(data.payload, latch=data.latched)
+        if publisher.connections == 0:
+            self._changed.set()
+
+    def _tell_wants(self) -> None:
+        wanted = frozenset(
+            number for number, (_, _, publisher) in self._topics.items() if publisher.connections
+        )
+        if wanted != self._wanted:
+            self._wanted = wanted
+            self._send(Want(wanted))
+
+    async def _keep_topics(self) -> bool:
+        offered = self._offer.topics
+        for number, (name, kind, publisher) in list(self._topics.items()):
+            if offered.get(number) != (name, kind):
+                del self._topics[number]
+                await publisher.close()
+        is_complete = True
+        for number in offered.keys() - self._topics.keys():
+            name, kind = offered[number]
+            own_name = self._rename(name)
+            if own_name is None or not self._chosen.takes_publisher("", name, kind.name):
+                continue
+            try:
+                publisher = await self._node.advertise(own_name, kind.as_type())
+            except RosError as error:
+                self._complain(f"topic {own_name} is not relayed: {error}")
+                is_complete = False
+                continue
+            publisher.on_subscriber = self._changed.set
+            self._topics[number] = (name, kind, publisher)
+            if publisher.connections:
+                self._changed.set()
+        return is_complete
+
+    # ------------------------------------------------------------------ services
+
+    async def _keep_services(self) -> bool:
+        offered = self._offer.services
+        for number, (name, kind, service) in list(self._services.items()):
+            if offered.get(number) != (name, kind):
+                del self._services[number]
+                await service.close()
+        is_complete = True
+        for number in offered.keys() - self._services.keys():
+            name, kind = offered[number]
+            own_name = self._rename(name)
+            if own_name is None or not self._chosen.takes_service("", name):
+                continue
+            try:
+                service = await self._provide(number, own_name, kind)
+            except RosError as error:
+                self._complain(f"service {own_name} is not relayed: {error}")
+                is_complete = False
+                continue
+            self._services[number] = (name, kind, service)
+        return is_complete
+
+    async def _provide(self, number: int, name: str, kind: ServiceKind) -> Service:
+        if await self._master.lookup_service(name) is not None:
+            raise MasterError("it is provided here already")
+
+        async def handle(request: bytes) -> bytes:
+            return await self._call(name, number, request)
+
+        return await self._node.advertise_service_serialized(name, kind.as_type(), handle)
+
+    async def _call(self, name: str, service: int, request: bytes) -> bytes:
+        number = next(self._numbers) & 0xFFFFFFFF
+        waiting: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
+        self._calls[number] = waiting
+        try:
+            self._send(Call(service, number, request))
+            async with asyncio.timeout(CALL_TIMEOUT):
+                return await waiting
+        except TimeoutError as error:
+            raise ServiceFault(name, "no answer came over the relay") from error
+        except ServiceFault as error:
+            raise ServiceFault(name, error.text) from error
+        finally:
+            del self._calls[number]
+
+    # ------------------------------------------------------------------ the end
+
+    async def _close(self) -> None:
+        for waiting in self._calls.values():
+            if not waiting.done():
+                waiting.set_exception(ServiceFault("", "the relay was closed"))
+        try:
+            for _, _, publisher in self._topics.values():
+                await publisher.close()
+            for _, _, service in self._services.values():
+                await service.close()
+        except MasterError as error:
+            _log.info("the master does not learn that a relay ended: %s", error)
+
+    def _complain(self, text: str) -> None:
+        if text not in self._complained:
+            self._complained.add(text)
+            _log.warning("%s", text)

@@ -1,0 +1,117 @@
+"""One topic under another name, in the same graph: what topic_tools' ``relay`` and ``throttle`` do."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+
+from rce.ros.multimaster.errors import NothingToRelay
+from rce.ros.multimaster.relay.kinds import TopicKind, learn_topic
+from rce.ros.multimaster.relay.throttle import Everything, Throttle
+from rce.ros.multimaster.source import multicall
+from rce.ros.node import Node, Publisher
+from rce.ros.node.master import MasterClient
+from rce.ros.xmlrpc import RpcClient
+
+_log = logging.getLogger(__name__)
+
+LOOK_AGAIN = 0.5
+"""Seconds between looks for a first publisher."""
+
+QUEUE = 100
+
+
+class TopicRelay:
+    """Publishes under one name what is published under another, of whatever type.
+
+    Attributes:
+        passed: How many messages went on.
+        held_back: How many the throttle stopped.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        target: str,
+        *,
+        throttle: Throttle | None = None,
+        latch: bool = False,
+        lazy: bool = False,
+    ) -> None:
+        """Prepare a relay.
+
+        Args:
+            source: The topic to take.
+            target: The topic to publish.
+            throttle: Decides which messages go on; None: all.
+            latch: Keep the last message for later subscribers. Without it, what is latched stays so.
+            lazy: Take messages only while somebody wants them.
+        """
+        self.passed = 0
+        self.held_back = 0
+        self._source = source
+        self._target = target
+        self._throttle = throttle or Everything()
+        self._latch = latch
+        self._lazy = lazy
+        self._idle = asyncio.Event()
+        self._publisher: Publisher
+
+    async def run(self, node: Node) -> None:
+        """Relay until cancelled.
+
+        Raises:
+            MasterError: The master does not answer any longer.
+            ValueError: Both names mean one topic.
+        """
+        source, target = node.resolve(self._source), node.resolve(self._target)
+        if source == target:
+            raise ValueError(f"{source} cannot be relayed to itself")
+        kind = await self._learn(node, source)
+        self._publisher = await node.advertise(target, kind.as_type(), latch=self._latch, queue_size=QUEUE)
+        while True:
+            if self._lazy:
+                await self._publisher.wait_for_subscribers()
+            self._idle.clear()
+            subscriber = await node.subscribe_serialized(
+                source, kind.as_type(), self._pass_on, queue_size=QUEUE
+            )
+            await self._idle.wait()
+            await subscriber.close()
+
+    def _pass_on(self, payload: bytes, latched: bool) -> None:
+        if self._lazy and self._publisher.connections == 0:
+            self._idle.set()
+            return
+        if self._throttle.passes(asyncio.get_running_loop().time(), len(payload)):
+            self.passed += 1
+            self._publisher.publish_serialized(payload, latch=latched)
+        else:
+            self.held_back += 1
+
+    @staticmethod
+    async def _learn(node: Node, topic: str) -> TopicKind:
+        """Wait for a publisher and take the type from it."""
+        reason = ""
+        async with RpcClient() as rpc:
+            master = MasterClient(node.master_uri, node.name, node.uri, rpc)
+            while True:
+                try:
+                    return await learn_topic(rpc, node.name, topic, await publisher_uris(master, topic))
+                except NothingToRelay as error:
+                    if str(error) != reason:
+                        reason = str(error)
+                        _log.info("%s", reason)
+                await asyncio.sleep(LOOK_AGAIN)
+
+
+async def publisher_uris(master: MasterClient, topic: str) -> list[str]:
+    """Return the addresses of a topic's publishers.
+
+    Raises:
+        MasterError: The master does not answer.
+    """
+    publishers, _, _ = await master.call("getSystemState")
+    nodes: list[str] = next((nodes for name, nodes in publishers if name == topic), [])
+    uris = await multicall(master, [("lookupNode", node) for node in nodes if node != master.caller])
+    return [uri for uri in uris if isinstance(uri, str)]

@@ -1,0 +1,249 @@
+"""Relays: to another name, into a namespace, and over one connection."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import pytest
+from support.multimaster import STRING, Neighbourhood, node
+
+from rce.ros.core import Core
+from rce.ros.errors import ServiceFault
+from rce.ros.multimaster.filters import SyncLists
+from rce.ros.multimaster.relay.throttle import MessageThrottle
+from rce.ros.multimaster.relay.topic import TopicRelay
+from rce.ros.multimaster.sync import MasterSync, SyncSettings
+
+
+@pytest.fixture
+async def core() -> AsyncIterator[Core]:
+    async with Core(port=0) as core:
+        yield core
+
+
+@asynccontextmanager
+async def relaying(core: Core, relay: TopicRelay) -> AsyncIterator[None]:
+    async with node("relay", core.uri) as relayer:
+        task = asyncio.create_task(relay.run(relayer))
+        try:
+            yield
+        finally:
+            task.cancel()
+            await asyncio.wait([task])
+
+
+async def test_a_topic_of_a_type_that_nobody_here_knows_is_relayed(core: Core) -> None:
+    from rce.ros.types import TypeRegistry
+
+    kind = TypeRegistry().from_definition("strange_msgs/Thing", "int32 number\nstring text\n")
+    async with (
+        relaying(core, TopicRelay("from", "to")),
+        node("talker", core.uri) as talker,
+        node("listener", core.uri) as listener,
+    ):
+        publisher = await talker.advertise("from", kind)
+        heard = await listener.subscribe("to", kind)
+        await publisher.wait_for_subscribers(timeout=20)
+        await heard.wait_for_publishers(timeout=20)
+        publisher.publish(number=7, text="seven")
+        message = await anext(aiter(heard))
+        assert (message.number, message.text) == (7, "seven")
+        assert core.graph.topic_types["/to"] == "strange_msgs/Thing"
+
+
+async def test_what_is_latched_stays_latched(core: Core) -> None:
+    async with node("talker", core.uri) as talker, relaying(core, TopicRelay("from", "to")):
+        (await talker.advertise("from", STRING, latch=True)).publish(data="kept")
+        async with node("late", core.uri) as late:
+            heard = await late.subscribe("to", STRING)
+            async with asyncio.timeout(20):
+                assert (await anext(aiter(heard))).data == "kept"
+            async with node("later", core.uri) as later:
+                heard = await later.subscribe("to", STRING)
+                async with asyncio.timeout(20):
+                    assert (await anext(aiter(heard))).data == "kept"
+
+
+async def test_a_lazy_relay_listens_only_while_somebody_listens_to_it(core: Core) -> None:
+    async with (
+        node("talker", core.uri) as talker,
+        node("listener", core.uri) as listener,
+        relaying(core, TopicRelay("from", "to", lazy=True)),
+    ):
+        publisher = await talker.advertise("from", STRING)
+        await core.wait_until(lambda graph: "/to" in graph.topic_types, timeout=20)
+        assert core.graph.subscribers("/from") == {}
+        for word in ("one", "two"):
+            heard = await listener.subscribe("to", STRING)
+            await publisher.wait_for_subscribers(timeout=20)
+            publisher.publish(data=word)
+            async with asyncio.timeout(20):
+                assert (await anext(aiter(heard))).data == word
+            await heard.close()
+            while publisher.connections:
+                publisher.publish(data="nobody listens")
+                await asyncio.sleep(0.02)
+
+
+async def test_a_throttled_relay_holds_back(core: Core) -> None:
+    relay = TopicRelay("from", "to", throttle=MessageThrottle(0.01))
+    async with (
+        node("talker", core.uri) as talker,
+        node("listener", core.uri) as listener,
+        relaying(core, relay),
+    ):
+        publisher = await talker.advertise("from", STRING)
+        heard = await listener.subscribe("to", STRING)
+        await publisher.wait_for_subscribers(timeout=20)
+        await heard.wait_for_publishers(timeout=20)
+        for number in range(5):
+            publisher.publish(data=str(number))
+        assert (await anext(aiter(heard))).data == "0"
+        async with asyncio.timeout(20):
+            while relay.held_back < 4:
+                await asyncio.sleep(0.02)
+        assert relay.passed == 1
+
+
+async def test_a_namespace_for_a_master(neighbourhood: Neighbourhood) -> None:
+    lists = SyncLists.read({"ignore_topics": ["/secret"]})
+    async with (
+        neighbourhood.machine(name="robot") as robot,
+        neighbourhood.machine(namespaces={"robot": "Robot1"}, lists=lists) as station,
+        node("amcl", robot.uri) as amcl,
+        node("planner", station.uri) as planner,
+    ):
+        pose = await amcl.advertise("amcl_pose", STRING)
+        await amcl.advertise("secret", STRING)
+        goals = await amcl.subscribe("goals", STRING)
+        await amcl.advertise_service("clear", "roscpp/GetLoggers", lambda _: {"loggers": [{"name": "x"}]})
+        poses = await planner.subscribe("/Robot1/amcl_pose", STRING)
+        goal = await planner.advertise("/Robot1/goals", STRING)
+
+        await station.until(lambda graph: graph.service("/Robot1/clear") is not None)
+        await robot.until(lambda graph: bool(graph.subscribers("/amcl_pose")))
+        await pose.wait_for_subscribers(timeout=20)
+        pose.publish(data="here")
+        async with asyncio.timeout(20):
+            assert (await anext(aiter(poses))).data == "here"
+        await goal.wait_for_subscribers(timeout=20)
+        await robot.until(lambda graph: bool(graph.publishers("/goals")))
+        async with asyncio.timeout(20):
+            await goals.wait_for_publishers()
+            while not (await heard_within(goals, goal)):
+                pass
+        answer = await planner.service_client("/Robot1/clear", "roscpp/GetLoggers").call({}, timeout=20)
+        assert [logger.name for logger in answer.loggers] == ["x"]
+        assert {"/Robot1/secret", "/amcl_pose", "/secret"} & station.graph.topic_types.keys() == set()
+
+
+async def heard_within(subscriber: Any, publisher: Any) -> bool:
+    """Publish once; tell whether it arrived soon. A relay takes a moment until it is wanted."""
+    publisher.publish(data="go")
+    try:
+        async with asyncio.timeout(0.3):
+            return bool((await anext(aiter(subscriber))).data == "go")
+    except TimeoutError:
+        return False
+
+
+@asynccontextmanager
+async def linked(token: str = "", **lists: Any) -> AsyncIterator[tuple[Core, Core, MasterSync, MasterSync]]:
+    """Two cores that know each other by one connection only: no discovery, no direct way."""
+    chosen = SyncLists.read(lists)
+    async with Core(port=0) as cloud, Core(port=0) as robot:
+        listening = SyncSettings(
+            cloud.uri, relay_listen=0, relay_addr="127.0.0.1", relay_token="t", relay_name="cloud"
+        )
+        async with MasterSync(listening) as one:
+            dialing = SyncSettings(
+                robot.uri,
+                lists=chosen,
+                relay_to=(("127.0.0.1", one.relay_port),),
+                relay_token=token or "t",
+                relay_name="robot",
+            )
+            async with MasterSync(dialing) as other:
+                yield cloud, robot, one, other
+
+
+async def test_one_connection_carries_topics_and_services_both_ways() -> None:
+    async with (
+        linked(ignore_topics=["/secret"]) as (cloud, robot, _, _),
+        node("planner", cloud.uri) as planner,
+        node("base", robot.uri) as base,
+    ):
+        said, answered = await base.advertise("said", STRING), await planner.advertise("answered", STRING)
+        await base.advertise("secret", STRING)
+        heard, got = await planner.subscribe("said", STRING), await base.subscribe("answered", STRING)
+        for publisher, subscriber, core in ((said, heard, robot), (answered, got, cloud)):
+            topic = publisher.topic
+            await core.wait_until(lambda graph, topic=topic: graph.subscribers(topic), timeout=20)  # type: ignore[misc]
+            await publisher.wait_for_subscribers(timeout=20)
+            body = "x" * 3_000_000
+            publisher.publish(data=body)
+            async with asyncio.timeout(20):
+                assert (await anext(aiter(subscriber))).data == body
+        assert base.uri not in cloud.graph.nodes.values()
+        assert "/secret" not in cloud.graph.topic_types
+
+        def refuse(_: object) -> None:
+            raise ServiceFault("/add", "not today")
+
+        await planner.advertise_service("add", "roscpp/GetLoggers", lambda _: {"loggers": []})
+        await planner.advertise_service("refuse", "roscpp/Empty", refuse)
+        await robot.wait_until(lambda graph: graph.service("/refuse") is not None, timeout=20)
+        assert (await base.service_client("add", "roscpp/GetLoggers").call({}, timeout=20)).loggers == []
+        with pytest.raises(ServiceFault, match="not today"):
+            await base.service_client("refuse", "roscpp/Empty").call({}, timeout=20)
+
+
+async def test_a_link_brings_messages_only_while_somebody_listens() -> None:
+    async with (
+        linked() as (cloud, robot, _, _),
+        node("planner", cloud.uri) as planner,
+        node("base", robot.uri) as base,
+    ):
+        said = await base.advertise("said", STRING)
+        await cloud.wait_until(lambda graph: "/said" in graph.topic_types, timeout=20)
+        assert robot.graph.subscribers("/said") == {}
+        heard = await planner.subscribe("said", STRING)
+        await robot.wait_until(lambda graph: bool(graph.subscribers("/said")), timeout=20)
+        await said.wait_for_subscribers(timeout=20)
+        await heard.close()
+        async with asyncio.timeout(20):
+            while said.connections:
+                said.publish(data="nobody listens")
+                await asyncio.sleep(0.02)
+
+
+async def test_a_broken_link_takes_back_and_comes_back() -> None:
+    async with (
+        linked() as (cloud, robot, one, _),
+        node("base", robot.uri) as base,
+    ):
+        await base.advertise("said", STRING)
+        await cloud.wait_until(lambda graph: "/said" in graph.topic_types, timeout=20)
+        with cloud.watch() as events:
+            (link,) = one._links._running
+            link._transport.abort()
+            gone = back = False
+            async with asyncio.timeout(20):
+                async for event in events:
+                    gone = gone or (event.name, event.change.value) == ("/said", "publisher removed")
+                    back = gone and (event.name, event.change.value) == ("/said", "publisher added")
+                    if back:
+                        break
+
+
+async def test_another_token_is_refused(caplog: pytest.LogCaptureFixture) -> None:
+    async with linked(token="wrong") as (cloud, robot, one, other), node("base", robot.uri) as base:
+        await base.advertise("said", STRING)
+        async with asyncio.timeout(20):
+            while "another token" not in caplog.text:
+                await asyncio.sleep(0.02)
+        assert one._links.connected == other._links.connected == set()
+        assert "/said" not in cloud.graph.topic_types
