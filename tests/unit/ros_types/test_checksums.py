@@ -156,7 +156,9 @@ def test_checksum_and_full_text_are_those_of_all_installed_ros_messages() -> Non
     types = TypeRegistry(PackageIndex(["/usr/share"]))
     for name, (md5sum, full_text) in classes.items():
         assert types.message(name).md5sum == md5sum, name
-        assert _same(types.message(name).definition, full_text), name
+        if Path("/usr/share", name.replace("/", "/msg/") + ".msg").exists():
+            # Else the type is one that is built in, whose text has no comments.
+            assert _same(types.message(name).definition, full_text), name
 
 
 @pytest.mark.needs("rospy")
