@@ -1,4 +1,4 @@
-"""The simulation as a program: ``python -m rce_client.simulation SCENE.json --report FILE --master URL``."""
+"""The simulation as a program: ``python -m rce_client.simulation SCENE.json --report FILE``."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ from rce.config.exceptions import ConfigError
 from rce.ros.types import TypeRegistry
 from rce_client.exceptions import RefusedError
 from rce_client.simulation.account import Account
+from rce_client.simulation.block_watch import BlockWatch
+from rce_client.simulation.cell_watch import CellWatch, GraphCellWatch
+from rce_client.simulation.cores import Cores
 from rce_client.simulation.program import Simulation
 from rce_client.simulation.scene import load_scene
 
@@ -32,18 +35,28 @@ def simulate(
     password: Annotated[str, typer.Option(envvar="RCE_PASSWORD", help="The user's password.")] = "testUser",  # noqa: S107 - the development user's
     robot_id: Annotated[str, typer.Option(help="The robotID by which the world comes.")] = "world",
     container: Annotated[str, typer.Option(help="Tag of the planner's container.")] = "cTag_fleet",
+    planner_core: Annotated[
+        str,
+        typer.Option(help="In place of --master: the ROS master of a planner that runs without the engine."),
+    ] = "",
+    core: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="ROS master that robots join in their namespaces: URI or ROBOT=URI; may be repeated."
+        ),
+    ] = None,
 ) -> None:
-    """Simulate robots in a world, in real time; each is a ROS graph of its own."""
+    """Simulate robots in a world, in real time; each is a ROS graph of its own unless --core names one."""
     logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    types = TypeRegistry()
+    watch: CellWatch | None = None
+    if planner_core:
+        watch = GraphCellWatch(planner_core, types)
+    elif master:
+        watch = BlockWatch(Account(master, user, password, robot_id), container)
+    cores = Cores.read(core or ())
     try:
-        simulation = Simulation(
-            load_scene(scene),
-            TypeRegistry(),
-            typer.echo,
-            report=report,
-            account=Account(master, user, password, robot_id) if master else None,
-            container=container,
-        )
+        simulation = Simulation(load_scene(scene), types, typer.echo, report=report, watch=watch, cores=cores)
     except ConfigError as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(BAD_SCENE) from None

@@ -1,4 +1,4 @@
-"""The world's connection to the engine: cells that the planner blocks get a box."""
+"""The world's connection to the engine: cells that the planner blocks come through its container."""
 
 from __future__ import annotations
 
@@ -6,14 +6,13 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 from rce_client.connection import Connection
+from rce_client.simulation.cell_watch import CELLS, TOPIC, cells_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rce_client.simulation.account import Account
 
-CELLS = "std_msgs/Int32MultiArray"
-TOPIC = "/fleet/blockedCells"
 OWN_TAG = "blockedCells"
 JOIN_TIMEOUT = 3.0
 """Seconds after which the interface is asked for again."""
@@ -30,29 +29,34 @@ class BlockWatch:
     Args:
         account: Whose fleet it is, and where.
         container: Tag of the planner's container.
-        follow: Called with all cells that are blocked now, whenever they change.
     """
 
-    def __init__(self, account: Account, container: str, follow: Callable[[list[int]], None]) -> None:
+    def __init__(self, account: Account, container: str) -> None:
         self._account = account
         self._container = container
-        self._follow = follow
         self.joined = asyncio.Event()
         """Set once the wire was there."""
 
-    async def run(self) -> None:
+    async def run(self, follow: Callable[[list[int]], None]) -> None:
         """Watch until cancelled, then take back the interface.
+
+        Args:
+            follow: Called with all cells that are blocked now, whenever they change.
 
         Raises:
             RefusedError: The engine does not take this client.
         """
         account = self._account
+
+        def take(message: dict[str, Any]) -> None:
+            follow(cells_of(message["data"]))
+
         connection = Connection(
             account.url, account.user, account.password, account.robot, on_error=lambda _: None
         )
         async with connection:
             try:
-                await connection.subscriber(OWN_TAG, CELLS, self._take)
+                await connection.subscriber(OWN_TAG, CELLS, take)
                 while True:
                     if not connection.active.get(OWN_TAG, False):
                         await self._join(connection)
@@ -72,6 +76,3 @@ class BlockWatch:
             except TimeoutError:
                 continue
             return
-
-    def _take(self, message: dict[str, Any]) -> None:
-        self._follow([int(cell) for cell in message["data"]])

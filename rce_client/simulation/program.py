@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 from rce.fleet.simulation.boxes import BoxKeeper
 from rce.ros.core import Core
 from rce.ros.node import Node
-from rce_client.simulation.block_watch import BlockWatch
+from rce.ros.tf import frames
+from rce_client.simulation.cores import Cores
 from rce_client.simulation.report import look_at, write_report
 from rce_client.simulation.robot_driver import RobotDriver
 from rce_client.simulation.runner import run_world
@@ -20,23 +21,25 @@ if TYPE_CHECKING:
 
     from rce.fleet.simulation.world import World
     from rce.ros.types import TypeRegistry
-    from rce_client.simulation.account import Account
+    from rce_client.simulation.cell_watch import CellWatch
     from rce_client.simulation.scene import Scene
 
 REPORT_EVERY = 0.5
 """Seconds between two reports."""
+ROBOT_NODE = "robot"
+"""Name of a robot's node in its namespace, where it joins a graph that is there."""
 
 
 class Simulation:
-    """A world in real time, each robot with a ROS graph of its own.
+    """A world in real time, each robot a node in a ROS graph.
 
     Args:
         scene: What stands where.
         types: Where message types come from.
         say: Gets lines for people and for programs that start this one.
         report: File that the report is written to; none if None.
-        account: The engine whose planner blocks cells; none if None.
-        container: Tag of the planner's container.
+        watch: Hears the cells that the planner blocks; nobody blocks any if None.
+        cores: The ROS graphs that the robots join.
     """
 
     def __init__(
@@ -46,8 +49,8 @@ class Simulation:
         say: Callable[[str], None],
         *,
         report: Path | None = None,
-        account: Account | None = None,
-        container: str = "cTag_fleet",
+        watch: CellWatch | None = None,
+        cores: Cores = Cores(),  # noqa: B008 - it cannot be changed
     ) -> None:
         self._scene = scene
         self._types = types
@@ -55,7 +58,8 @@ class Simulation:
         self._report = report
         self._world = scene.build()
         self._boxes = BoxKeeper(self._world)
-        self._watch = None if account is None else BlockWatch(account, container, self._boxes.follow)
+        self._watch = watch
+        self._cores = cores
 
     @property
     def world(self) -> World:
@@ -73,7 +77,7 @@ class Simulation:
                         tasks.create_task(self._keep_report()),
                     ]
                     if self._watch is not None:
-                        work.append(tasks.create_task(self._watch.run()))
+                        work.append(tasks.create_task(self._watch.run(self._boxes.follow)))
                     work.append(tasks.create_task(self._announce()))
                     await stop.wait()
                     for task in work:
@@ -82,11 +86,20 @@ class Simulation:
             self._write_report()
 
     async def _start_robot(self, graphs: AsyncExitStack, robot: str) -> RobotDriver:
-        core = await graphs.enter_async_context(Core(port=0))
-        node = Node(robot, argv=(), master_uri=core.uri, types=self._types, signals=False)
-        driver = RobotDriver(await graphs.enter_async_context(node), self._world, robot)
+        uri = self._cores.of(robot)
+        if uri is None:
+            core = await graphs.enter_async_context(Core(port=0))
+            uri, name, namespace, prefix = core.uri, robot, "", ""
+        else:
+            name, namespace, prefix = ROBOT_NODE, robot, robot
+        node = await graphs.enter_async_context(
+            Node(name, namespace=namespace, argv=(), master_uri=uri, types=self._types, signals=False)
+        )
+        if prefix:
+            await node.set_param(frames.PARAMETER, prefix)
+        driver = RobotDriver(node, self._world, robot, tf_prefix=prefix)
         await driver.start()
-        self._say(f"robot {robot} ROS_MASTER_URI={core.uri}")
+        self._say(f"robot {robot} ROS_MASTER_URI={uri}")
         return driver
 
     async def _announce(self) -> None:

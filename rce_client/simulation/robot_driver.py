@@ -15,6 +15,7 @@ import numpy as np
 from rce.fleet.angles import quaternion_z
 from rce.fleet.simulation.move_base import SimulatedMoveBase
 from rce.fleet.simulation.obstacles import hit_points
+from rce.ros.tf import frames
 from rce.ros.types import Time
 
 if TYPE_CHECKING:
@@ -55,13 +56,25 @@ class RobotDriver:
         world: The world.
         robot: Id of the robot in the world.
         limits: What the robot can do.
+        tf_prefix: What the robot's own frames live below, where several robots share a graph.
     """
 
-    def __init__(self, node: Node, world: World, robot: str, limits: DriveLimits | None = None) -> None:
+    def __init__(
+        self,
+        node: Node,
+        world: World,
+        robot: str,
+        limits: DriveLimits | None = None,
+        *,
+        tf_prefix: str = "",
+    ) -> None:
         self._node = node
         self._world = world
         self._robot = world.robots[robot]
         self._base = SimulatedMoveBase(world.grid, self._robot.radius, limits)
+        self._odom, self._base_link, self._base_scan = (
+            frames.resolve(tf_prefix, frame) for frame in ("odom", "base_link", "base_scan")
+        )
         self._points: Floats = np.empty((0, 2))
         self._topics: _Topics | None = None
         self._sensed_at = -math.inf
@@ -120,14 +133,14 @@ class RobotDriver:
         )
         twist = robot.twist
         topics.odometry.publish(
-            header={"stamp": stamp, "frame_id": "odom"},
-            child_frame_id="base_link",
+            header={"stamp": stamp, "frame_id": self._odom},
+            child_frame_id=self._base_link,
             pose={"pose": _pose_fields(robot.odometry)},
             twist={"twist": {"linear": {"x": twist.speed}, "angular": {"z": twist.turn_rate}}},
         )
         if topics.scan.connections:
             topics.scan.publish(
-                header={"stamp": stamp, "frame_id": "base_scan"},
+                header={"stamp": stamp, "frame_id": self._base_scan},
                 angle_min=-math.pi,
                 angle_max=math.pi - spec.increment,
                 angle_increment=spec.increment,

@@ -1,4 +1,4 @@
-"""``rce ui CONFIG``: the operator station as a program."""
+"""``rce ui CONFIG``, ``rce ui --ros-master URI``: the operator station as a program."""
 
 from __future__ import annotations
 
@@ -9,18 +9,24 @@ import logging
 import signal
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol
 
 import typer
 import uvloop
 
 from rce.config.client import ClientConfig, load
 from rce.config.exceptions import ConfigError
+from rce.config.resources import examples_dir
+from rce.ros.packages import PackageIndex
+from rce.ros.types import TypeRegistry
 from rce.web.server import HttpServer
 from rce_client.exceptions import RefusedError
 from rce_client.station.engine_watch import EngineWatch
-from rce_client.station.fleet_link import FleetLink
+from rce_client.station.engine_wire import EngineWire
+from rce_client.station.fleet_link import FleetLink, PlannerWire
+from rce_client.station.graph_watch import GraphWatch
 from rce_client.station.live import Broadcast
+from rce_client.station.ros_wire import RosWire
 from rce_client.station.server import Station
 from rce_client.station.view import FleetView
 
@@ -29,8 +35,12 @@ PORT = 9080
 
 def ui(
     config: Annotated[
-        Path, typer.Argument(help="The operator's file: user, robotID, the planner's container.")
-    ],
+        Path | None, typer.Argument(help="The operator's file: user, robotID, the planner's container.")
+    ] = None,
+    ros_master: Annotated[
+        str,
+        typer.Option(help="In place of a file: the ROS master of a planner that runs without the engine."),
+    ] = "",
     port: Annotated[int, typer.Option(help="Port of the page and the API; 0 takes a free one.")] = PORT,
     bind: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     token: Annotated[
@@ -38,17 +48,19 @@ def ui(
         typer.Option(envvar="RCE_STATION_TOKEN", help="Callers must show it; needed beyond loopback."),
     ] = "",
 ) -> None:
-    """Run the fleet planner in the cloud, and the page and the API that steer it."""
+    """Serve the page and the API that steer a fleet; CONFIG's planner is run in the cloud for that."""
     logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    if (config is None) == (not ros_master):
+        raise typer.BadParameter("give either CONFIG or --ros-master")
     try:
-        settings = load(config)
+        way = RosWay(ros_master) if config is None else EngineWay(load(config))
     except ConfigError as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(2) from None
     if not token and not _is_loopback(bind):
         raise typer.BadParameter(f"--bind {bind} opens the station to others: give it a --token")
     try:
-        uvloop.run(serve(settings, bind, port, token))
+        uvloop.run(serve(way, bind, port, token))
     except* RefusedError as group:
         typer.echo(f"rce ui: {group.exceptions[0]}", err=True)
         raise typer.Exit(1) from None
@@ -98,17 +110,53 @@ class Feed:
         self._pages.send(topic, json.dumps({"type": topic, **message}))
 
 
-async def serve(config: ClientConfig, bind: str, port: int, token: str) -> None:
+class Way(Protocol):
+    """How the station reaches the planner, and what carries the fleet."""
+
+    @property
+    def wire(self) -> PlannerWire:
+        """The wire to the planner."""
+
+    async def watch(self, on_state: Callable[[dict[str, Any]], None]) -> None:
+        """Tell the state of what carries the fleet until cancelled."""
+
+
+class EngineWay:
+    """Through the engine, which runs the planner in a container."""
+
+    def __init__(self, config: ClientConfig) -> None:
+        self.wire = EngineWire(config)
+        self._config = config
+
+    async def watch(self, on_state: Callable[[dict[str, Any]], None]) -> None:
+        """Tell the engine's state; the wire has ended nodes started again."""
+        config = self._config
+
+        def take(state: dict[str, Any]) -> None:
+            on_state(state)
+            self.wire.on_engine(state)
+
+        await EngineWatch(config.url, config.user, config.password.get_secret_value(), on_state=take).run()
+
+
+class RosWay:
+    """In the ROS graph of the planner."""
+
+    def __init__(self, master_uri: str) -> None:
+        path = [*PackageIndex.from_environ().path, examples_dir()]
+        self.wire = RosWire(master_uri, TypeRegistry(PackageIndex(path)))
+        self._master_uri = master_uri
+
+    async def watch(self, on_state: Callable[[dict[str, Any]], None]) -> None:
+        """Tell the nodes of the graph."""
+        await GraphWatch(self._master_uri, on_state=on_state).run()
+
+
+async def serve(way: Way, bind: str, port: int, token: str) -> None:
     """Serve until SIGINT or SIGTERM."""
     view, pages = FleetView(), Broadcast()
     feed = Feed(view, pages)
-    fleet = FleetLink(config, view, on_change=feed.on_change, on_event=feed.on_event)
-
-    def on_engine(state: dict[str, Any]) -> None:
-        feed.on_engine(state)
-        fleet.on_engine(state)
-
-    watch = EngineWatch(config.url, config.user, config.password.get_secret_value(), on_state=on_engine)
+    fleet = FleetLink(way.wire, view, on_change=feed.on_change, on_event=feed.on_event)
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
@@ -117,7 +165,7 @@ async def serve(config: ClientConfig, bind: str, port: int, token: str) -> None:
         async def announce() -> None:
             typer.echo(f"rce ui ready: {server.url}")
 
-        await _until(stop.wait, lambda: fleet.run(announce), watch.run)
+        await _until(stop.wait, lambda: fleet.run(announce), lambda: way.watch(feed.on_engine))
 
 
 async def _until(done: Callable[[], Any], *work: Callable[[], Any]) -> None:

@@ -1,29 +1,38 @@
-"""The station's way to the planner: state and poses come in, wishes go out, all through the engine."""
+"""The station's dealings with the planner: state and poses come in, wishes go out, over any wire."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
-from rce.config.client import ClientConfig
-from rce.protocol.messages import Request
-from rce_client.connection import Connection, State
-from rce_client.ends import ServiceClient
-from rce_client.exceptions import CallError, ClientError
-from rce_client.station.respawn import repairs
 from rce_client.station.view import FleetView
 from rce_client.station.wishes import CellWish, GoalWish, Wishes
 
 STATE = "fleet/FleetState"
+STATE_TOPIC = "/fleet/state"
 POSE = "geometry_msgs/PoseWithCovarianceStamped"
-SET_GOAL = "fleet/SetGoal"
-BLOCK_CELL = "fleet/BlockCell"
 CALL_TIMEOUT_S = 10.0
 TELL_AGAIN_S = 20.0
 """How long a planner that was restarted is told again what it does not know."""
 TELL_EVERY_S = 0.5
+
+
+class PlannerService(NamedTuple):
+    """A service of the planner: its name in the planner's ROS graph, and its type."""
+
+    name: str
+    cls: str
+
+
+SET_GOAL = PlannerService("/fleet/set_goal", "fleet/SetGoal")
+BLOCK_CELL = PlannerService("/fleet/block_cell", "fleet/BlockCell")
+
+
+def pose_topic(robot: str) -> str:
+    """The topic of a robot's poses in the planner's ROS graph."""
+    return f"/{robot}/amcl_pose"
 
 
 class FleetError(Exception):
@@ -34,11 +43,41 @@ class PlannerAwayError(FleetError):
     """The planner cannot be reached at this moment."""
 
 
+class Listener(Protocol):
+    """Gets what comes in over a wire. Messages are in their JSON form."""
+
+    def take_state(self, message: dict[str, Any]) -> None:
+        """Take a ``fleet/FleetState``."""
+
+    def take_pose(self, robot: str, message: dict[str, Any]) -> None:
+        """Take a robot's pose message."""
+
+    def take_event(self, text: str, tone: str) -> None:
+        """Take words on what happened; the tone is ``good``, ``warn`` or ``bad``."""
+
+
+class PlannerWire(Protocol):
+    """A way to the planner: through the engine, or in its own ROS graph."""
+
+    async def run(self, listener: Listener, ready: Callable[[], Awaitable[None]]) -> None:
+        """Let state and poses come in until cancelled; call ``ready`` once the planner can be heard."""
+
+    def follow(self, robot: str) -> None:
+        """Let a robot's poses come in."""
+
+    async def call(self, service: PlannerService, request: dict[str, Any]) -> dict[str, Any]:
+        """Ask the planner.
+
+        Raises:
+            PlannerAwayError: There is no answer.
+        """
+
+
 class FleetLink:
-    """A connection to the fleet's container.
+    """What the station knows and wants of the fleet.
 
     Args:
-        config: The operator's configuration; its first container is the planner's.
+        wire: The way to the planner.
         view: Gets what comes in.
         on_change: Called with ``state`` or ``poses`` after the view took something.
         on_event: Called with words and a tone (``good``, ``warn``, ``bad`` or none) when something happens.
@@ -46,50 +85,26 @@ class FleetLink:
 
     def __init__(
         self,
-        config: ClientConfig,
+        wire: PlannerWire,
         view: FleetView,
         *,
         on_change: Callable[[str], None],
         on_event: Callable[[str, str], None],
     ) -> None:
-        if not config.containers:
-            raise ValueError("containers: the fleet's configuration names no container for the planner")
-        self._config = config
-        self._container = config.containers[0].tag
+        self._wire = wire
         self._view = view
         self._on_change = on_change
         self._on_event = on_event
         self._wishes = Wishes()
         self._planner_began: str | None = None
         self._planner_restarted = asyncio.Event()
-        self._repairs: asyncio.Queue[Request] = asyncio.Queue()
         self._known: set[str] = set()
-        self._new_robots: asyncio.Queue[str] = asyncio.Queue()
-        self._set_goal: ServiceClient[dict[str, Any]] | None = None
-        self._block_cell: ServiceClient[dict[str, Any]] | None = None
-        self._connection = Connection(
-            config.url,
-            config.user,
-            config.password.get_secret_value(),
-            config.robot,
-            on_error=lambda text: on_event(text, "bad"),
-            on_state=self._on_state,
-        )
 
     async def run(self, ready: Callable[[], Awaitable[None]]) -> None:
-        """Make the planner's container, wire it, and keep taking what comes until cancelled."""
-        async with self._connection as connection:
-            try:
-                for request in self._config.setup():
-                    await connection.request(request)
-                await self._wire(connection)
-                await ready()
-                async with asyncio.TaskGroup() as group:
-                    group.create_task(self._follow_robots(connection))
-                    group.create_task(self._repair(connection))
-                    group.create_task(self._tell_again())
-            finally:
-                await connection.remove_all()
+        """Keep taking what comes until cancelled; ``ready`` is called once the planner can be heard."""
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._wire.run(self, ready))
+            group.create_task(self._tell_again())
 
     async def set_goal(self, robot: str, cell: int | None) -> str:
         """Send a robot to a cell, or let it stop (None); returns what the planner says.
@@ -97,7 +112,7 @@ class FleetLink:
         Raises:
             FleetError: The planner refuses, or is away.
         """
-        said = await self._ask(self._set_goal, {"robot": robot, "cell": -1 if cell is None else cell})
+        said = await self._ask(SET_GOAL, {"robot": robot, "cell": -1 if cell is None else cell})
         self._wishes.set_goal(robot, cell)
         return said
 
@@ -107,49 +122,15 @@ class FleetLink:
         Raises:
             FleetError: The planner refuses, or is away.
         """
-        said = await self._ask(self._block_cell, {"cell": cell, "blocked": blocked})
+        said = await self._ask(BLOCK_CELL, {"cell": cell, "blocked": blocked})
         self._wishes.set_cell(cell, blocked=blocked)
         return said
 
-    def on_engine(self, state: dict[str, Any]) -> None:
-        """Take the engine's state; nodes that ended are started again."""
-        for request in repairs(self._config, state):
-            self._repairs.put_nowait(request)
-
-    async def _ask(self, service: ServiceClient[dict[str, Any]] | None, request: dict[str, Any]) -> str:
-        if service is None:
-            raise PlannerAwayError("the planner's container is not ready yet")
-        try:
-            answer = await service(request, timeout=CALL_TIMEOUT_S)
-        except CallError as error:
-            raise PlannerAwayError(f"the planner did not answer: {error}") from error
-        except ClientError as error:
-            raise PlannerAwayError(f"the engine cannot be reached: {error}") from error
+    async def _ask(self, service: PlannerService, request: dict[str, Any]) -> str:
+        answer = await self._wire.call(service, request)
         if not answer["ok"]:
             raise FleetError(answer["message"])
         return str(answer["message"])
-
-    async def _wire(self, connection: Connection) -> None:
-        await connection.subscriber("fleetState", STATE, self._take_state)
-        self._set_goal = await connection.service_client("setGoal", SET_GOAL)
-        self._block_cell = await connection.service_client("blockCell", BLOCK_CELL)
-        for tag, kind, cls, address in (
-            ("fleetState", "SubscriberInterface", STATE, "/fleet/state"),
-            ("setGoal", "ServiceClientInterface", SET_GOAL, "/fleet/set_goal"),
-            ("blockCell", "ServiceClientInterface", BLOCK_CELL, "/fleet/block_cell"),
-        ):
-            await connection.add_interface(self._container, tag, kind, cls, addr=address)
-            await self._join(connection, tag)
-        for tag in ("fleetState", "setGoal", "blockCell"):
-            await connection.wait_active(tag)
-
-    async def _follow_robots(self, connection: Connection) -> None:
-        while True:
-            await self._follow(connection, await self._new_robots.get())
-
-    async def _repair(self, connection: Connection) -> None:
-        while True:
-            await connection.request(await self._repairs.get())
 
     async def _tell_again(self) -> None:
         """Tell a planner that was restarted what it forgot, until it knows or it is time to give up."""
@@ -172,19 +153,10 @@ class FleetLink:
                     case GoalWish(robot, cell):
                         await self.set_goal(robot, cell)
 
-    async def _follow(self, connection: Connection, robot: str) -> None:
-        """Wire a robot's pose to the station."""
-        tag = f"pose{robot}"
-        await connection.subscriber(tag, POSE, lambda message: self._take_pose(robot, message))
-        await connection.add_interface(
-            self._container, tag, "SubscriberInterface", POSE, addr=f"/{robot}/amcl_pose"
-        )
-        await self._join(connection, tag)
+    # -- what comes in ------------------------------------------------------------------------------
 
-    async def _join(self, connection: Connection, tag: str) -> None:
-        await connection.connect(f"{connection.robot_id}/{tag}", f"{self._container}/{tag}")
-
-    def _take_state(self, message: dict[str, Any]) -> None:
+    def take_state(self, message: dict[str, Any]) -> None:
+        """Take a ``fleet/FleetState``."""
         self._view.on_state(message)
         if self._planner_began not in (None, message["started"]):
             self._planner_restarted.set()
@@ -192,15 +164,14 @@ class FleetLink:
         for robot in self._view.robot_ids():
             if robot not in self._known:
                 self._known.add(robot)
-                self._new_robots.put_nowait(robot)
+                self._wire.follow(robot)
         self._on_change("state")
 
-    def _take_pose(self, robot: str, message: dict[str, Any]) -> None:
+    def take_pose(self, robot: str, message: dict[str, Any]) -> None:
+        """Take a robot's pose message."""
         self._view.on_pose(robot, message)
         self._on_change("poses")
 
-    def _on_state(self, state: State, words: str) -> None:
-        if state is State.LOST:
-            self._on_event(f"connection to the engine lost: {words}", "bad")
-        elif state is State.RESTORED:
-            self._on_event("connection to the engine is back", "good")
+    def take_event(self, text: str, tone: str) -> None:
+        """Take words on what happened."""
+        self._on_event(text, tone)

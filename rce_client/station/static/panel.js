@@ -24,6 +24,7 @@ export class Panel {
     this.fleet = fleet;
     this.body = document.querySelector("#robots tbody");
     this.engine = document.querySelector("#engine");
+    this.carrier = document.querySelector("#carrier");
     this.events = document.querySelector("#events");
     this.summary = document.querySelector("#summary");
     for (const type of ["state", "selected"]) fleet.addEventListener(type, () => this.drawRobots());
@@ -73,7 +74,17 @@ export class Panel {
       this.engine.replaceChildren(element("p", engine.error, "bad"));
       return;
     }
+    this.carrier.textContent = engine.graph ? "ROS graph" : "Engine";
     const list = element("ul");
+    if (engine.graph) {
+      list.append(element("li", engine.graph.uri, "quiet"));
+      for (const node of engine.graph.nodes) {
+        const counts = `${node.publishes} out, ${node.subscribes} in, ${node.serves} services`;
+        list.append(stateLine(node.name, "registered", counts));
+      }
+      this.engine.replaceChildren(list);
+      return;
+    }
     const containers = [...engine.containers].sort((a, b) => a.tag.localeCompare(b.tag, "en", { numeric: true }));
     for (const container of containers) {
       const item = stateLine(container.tag, container.state, container.machine);
