@@ -35,9 +35,11 @@ class SqliteStore:
     Written with a write-ahead log and a sync at every commit, so what was saved survives a power cut.
     """
 
-    def __init__(self, database: aiosqlite.Connection, lock: FolderLock) -> None:
+    def __init__(self, database: aiosqlite.Connection, lock: FolderLock, path: Path) -> None:
         self._database = database
         self._lock = lock
+        self._path = path
+        self._inode = path.stat().st_ino
 
     @classmethod
     async def open(cls, folder: Path) -> SqliteStore:
@@ -49,7 +51,8 @@ class SqliteStore:
         """
         lock = FolderLock(folder)
         try:
-            return cls(await _connect(folder / FILE_NAME), lock)
+            path = folder / FILE_NAME
+            return cls(await _connect(path), lock, path)
         except BaseException:
             lock.close()
             raise
@@ -75,6 +78,7 @@ class SqliteStore:
         Raises:
             StoreError: Nothing was written.
         """
+        self._check_that_it_is_there()
         puts = [(row.table, row.key, row.body) for row in rows if row.body is not None]
         deletes = [(row.table, row.key) for row in rows if row.body is None]
         try:
@@ -89,6 +93,15 @@ class SqliteStore:
         """Close the file and unlock the folder."""
         await self._database.close()
         self._lock.close()
+
+    def _check_that_it_is_there(self) -> None:
+        """Refuse to write to a file that was taken away: SQLite would, and all would be lost at the end."""
+        try:
+            there = self._path.stat().st_ino == self._inode
+        except OSError:
+            there = False
+        if not there:
+            raise StoreError(f"the store {self._path} was removed or replaced while it is in use")
 
     async def _roll_back(self) -> None:
         try:

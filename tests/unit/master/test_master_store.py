@@ -81,3 +81,18 @@ async def test_a_failed_save_writes_nothing(tmp_path: Path) -> None:
     await store.save([Row("users", "c", b"3")])
     assert await store.load() == {"users": {"c": b"3"}}
     await store.close()
+
+
+async def test_nothing_is_saved_into_a_file_that_was_taken_away(tmp_path: Path) -> None:
+    store = await SqliteStore.open(tmp_path)
+    await store.save([Row("users", "a", b"1")])
+    (tmp_path / "rce.sqlite").rename(tmp_path / "backup")
+    with pytest.raises(StoreError, match="removed or replaced"):
+        await store.save([Row("users", "b", b"2")])
+    (tmp_path / "rce.sqlite").write_bytes(b"")
+    with pytest.raises(StoreError, match="removed or replaced"):
+        await store.save([Row("users", "b", b"2")])
+    (tmp_path / "backup").replace(tmp_path / "rce.sqlite")
+    await store.save([Row("users", "b", b"2")])
+    assert await store.load() == {"users": {"a": b"1", "b": b"2"}}
+    await store.close()
