@@ -79,10 +79,11 @@ class RobotSocket(ServerConnection):
         _add_frame(buffers, _FIN_TEXT, b"", message.text)
         for head, body in message.binaries:
             _add_frame(buffers, _FIN_BINARY, head, body)
-        if len(buffers) == 1:
-            self.transport.write(buffers[0])
-        else:
+        last = buffers.pop()
+        if buffers:
             self.transport.writelines(buffers)
+        # Python 3.12's and 3.13.0's writelines never calls pause_writing; write does, for all that waits.
+        self.transport.write(last)
 
     def fail(self, code: int, reason: str) -> None:
         """Close the connection because of what the robot sent."""
