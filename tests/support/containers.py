@@ -246,7 +246,8 @@ class Machine:
                     word.startswith(bytes(self.folder)) for word in words
                 ):
                     found.append(process)
-        return found
+        pids = {process.pid for process in found}  # a child between fork and exec looks the same
+        return [process for process in found if process.parent not in pids]
 
     def processes(self) -> list[proc.Process]:
         """All processes of this machine's containers that hang together with a shim."""
