@@ -1,4 +1,4 @@
-"""``rce-ros`` joins a robot's graph, one of a real roscore with rospy nodes or one of ours, to a container."""
+"""``rce-ros`` joins a robot's graph, a real roscore's with rospy nodes or one of ours, to a container."""
 
 from __future__ import annotations
 
