@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-import inspect
 import logging
-from collections.abc import AsyncGenerator, Awaitable, Callable
-from contextlib import AsyncExitStack, aclosing
+from contextlib import AsyncExitStack
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from rce.ros.actions import topics
+from rce.ros.actions import topics, work
 from rce.ros.actions.goal_id import GoalId
 from rce.ros.actions.ledger import MEMORY, Arrival, Entry, GoalLedger
 from rce.ros.actions.policy import MAX_GOALS, Drop, ManyGoals, Policy, Refuse, SingleGoal, Start, Step, Stop
 from rce.ros.actions.server_goal import Content, ServerGoal
-from rce.ros.actions.states import GoalEvent, GoalState
+from rce.ros.actions.states import GoalEvent
 from rce.ros.handles import release
 from rce.ros.tasks import TaskScope
 
@@ -24,9 +22,6 @@ if TYPE_CHECKING:
     from rce.ros.types import Message
 
 _log = logging.getLogger(__name__)
-
-Handler = Callable[[ServerGoal], Awaitable["Message | Content | None"] | AsyncGenerator[Any, None]]
-"""Works on one goal: a coroutine function that returns the result, or an async generator of feedback."""
 
 STATUS_FREQUENCY = 5.0
 """Hz; the parameter ``actionlib_status_frequency`` of the node or a namespace above it overrides it."""
@@ -60,7 +55,7 @@ class ActionServer:
         node: Node,
         name: str,
         kind: str,
-        handler: Handler,
+        handler: work.Handler,
         *,
         auto_accept: bool = True,
         max_goals: int = MAX_GOALS,
@@ -76,22 +71,11 @@ class ActionServer:
                 ``goal.accept()`` or ``goal.reject()``.
             max_goals: How many goals are worked on at the same time; more are rejected.
         """
-        self._set_up(node, name, kind, handler, ManyGoals(max_goals), auto_accept)
-
-    def _set_up(
-        self,
-        node: Node,
-        name: str,
-        kind: str,
-        handler: Handler,
-        policy: Policy,
-        auto_accept: bool,
-    ) -> None:
         self.name = node.resolve(name)
         self._node = node
         self._types = topics.ActionTypes.named(kind)
         self._handler = handler
-        self._policy = policy
+        self._policy: Policy = ManyGoals(max_goals)
         self._auto_accept = auto_accept
         self._goals: dict[str, ServerGoal] = {}
         self._ledger = GoalLedger()
@@ -233,51 +217,23 @@ class ActionServer:
             if self._auto_accept and not goal.state.is_over:
                 goal.accept()
             if not goal.state.is_over:
-                self._conclude(goal, await self._call_handler(goal))
+                work.conclude(goal, await work.call(self._handler, goal))
         except asyncio.CancelledError:
-            self._give_up(goal, STOPPED)
+            work.give_up(goal, STOPPED)
             raise
         except Exception as error:  # noqa: BLE001 - the program's own fault is the client's to know
             _log.exception("the handler of %s failed on goal %s", self.name, goal.id)
-            self._give_up(goal, f"{type(error).__name__}: {error}")
+            work.give_up(goal, f"{type(error).__name__}: {error}")
         finally:
             self._goals.pop(goal.id, None)
             following = self._policy.ended(goal.id)
         self._perform(following)
 
-    async def _call_handler(self, goal: ServerGoal) -> Message | Content | None:
-        work: Any = self._handler(goal)
-        if inspect.isawaitable(work):
-            result: Message | Content | None = await work
-            return result
-        async with aclosing(work):
-            async for feedback in work:
-                goal.publish_feedback(feedback)
-        return None
-
-    @staticmethod
-    def _conclude(goal: ServerGoal, result: Message | Content | None) -> None:
-        if goal.state.is_over:
-            return
-        if goal.state in {GoalState.PENDING, GoalState.RECALLING}:
-            goal.reject("the server did not accept the goal")
-        elif result is None and goal.cancel_requested:
-            goal.cancel()
-        else:
-            goal.succeed(result)
-
-    @staticmethod
-    def _give_up(goal: ServerGoal, text: str) -> None:
-        if goal.state in {GoalState.PENDING, GoalState.RECALLING}:
-            goal.reject(text)
-        elif not goal.state.is_over:
-            goal.abort(text)
-
     def _give_up_rest(self) -> None:
         """End the goals that wait, and those whose work was cancelled before it began."""
         while self._goals:
             _, goal = self._goals.popitem()
-            self._give_up(goal, STOPPED)
+            work.give_up(goal, STOPPED)
 
     # ------------------------------------------------------------------ publishing
 
@@ -311,12 +267,13 @@ class SimpleActionServer(ActionServer):
         node: Node,
         name: str,
         kind: str,
-        handler: Handler,
+        handler: work.Handler,
         *,
         auto_accept: bool = True,
     ) -> None:
         """Prepare a server; as for :class:`ActionServer`."""
-        self._set_up(node, name, kind, handler, SingleGoal(), auto_accept)
+        super().__init__(node, name, kind, handler, auto_accept=auto_accept)
+        self._policy = SingleGoal()
 
 
 def _status(entry: Entry) -> dict[str, Any]:

@@ -263,7 +263,8 @@ async def test_a_goal_that_got_lost_on_the_way_is_sent_again(
     make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async with pair(make_node, fibonacci) as (server, client):
-        receive, lost = server._ledger.receive, []
+        receive = server._ledger.receive
+        lost: list[GoalId] = []
 
         def lose_once(goal_id: GoalId, now: float) -> Arrival:
             if lost:

@@ -66,9 +66,11 @@ import json, sys
 import actionlib, rospy
 from actionlib.msg import TestAction, TestGoal
 from actionlib_msgs.msg import GoalStatus
+from roscpp.srv import Empty
 
 rospy.init_node("real")
 report = {}
+go = rospy.ServiceProxy("go", Empty)
 
 simple = actionlib.SimpleActionClient("simple", TestAction)
 assert simple.wait_for_server(rospy.Duration(20))
@@ -78,6 +80,7 @@ def run(number, cancel=False):
     def feedback(message):
         heard.append(message.feedback)
     simple.send_goal(TestGoal(number), feedback_cb=feedback)
+    go()
     if cancel:
         while not heard:
             rospy.sleep(0.01)
@@ -183,7 +186,7 @@ async def test_our_client_at_a_full_server_of_rospy(core: Core, node: Node, tmp_
     async with (
         rospy_program(core, tmp_path, SERVERS) as process,
         node,
-        ActionClient(node, "full", TEST, patience=2) as client,
+        ActionClient(node, "full", TEST, patience=4) as client,
         asyncio.timeout(50),
     ):
         goals = [await client.send(goal=number) for number in (1, 2, 3, 4)]
@@ -228,14 +231,22 @@ async def choose(goal: ServerGoal) -> dict[str, Any] | None:
 
 
 async def test_rospys_clients_at_our_servers(core: Core, node: Node, tmp_path: Path) -> None:
+    go = asyncio.Semaphore(0)
+
+    async def patient(goal: ServerGoal) -> dict[str, Any] | None:
+        """Wait until the client knows of its goal: rospy's simple client forgets one that ends before."""
+        await go.acquire()
+        return await answer(goal)
+
     async with (
         node,
-        SimpleActionServer(node, "simple", TEST, answer),
+        SimpleActionServer(node, "simple", TEST, patient),
         ActionServer(node, "full", TEST, choose, auto_accept=False),
-        rospy_program(core, tmp_path, CLIENT) as process,
         asyncio.timeout(50),
     ):
-        output, _ = await process.communicate()
+        await node.advertise_service("go", "roscpp/Empty", lambda _: go.release())
+        async with rospy_program(core, tmp_path, CLIENT) as process:
+            output, _ = await process.communicate()
     assert process.returncode == 0
     report = json.loads(output)
     # Feedback may be overtaken by the result, which has a connection of its own.

@@ -68,7 +68,7 @@ def random_time(choice: random.Random) -> list[int]:
 def random_tree(choice: random.Random) -> dict[str, Any]:
     """Return edges in the order of their arrival, some of them late, and questions; often not one tree."""
     frames = [f"f{index}" for index in range(choice.randint(2, 9))]
-    edges = []
+    edges: list[dict[str, Any]] = []
     for index, child in enumerate(frames[1:], 1):
         if choice.random() < 0.15:
             continue

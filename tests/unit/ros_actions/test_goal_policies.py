@@ -2,8 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
+from hypothesis import given
+from hypothesis import strategies as st
+
 from rce.ros.actions import GoalId
-from rce.ros.actions.policy import REPLACED, Drop, ManyGoals, Refuse, SingleGoal, Start, Stop
+from rce.ros.actions.policy import (
+    REPLACED,
+    Drop,
+    ManyGoals,
+    Policy,
+    Refuse,
+    SingleGoal,
+    Start,
+    Step,
+    Stop,
+)
 
 
 def goal(number: int) -> GoalId:
@@ -55,3 +70,53 @@ def test_cancellations_of_the_present_and_the_waiting_goal() -> None:
     assert policy.cancel("g0") == []
     assert policy.ended("g0") == []
     assert policy.ended("g1") == []
+
+
+class Works:
+    """A server that does what its policy says; each goal must come to exactly one end."""
+
+    def __init__(self, policy: Policy) -> None:
+        self.policy = policy
+        self.running: list[str] = []
+        self.waiting: set[str] = set()
+        self.ended: list[str] = []
+
+    def take(self, steps: Iterable[Step]) -> None:
+        for step in steps:
+            match step:
+                case Start(goal_id):
+                    self.waiting.remove(goal_id)
+                    self.running.append(goal_id)
+                case Stop(goal_id):
+                    assert goal_id in self.running
+                case Drop(goal_id) | Refuse(goal_id):
+                    self.waiting.remove(goal_id)
+                    self.ended.append(goal_id)
+
+    def end_first(self) -> None:
+        if self.running:
+            goal_id = self.running.pop(0)
+            self.ended.append(goal_id)
+            self.take(self.policy.ended(goal_id))
+
+
+@given(st.sampled_from([1, 3]), st.lists(st.tuples(st.sampled_from("oce"), st.integers(0, 30))))
+def test_every_goal_ends_once_and_never_too_many_run(limit: int, story: list[tuple[str, int]]) -> None:
+    works = Works(SingleGoal() if limit == 1 else ManyGoals(limit))
+    offered: set[str] = set()
+    for what, number in story:
+        goal_id = f"g{number}"
+        if what == "o" and goal_id not in offered:
+            offered.add(goal_id)
+            works.waiting.add(goal_id)
+            works.take(works.policy.offer(goal(number)))
+        elif what == "c" and goal_id in {*works.running, *works.waiting}:
+            works.take(works.policy.cancel(goal_id))
+        elif what == "e":
+            works.end_first()
+        assert len(works.running) <= limit
+        assert len(works.waiting) <= 1
+        assert works.running or not works.waiting
+    while works.running:
+        works.end_first()
+    assert sorted(works.ended) == sorted(offered)

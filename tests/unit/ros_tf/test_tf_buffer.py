@@ -207,7 +207,7 @@ def test_prefixes(prefix: str, frame: str, full: str) -> None:
 @given(st.lists(st.integers(0, 100), min_size=1))
 def test_an_edge_keeps_order_and_length(times: list[int]) -> None:
     timed = TimedEdge(30)
-    taken = set()
+    taken: set[int] = set()
     for time in times:
         newest = max(taken, default=0)
         is_new = timed.insert(Sample(time, "p", Transform.make(x=time)))
