@@ -78,11 +78,11 @@ class GoalLedger:
             raise UnknownGoal(goal_id) from None
 
     def receive(self, goal_id: GoalId, now: float) -> Arrival:
-        """Take a goal. Its id and stamp must not be empty."""
+        """Take a goal. Its id must not be empty; without a stamp, no cancellation up to a time meets it."""
         entry = self._entries.get(goal_id.id)
         if entry is None:
             entry = self._entries[goal_id.id] = Entry(goal_id)
-            if goal_id.stamp > self._cancelled_up_to:
+            if not goal_id.stamp or goal_id.stamp > self._cancelled_up_to:
                 return Arrival.NEW
             self.apply(goal_id.id, GoalEvent.CANCEL, now, CANCELLED_BEFORE)
             return Arrival.CANCELLED
