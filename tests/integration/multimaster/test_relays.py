@@ -195,7 +195,7 @@ async def test_one_connection_carries_topics_and_services_both_ways() -> None:
 
         await planner.advertise_service("add", "roscpp/GetLoggers", lambda _: {"loggers": []})
         await planner.advertise_service("refuse", "roscpp/Empty", refuse)
-        await robot.wait_until(lambda graph: graph.service("/refuse") is not None, timeout=20)
+        await robot.wait_until(lambda graph: graph.service("/refuse") and graph.service("/add"), timeout=20)  # type: ignore[arg-type,return-value]
         assert (await base.service_client("add", "roscpp/GetLoggers").call({}, timeout=20)).loggers == []
         with pytest.raises(ServiceFault, match="not today"):
             await base.service_client("refuse", "roscpp/Empty").call({}, timeout=20)

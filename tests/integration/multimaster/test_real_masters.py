@@ -1,0 +1,185 @@
+"""Real masters and rospy nodes on either side, and masters and discoveries that are killed."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+from support.engine import free_ports
+from support.multimaster import STRING, Neighbourhood, node, process, real_master, ros_environment
+
+TALKER = """
+import rospy
+from std_msgs.msg import String
+rospy.init_node("rospy_talker")
+publisher = rospy.Publisher("chatter", String, queue_size=10)
+rate = rospy.Rate(20)
+while not rospy.is_shutdown():
+    publisher.publish("from rospy")
+    rate.sleep()
+"""
+
+LISTENER = """
+import rospy
+from std_msgs.msg import String
+rospy.init_node("rospy_listener")
+rospy.Subscriber("orders", String, lambda message: print("heard", message.data, flush=True))
+rospy.spin()
+"""
+
+
+@asynccontextmanager
+async def rospy_program(text: str, uri: str, folder: Path) -> AsyncIterator[asyncio.subprocess.Process]:
+    script = folder / f"program{len(list(folder.glob('program*')))}.py"
+    script.write_text(text)
+    async with process("/usr/bin/python3", str(script), env=ros_environment(uri, folder)) as started:
+        yield started
+
+
+async def heard(program: asyncio.subprocess.Process, text: str) -> None:
+    assert program.stdout is not None
+    async with asyncio.timeout(30):
+        while (await program.stdout.readline()).decode().strip() != f"heard {text}":
+            pass
+
+
+@pytest.mark.needs("rospy")
+@pytest.mark.parametrize("both_real", [False, True])
+async def test_rospy_nodes_at_a_real_master(
+    neighbourhood: Neighbourhood, tmp_path: Path, both_real: bool
+) -> None:
+    async with (
+        real_master(tmp_path) as real,
+        _second(both_real, tmp_path) as second,
+        neighbourhood.machine(real, name="real"),
+        neighbourhood.machine(second, name="second") as other,
+        rospy_program(TALKER, real, tmp_path),
+        rospy_program(LISTENER, real, tmp_path) as listener,
+        node("ours", other.uri) as ours,
+    ):
+        said = await ours.subscribe("chatter", STRING)
+        orders = await ours.advertise("orders", STRING)
+        async with asyncio.timeout(40):
+            assert (await anext(aiter(said))).data == "from rospy"
+            await orders.wait_for_subscribers()
+        orders.publish(data="go")
+        await heard(listener, "go")
+
+
+@asynccontextmanager
+async def _second(is_real: bool, folder: Path) -> AsyncIterator[str | None]:
+    if not is_real:
+        yield None
+        return
+    async with real_master(folder) as uri:
+        yield uri
+
+
+@pytest.mark.needs("rospy")
+async def test_rospy_listens_again_after_its_talker_was_lost_for_a_while(
+    neighbourhood: Neighbourhood, tmp_path: Path
+) -> None:
+    async with (
+        real_master(tmp_path) as real,
+        neighbourhood.machine(real, name="real") as far,
+        neighbourhood.machine(name="near") as near,
+        rospy_program(LISTENER, real, tmp_path) as listener,
+        node("ours", near.uri) as ours,
+    ):
+        orders = await ours.advertise("orders", STRING)
+        await orders.wait_for_subscribers(timeout=40)
+        orders.publish(data="one")
+        await heard(listener, "one")
+        with far.discovery.watch() as events:
+            send = near.discovery._socket.send_to
+            near.discovery._socket.send_to = lambda *_: None  # type: ignore[method-assign] # the network is gone
+            async with asyncio.timeout(20):
+                async for event in events:
+                    if event.master.name == "near" and not event.master.online:
+                        break
+                while far.sync.registrar.held:
+                    await asyncio.sleep(0.05)
+                near.discovery._socket.send_to = send  # type: ignore[method-assign]
+                while not far.sync.registrar.held:
+                    await asyncio.sleep(0.05)
+                await orders.wait_for_subscribers()
+        orders.publish(data="two")
+        await heard(listener, "two")
+
+
+@pytest.mark.needs("rospy")
+async def test_a_killed_master_is_left_and_found_again(neighbourhood: Neighbourhood, tmp_path: Path) -> None:
+    (port,) = free_ports(1)
+    async with (
+        neighbourhood.machine(name="near") as near,
+        real_master(tmp_path, port) as real,
+        neighbourhood.machine(real, name="far"),
+        node("near_node", near.uri) as near_node,
+    ):
+        async with node("far_node", real) as far_node:
+            await far_node.advertise("said", STRING)
+            await near.until(lambda graph: "/said" in graph.topic_types)
+        publisher = await near_node.advertise("answered", STRING)
+        with near.discovery.watch() as events:
+            _kill_master(port)
+            await _until(events, "far", "removed")
+            async with real_master(tmp_path, port):
+                await _until(events, "far", "new")
+                async with node("listener", real) as listener:
+                    got = await listener.subscribe("answered", STRING)
+                    await got.wait_for_publishers(timeout=20)
+                    publisher.publish(data="again")
+                    assert (await anext(aiter(got))).data == "again"
+
+
+def _kill_master(port: int) -> None:
+    import psutil
+
+    (found,) = [
+        child
+        for child in psutil.Process().children(recursive=True)
+        if "rosmaster" in " ".join(child.cmdline()) and str(port) in child.cmdline()
+    ]
+    found.send_signal(signal.SIGKILL)
+
+
+async def _until(events: object, name: str, change: str) -> None:
+    async with asyncio.timeout(30):
+        async for event in events:  # type: ignore[attr-defined]
+            if (event.master.name, event.change.value) == (name, change):
+                return
+
+
+async def test_a_killed_discovery_is_noticed_and_taken_back(neighbourhood: Neighbourhood) -> None:
+    from rce.ros.core import Core
+
+    async with neighbourhood.machine(name="near") as near, Core(port=0) as core, node("n", core.uri) as far:
+        await far.advertise("said", STRING)
+        for _ in range(2):
+            async with _discovery_process(core.uri, neighbourhood.port) as program:
+                await near.until(lambda graph: "/said" in graph.topic_types)
+                program.kill()
+                await near.until(lambda graph: "/said" not in graph.topic_types)
+
+
+@asynccontextmanager
+async def _discovery_process(uri: str, mcast_port: int) -> AsyncIterator[asyncio.subprocess.Process]:
+    program = await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-c",
+        "import typer; from rce.cli.discovery import discovery; typer.run(discovery)",
+        *("--master-uri", uri, "--mcast-group", "226.0.0.0@127.0.0.1", "--mcast-port", str(mcast_port)),
+        *("--heartbeat-hz", "10", "--rpc-port", str(free_ports(1)[0])),
+        stdout=asyncio.subprocess.DEVNULL,
+    )
+    try:
+        yield program
+    finally:
+        if program.returncode is None:
+            program.kill()
+        await program.wait()
