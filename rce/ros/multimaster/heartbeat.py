@@ -64,6 +64,9 @@ class Kind(Enum):
     LEAVING = "leaving"
 
 
+_FIXED_STAMPS = {Kind.REQUEST: (ZERO, ZERO), Kind.LEAVING: (Stamp(_GONE, _GONE), Stamp(_GONE, _GONE))}
+
+
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
     """A heartbeat, taken apart."""
@@ -81,10 +84,8 @@ class Heartbeat:
     def encode(self) -> bytes:
         """Write the datagram."""
         version = _REQUEST_VERSION if self.kind is Kind.REQUEST else _STATE_VERSION
-        stamp, local = self.stamp, self.stamp_local
-        if self.kind is Kind.LEAVING:
-            stamp = local = Stamp(_GONE, _GONE)
-        rate = min(255, max(0, int(self.rate * 10)))
+        stamp, local = _FIXED_STAMPS.get(self.kind, (self.stamp, self.stamp_local))
+        rate = min(255, max(0, round(self.rate * 10)))
         return _PACKET.pack(_MARK, version, rate, *stamp, self.rpc_port, *local)
 
 

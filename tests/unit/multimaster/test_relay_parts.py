@@ -1,0 +1,117 @@
+"""Throttles, the frames of relay links, and names in namespaces."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rce.ros.multimaster.errors import LinkBroken
+from rce.ros.multimaster.relay.frames import (
+    Answer,
+    Call,
+    Data,
+    Decoder,
+    Frame,
+    Hello,
+    Offer,
+    Ping,
+    Want,
+    encode,
+)
+from rce.ros.multimaster.relay.kinds import ServiceKind, TopicKind
+from rce.ros.multimaster.relay.namespace import add_namespace, strip_namespace
+from rce.ros.multimaster.relay.throttle import ByteThrottle, MessageThrottle
+
+NUMBERS = st.integers(0, 2**32 - 1)
+TEXT = st.text(max_size=5)
+TOPIC_KINDS = st.builds(TopicKind, TEXT, TEXT, TEXT)
+SERVICE_KINDS = st.builds(ServiceKind, TEXT, TEXT, TEXT, TEXT)
+FRAMES: st.SearchStrategy[Frame] = st.one_of(
+    st.builds(Hello, TEXT, TEXT),
+    st.builds(Want, st.frozensets(NUMBERS, max_size=3)),
+    st.builds(Data, NUMBERS, st.booleans(), st.binary(max_size=50)),
+    st.builds(Call, NUMBERS, NUMBERS, st.binary(max_size=50)),
+    st.builds(Answer, NUMBERS, st.booleans(), st.binary(max_size=50)),
+    st.builds(Ping),
+    st.builds(
+        Offer,
+        st.dictionaries(NUMBERS, st.tuples(TEXT, TOPIC_KINDS), max_size=2),
+        st.dictionaries(NUMBERS, st.tuples(TEXT, SERVICE_KINDS), max_size=2),
+    ),
+)
+
+
+@given(st.lists(FRAMES, max_size=5), st.integers(1, 30))
+def test_frames_arrive_however_they_are_cut(frames: list[Frame], size: int) -> None:
+    stream = b"".join(piece for frame in frames for piece in encode(frame))
+    decoder = Decoder()
+    cuts = (stream[begin : begin + size] for begin in range(0, len(stream), size))
+    assert list(itertools.chain.from_iterable(map(decoder.feed, cuts))) == frames
+
+
+def test_a_message_is_not_copied_on_its_way_out() -> None:
+    payload = b"x" * 100_000
+    assert encode(Data(1, False, payload))[-1] is payload
+
+
+@given(st.binary(max_size=60))
+def test_any_bytes_are_frames_or_break_the_link(stream: bytes) -> None:
+    try:
+        list(Decoder().feed(stream))
+    except LinkBroken:
+        return
+
+
+@pytest.mark.parametrize(
+    "stream",
+    [b"\0\0\0\0P", b"\xff\xff\xff\xffD", b"\x01\0\0\0Z", b"\x02\0\0\0D1", b"\x03\0\0\0O[]", b"\x03\0\0\0H{}"],
+)
+def test_broken_frames(stream: bytes) -> None:
+    with pytest.raises(LinkBroken):
+        list(Decoder().feed(stream))
+
+
+def test_a_hello_hides_its_token() -> None:
+    assert "secret" not in repr(Hello("robot", "secret"))
+
+
+def test_messages_per_second() -> None:
+    throttle = MessageThrottle(2)
+    assert [throttle.passes(now, 1) for now in (0, 0.4, 0.5, 0.9, 1.0)] == [True, False, True, False, True]
+    assert throttle.passes(0.1, 1)  # the clock was set back
+
+
+def test_bytes_per_second() -> None:
+    throttle = ByteThrottle(100, window=1)
+    assert [throttle.passes(now, size) for now, size in ((0, 60), (0.1, 60), (0.2, 40), (0.9, 1))] == [
+        True,
+        False,
+        True,
+        False,
+    ]
+    assert throttle.passes(1.0, 60)
+
+
+@given(st.lists(st.tuples(st.floats(0, 10), st.integers(1, 200)), max_size=40))
+def test_no_window_has_more_bytes_than_allowed(messages: list[tuple[float, int]]) -> None:
+    throttle = ByteThrottle(100, window=2)
+    passed = [(now, size) for now, size in sorted(messages) if throttle.passes(now, size)]
+    for begin, _ in passed:
+        assert sum(size for now, size in passed if begin <= now < begin + 2) <= 200
+
+
+@pytest.mark.parametrize("rate", [0, -1, float("nan")])
+def test_rates_must_be_positive(rate: float) -> None:
+    with pytest.raises(ValueError, match="above 0"):
+        MessageThrottle(rate)
+    with pytest.raises(ValueError, match="above 0"):
+        ByteThrottle(rate)
+
+
+@given(st.lists(st.sampled_from("abc"), min_size=1).map(lambda parts: "/" + "/".join(parts)))
+def test_a_namespace_can_be_taken_off_again(name: str) -> None:
+    assert strip_namespace(add_namespace(name, "/Robot1"), "/Robot1") == name
+    assert strip_namespace(name, "/Robot1") is None
