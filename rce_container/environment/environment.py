@@ -27,6 +27,7 @@ from rce_container.environment import messages as m
 from rce_container.environment.channel import Channel, accept
 from rce_container.environment.exceptions import ChannelError
 from rce_container.environment.interfaces import InterfaceMaker, Readiness
+from rce_container.environment.launch import OWN_NODE
 from rce_container.environment.nodes import NodeSet, Workshop
 from rce_container.environment.parameters import Values, difference, evaluate_all
 from rce_container.environment.process import strike_all
@@ -34,9 +35,6 @@ from rce_container.environment.reach import Operator
 from rce_container.environment.reaper import Reaper
 
 log = logging.getLogger(__name__)
-
-NODE_NAME = "rce_environment"
-"""The environment's own node in the container's graph."""
 
 _MAX_UNTOLD = 100
 _GET_PID_TIMEOUT_S = 5.0
@@ -81,7 +79,7 @@ class Environment:
             self._core = await stack.enter_async_context(Core("127.0.0.1", self._boot.ros_port, rosout=True))
             types = TypeRegistry(self._packages)
             node = await stack.enter_async_context(
-                Node(NODE_NAME, argv=[], master_uri=self._core.uri, types=types)
+                Node(OWN_NODE, argv=[], master_uri=self._core.uri, types=types)
             )
             dial = self._operator.connect if self._boot.isolated else None
             hub = LinkHub(self._boot.machine, dial=dial)
@@ -223,10 +221,10 @@ class Environment:
     async def _identify(self, client: RpcClient, name: str) -> None:
         """Ask a node whose name tells nothing for its process."""
         uri = self._core.graph.nodes.get(name)
-        if uri is None or name == f"/{NODE_NAME}":
+        if uri is None or name == f"/{OWN_NODE}":
             return
         try:
-            _, _, pid = await client.call(uri, "getPid", (NODE_NAME,), timeout=_GET_PID_TIMEOUT_S)
+            _, _, pid = await client.call(uri, "getPid", (OWN_NODE,), timeout=_GET_PID_TIMEOUT_S)
             self._nodes.registered_process(int(pid))
         except (RosError, TypeError, ValueError) as error:
             log.info("node %s does not tell its process: %s", name, error)

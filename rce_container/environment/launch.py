@@ -15,6 +15,10 @@ NODE_MARK = "RCE_NODE"
 """Environment variable that every process of a node carries; its value names one life of one node."""
 
 
+OWN_NODE = "rce_environment"
+"""The environment's own node in the container's graph; a second one of that name would end it."""
+
+
 class Launch(NamedTuple):
     """How to start a node."""
 
@@ -52,4 +56,8 @@ def prepare(spec: NodeSpec, packages: PackageIndex, environ: Mapping[str, str], 
         arguments.append(f"__ns:=/{namespace}")
         env["ROS_NAMESPACE"] = f"/{namespace}"
     ros_name = "/" + "/".join(filter(None, (namespace, spec.name))) if spec.name else ""
+    if ros_name == f"/{OWN_NODE}":
+        raise NodeError(
+            f"{ros_name} is the node that joins the container to others; give this one another name"
+        )
     return Launch([*executable, *arguments], env, ros_name)

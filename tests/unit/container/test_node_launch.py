@@ -99,3 +99,12 @@ def test_exits_in_words() -> None:
     assert describe_exit(3) == "exit code 3"
     assert describe_exit(-signal.SIGSEGV) == "killed by SIGSEGV"
     assert "out of memory" in describe_exit(-signal.SIGKILL)
+
+
+@pytest.mark.parametrize("namespace", ["", "/"])
+def test_no_node_takes_the_name_of_the_containers_own(packages: PackageIndex, namespace: str) -> None:
+    spec = NodeSpec(tag="n", pkg="maps", exe="serve.py", name="rce_environment", namespace=namespace)
+    with pytest.raises(NodeError, match="another name"):
+        prepare(spec, packages, {}, "mark")
+    elsewhere = NodeSpec(tag="n", pkg="maps", exe="serve.py", name="rce_environment", namespace="/robot")
+    assert prepare(elsewhere, packages, {}, "mark").ros_name == "/robot/rce_environment"
