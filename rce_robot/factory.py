@@ -31,9 +31,7 @@ class FormFactory:
             InterfaceError: The interface is none of a robot, or its class is not known.
         """
         if type_.form is FormName.INTERFACE:
-            raise InterfaceError(
-                f"{spec.tag}: {type_} is a container's; a robot has Converters and Forwarders"
-            )
+            raise InterfaceError(f"{type_} is a container's; a robot has Converters and Forwarders")
         if type_.form is FormName.FORWARDER:
             form = ForwarderForm()
             return form, form
@@ -48,7 +46,7 @@ class FormFactory:
                 return message, message
             service = self._types.service(spec.cls)
         except TypesError as error:
-            raise InterfaceError(f"{spec.tag}: {error}") from error
+            raise InterfaceError(str(error)) from error
         if role is Role.SERVICE_PROVIDER:  # the robot asks
             return service.request, service.response
         return service.response, service.request

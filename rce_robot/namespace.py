@@ -212,7 +212,7 @@ class Namespace:
         try:
             type_ = InterfaceType.parse(port.spec.type)
         except ValueError as error:
-            raise InterfaceError(f"{port.spec.tag}: {error}") from error
+            raise InterfaceError(str(error)) from error
         form_in, form_out = self._forms.pair(port.spec, type_)
         interface = make_interface(type_.role, port, self, form_in, form_out, call_timeout=self._call_timeout)
         self._interfaces[interface.tag] = interface

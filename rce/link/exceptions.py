@@ -36,7 +36,10 @@ class LinkLost(LinkError):  # noqa: N818
 
 
 class InterfaceError(LinkError):
-    """An interface cannot be made or started as its spec says; the text is for the user."""
+    """An interface cannot be made or started as its spec says.
+
+    The text is for the user, who is told the interface's tag before it.
+    """
 
 
 class CallError(LinkError):

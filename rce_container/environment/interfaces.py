@@ -60,7 +60,7 @@ class RosInterface(Interface):
         try:
             await self.open()
         except RosError as error:
-            raise InterfaceError(f"interface {self.port.spec.tag} ({self.addr}): {error}") from error
+            raise InterfaceError(f"{self.addr}: {error}") from error
 
     async def open(self) -> None:
         """Do the work of :meth:`start`; errors of ROS may go through."""
@@ -180,7 +180,7 @@ class InterfaceMaker:
         try:
             kind = self._check(spec)
         except (ValueError, LookupError, RosError, OSError) as error:
-            raise InterfaceError(f"interface {spec.tag}: {error}") from error
+            raise InterfaceError(str(error)) from error
         return kind(port, self._node, self._readiness)
 
     def _check(self, spec: InterfaceSpec) -> type[RosInterface]:
