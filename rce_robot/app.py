@@ -22,6 +22,7 @@ from rce.control.messages import MachineInfo
 from rce.control.model import LinkAddress
 from rce.link import LinkHub
 from rce.link.address import in_url, is_any, own_address
+from rce.link.unix import remove_stale_sockets
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce_robot.factory import FormFactory
@@ -118,6 +119,7 @@ async def _announce(channel: TaskSetChannel, url: str, ready: Callable[[str], No
 
 async def _listen(hub: LinkHub, machine: str, name: str, reach: str, settings: RobotSettings) -> LinkAddress:
     """Accept links on a unix socket and on TCP; return where."""
+    remove_stale_sockets(run_dir(), "robot_*.sock")
     path = run_dir() / f"{name}.sock"
     await hub.listen_unix(path)
     port = await _listen_tcp(hub, settings.host, settings.link_port)

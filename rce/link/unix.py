@@ -6,10 +6,14 @@ import contextlib
 import errno
 import socket
 import stat
+import time
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+
+_YOUNG_S = 60.0
 
 
 def bind_private(path: Path) -> tuple[socket.socket, int]:
@@ -55,3 +59,11 @@ def _remove_stale_socket(path: Path) -> None:
         except BlockingIOError:
             pass
     raise OSError(errno.EADDRINUSE, "another process listens here", str(path))
+
+
+def remove_stale_sockets(folder: Path, pattern: str) -> None:
+    """Remove socket files that killed processes left behind; young ones may just be about to listen."""
+    for path in folder.glob(pattern):
+        with contextlib.suppress(OSError):  # somebody listens, or another one was quicker
+            if time.time() - path.stat().st_mtime > _YOUNG_S:
+                _remove_stale_socket(path)
