@@ -15,7 +15,7 @@ from rce.ros.tcpros.header import MAX_HEADER
 
 _log = logging.getLogger(__name__)
 
-LARGE_MESSAGE = 2**20
+LARGE_MESSAGE = 2**16
 """From this length on, a message's memory is worth keeping (see :mod:`rce.ros.tcpros.allocator`)."""
 
 WRITE_HIGH = 2**16

@@ -1,0 +1,1 @@
+"""The measured programs, one for each library, with the same command line."""
