@@ -15,7 +15,7 @@ from rce_client.demo.exceptions import ChildDiedError, NotReadyError
 TAIL = 25
 """How many of the last lines of a program are kept to be shown."""
 STOP_TIMEOUT = 15.0
-ENGINE_STOP_TIMEOUT = 25.0
+NEEDED_STOP_TIMEOUT = 25.0
 DRAIN_TIMEOUT = 1.0
 """How long the output of an ended program is read on; something that it started may hold it open."""
 
@@ -25,9 +25,10 @@ T = TypeVar("T")
 class Program:
     """A running program of the demo."""
 
-    def __init__(self, child: Child, log: Path) -> None:
+    def __init__(self, child: Child, log: Path, *, needed: bool) -> None:
         self.child = child
         self.log = log
+        self.needed = needed
         self.tail: deque[str] = deque(maxlen=TAIL)
         self.lines: deque[str] = deque(maxlen=1000)
         self._printed = asyncio.Event()
@@ -51,7 +52,7 @@ class Program:
 class Children:
     """Programs that belong together. An async context manager; leaving it ends them all.
 
-    The one that was started first is ended last: the others need it to take their leave.
+    Those that the others need to take their leave are ended last.
 
     Args:
         folder: Where each program's output goes to, ``NAME.log``.
@@ -84,10 +85,19 @@ class Children:
         finally:
             await self._readers.__aexit__(None, None, None)
 
-    async def start(self, name: str, argv: Sequence[str], *, env: Mapping[str, str] | None = None) -> Program:
-        """Start a program."""
+    async def start(
+        self, name: str, argv: Sequence[str], *, env: Mapping[str, str] | None = None, needed: bool = False
+    ) -> Program:
+        """Start a program.
+
+        Args:
+            name: For its log and for people.
+            argv: Its command line.
+            env: What is different in its environment.
+            needed: The others need it to take their leave: it is ended after them.
+        """
         child = await Child.start(name, argv, env=env)
-        program = Program(child, self._folder / f"{name}.log")
+        program = Program(child, self._folder / f"{name}.log", needed=needed)
         self._programs.append(program)
         self._readers.create_task(self._attend(program), name=f"output of {name}")
         return program
@@ -142,9 +152,10 @@ class Children:
                 self._show(f"[{program.child.name}] {line}")
 
     async def _stop_all(self) -> None:
-        first, *others = self._programs or (None,)
         async with asyncio.TaskGroup() as group:
-            for program in others:
-                group.create_task(program.child.stop(timeout=STOP_TIMEOUT))
-        if first is not None:
-            await first.child.stop(timeout=ENGINE_STOP_TIMEOUT)
+            for program in self._programs:
+                if not program.needed:
+                    group.create_task(program.child.stop(timeout=STOP_TIMEOUT))
+        for program in reversed(self._programs):
+            if program.needed:
+                await program.child.stop(timeout=NEEDED_STOP_TIMEOUT)

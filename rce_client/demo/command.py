@@ -6,8 +6,9 @@ import asyncio
 import signal
 import tempfile
 import time
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
 from random import Random
 from typing import Annotated, Any, TypeVar
@@ -20,9 +21,10 @@ from rce.config.settings import Runtime
 from rce_client.demo.exceptions import DemoError
 from rce_client.demo.floor import draw
 from rce_client.demo.headless import run_headless
+from rce_client.demo.play import CoreKind, Mode, Play
 from rce_client.demo.ports import ANY, Ports
 from rce_client.demo.roaming import roam
-from rce_client.demo.stage import Play, set_stage
+from rce_client.demo.stage import set_stage
 from rce_client.demo.station import StationApi
 
 ROBOTS, ROBOTS_OF_SCEN = 3, 4
@@ -33,6 +35,9 @@ T = TypeVar("T")
 
 
 def demo(
+    mode: Annotated[
+        Mode, typer.Option(help="What carries the messages: the engine, one ROS core, or one per robot.")
+    ] = Mode.CLOUD,
     headless: Annotated[
         bool, typer.Option("--headless", help="No page to look at: drive to goals once, report, exit.")
     ] = False,
@@ -59,12 +64,17 @@ def demo(
     robot_link_port: Annotated[int | None, typer.Option(help="Its links to robot endpoints [10030].")] = None,
     container_link_port: Annotated[int | None, typer.Option(help="Its links to containers [10031].")] = None,
     runtime: Annotated[Runtime | None, typer.Option(help="How containers are isolated [auto].")] = None,
+    core_port: Annotated[int | None, typer.Option(help="The ROS core of --mode single [11311].")] = None,
+    core: Annotated[CoreKind, typer.Option(help="Which program it is.")] = CoreKind.RCE,
+    core_uri: Annotated[
+        str, typer.Option(help="A ROS master that runs already, in place of a core of its own.")
+    ] = "",
     state_dir: Annotated[
         Path | None, typer.Option(help="Keep configs, logs and state in a new folder in here.")
     ] = None,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Show what the programs print.")] = False,
 ) -> None:
-    """Run an engine with a simulated fleet on it, and its page."""
+    """Run a simulated fleet with its planner, on the engine or on ROS cores, and its page."""
     given = {
         "page": port,
         "http": http_port,
@@ -72,12 +82,22 @@ def demo(
         "ws": ws_port,
         "robot_link": robot_link_port,
         "container_link": container_link_port,
+        "core": core_port,
     }
     try:
         scenario = draw(robots or (ROBOTS if scen is None else ROBOTS_OF_SCEN), seed, world=world, scen=scen)
-        ports = _choose_ports(headless, given)
+        ports = _choose_ports(headless, given, _needed_ports(mode, core_uri))
         with _folder(state_dir) as folder:
-            play = Play(scenario, seed, ports, folder, runtime.value if runtime is not None else "")
+            play = Play(
+                scenario,
+                seed,
+                ports,
+                folder,
+                runtime=runtime.value if runtime is not None else "",
+                mode=mode,
+                core=core,
+                core_uri=core_uri,
+            )
             show = typer.echo if verbose else _ignore
             if headless:
                 code = _run(_headless(play, timeout, report, show), stopped=1)
@@ -95,7 +115,7 @@ def say(text: str) -> None:
 
 
 async def _headless(play: Play, timeout: float, report: Path | None, show: Callable[[str], None]) -> int:
-    say(f"{len(play.scenario.robots)} robots, seed {play.seed}, at most {timeout:g} s")
+    say(f"{len(play.scenario.robots)} robots, mode {play.mode}, seed {play.seed}, at most {timeout:g} s")
     result = await run_headless(play, timeout, say, show)
     if report is not None:
         result.write(report)
@@ -107,7 +127,7 @@ async def _headless(play: Play, timeout: float, report: Path | None, show: Calla
 
 
 async def _with_page(play: Play, show: Callable[[str], None], *, auto: bool) -> int:
-    say("starting the engine and its fleet")
+    say(f"starting the fleet, mode {play.mode}")
     async with set_stage(play, show) as stage, aiohttp.ClientSession() as session:
         typer.echo(f"RCE demo: {stage.page}")
         station = StationApi(session, stage.page)
@@ -148,11 +168,21 @@ def _run(work: Coroutine[Any, Any, int], *, stopped: int) -> int:
     return uvloop.run(until_signal())
 
 
-def _choose_ports(headless: bool, given: dict[str, int | None]) -> Ports:
+def _needed_ports(mode: Mode, core_uri: str) -> tuple[str, ...]:
+    match mode:
+        case Mode.CLOUD:
+            return tuple(field.name for field in fields(Ports) if field.name != "core")
+        case Mode.SINGLE if not core_uri:
+            return ("page", "core")
+        case _:
+            return ("page",)
+
+
+def _choose_ports(headless: bool, given: dict[str, int | None], needed: Iterable[str]) -> Ports:
     """The ports to use; free ones where a headless run was not told which."""
     base = ANY if headless else Ports()
     wished = {name: value for name, value in given.items() if value is not None}
-    return Ports(**{name: getattr(base, name) for name in given} | wished).chosen()
+    return Ports(**{name: getattr(base, name) for name in given} | wished).chosen(needed)
 
 
 @contextmanager

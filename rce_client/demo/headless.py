@@ -7,11 +7,12 @@ from collections.abc import Callable
 
 import aiohttp
 
-from rce_client.demo.counters import Counters, read_counters
+from rce_client.demo.counters import Counters
 from rce_client.demo.exceptions import DemoError
 from rce_client.demo.mission import Mission
+from rce_client.demo.play import Play
 from rce_client.demo.result import Result
-from rce_client.demo.stage import Play, Stage, set_stage
+from rce_client.demo.stage import Stage, set_stage
 from rce_client.demo.station import StationApi
 from rce_client.simulation.report import read_report
 
@@ -42,7 +43,8 @@ async def run_headless(
     except (DemoError, OSError) as error:
         problem = str(error)
     # The world's last word comes at its end: what was touched until then counts.
-    return Result(play.scenario, play.seed, run.mission, read_report(play.report), run.counters, problem)
+    truth = read_report(play.report)
+    return Result(play.scenario, play.seed, run.mission, truth, run.counters, problem, play.mode)
 
 
 def _tell_tails(play: Play, say: Callable[[str], None]) -> None:
@@ -62,20 +64,17 @@ class _Run:
         self._say = say
 
     async def perform(self, stage: Stage) -> None:
-        account = self._play.account
         async with aiohttp.ClientSession() as session:
             station = StationApi(session, stage.page)
             self.mission = Mission(station, self._play.scenario, stage.truth, self._say)
             try:
                 await self.mission.run()
             finally:
-                self.counters = await self._count(session, account.url, account.user, account.password)
+                self.counters = await self._count(stage)
 
-    async def _count(
-        self, session: aiohttp.ClientSession, master: str, user: str, password: str
-    ) -> Counters | None:
+    async def _count(self, stage: Stage) -> Counters | None:
         try:
-            return await read_counters(session, master, user, password)
+            return await stage.setting.count()
         except DemoError as error:
             self._say(str(error))
             return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import random
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 
 from rce_client.demo.exceptions import PortTakenError
@@ -18,7 +18,7 @@ ATTEMPTS = 100
 
 @dataclass(frozen=True, slots=True)
 class Ports:
-    """The ports of engine and page; 0 stands for a free one that is still to be chosen."""
+    """The ports of engine, core and page; 0 stands for a free one that is still to be chosen."""
 
     page: int = 9080
     """The operator's page and the API for an ERP."""
@@ -32,21 +32,26 @@ class Ports:
     """Links to robot endpoints."""
     container_link: int = 10031
     """Links to containers."""
+    core: int = 11311
+    """The ROS core of the mode ``single``."""
 
-    def chosen(self) -> Ports:
+    def chosen(self, names: Iterable[str] = ()) -> Ports:
         """The same with every 0 replaced by a free port.
+
+        Args:
+            names: Those that are needed; the others stay as they are, and may be in use. None: all.
 
         Raises:
             PortTakenError: A port that was asked for is in use.
         """
-        names = [field.name for field in fields(self)]
+        names = tuple(names) or [field.name for field in fields(self)]
         # All are held at once, so that none is found twice.
         with contextlib.ExitStack() as held:
             found = {name: held.enter_context(_hold(getattr(self, name), option_of(name))) for name in names}
         return replace(self, **found)
 
 
-ANY = Ports(page=0, http=0, control=0, ws=0, robot_link=0, container_link=0)
+ANY = Ports(page=0, http=0, control=0, ws=0, robot_link=0, container_link=0, core=0)
 """Free ports, so that several demos can run side by side."""
 
 

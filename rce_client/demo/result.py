@@ -10,6 +10,7 @@ from typing import Any
 from rce.fleet.scenario import Scenario
 from rce_client.demo.counters import Counters
 from rce_client.demo.mission import Mission
+from rce_client.demo.play import Mode
 from rce_client.simulation.report import WorldReport
 
 
@@ -22,8 +23,9 @@ class Result:
         seed: What it was drawn from.
         mission: How it went.
         truth: What happened in the world until its end; None if it never said.
-        counters: What the engine carried; None if it did not say.
+        counters: What was carried; None if nobody says.
         problem: Why the run was ended early; empty if it was not.
+        mode: What carried the fleet's messages.
     """
 
     scenario: Scenario
@@ -32,6 +34,7 @@ class Result:
     truth: WorldReport | None
     counters: Counters | None
     problem: str = ""
+    mode: Mode = Mode.CLOUD
 
     @property
     def ok(self) -> bool:
@@ -59,6 +62,7 @@ class Result:
         distances = {} if truth is None else {robot.id: robot.distance_m for robot in truth.robots}
         return {
             "ok": self.ok,
+            "mode": self.mode.value,
             "duration_s": 0.0 if mission is None else round(mission.duration, 2),
             "collisions": None if truth is None else truth.collisions.total,
             "min_separation_m": None if truth is None else truth.min_separation_m,

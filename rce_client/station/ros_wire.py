@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from array import array
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -92,6 +93,8 @@ def plain(message: Message) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     if isinstance(value, Message):
         return plain(value)
+    if isinstance(value, array):
+        return value.tolist()
     if isinstance(value, (list, tuple)):
         return [_plain(element) for element in value]
     if isinstance(value, (Time, Duration)):

@@ -35,3 +35,12 @@ def test_ports_that_are_given_are_kept() -> None:
     wished = ANY.chosen()
     assert wished.chosen() == wished
     assert Ports().http == 9000
+
+
+def test_ports_that_are_not_needed_may_be_in_use() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        taken = server.getsockname()[1]
+        ports = replace(ANY, http=taken).chosen(["page", "core"])
+    assert ports.http == taken
+    assert ports.ws == 0
+    assert {ports.page, ports.core}.isdisjoint({0, taken})

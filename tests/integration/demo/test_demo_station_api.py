@@ -108,14 +108,14 @@ async def test_nobody_there(server: TestServer, session: aiohttp.ClientSession) 
     with pytest.raises(StationAwayError):
         await StationApi(session, url).fleet()
     with pytest.raises(DemoError):
-        await read_counters(session, url, "u", "p")
+        await read_counters(url, "u", "p")
 
 
-async def test_counters_are_summed(server: TestServer, session: aiohttp.ClientSession) -> None:
-    assert await read_counters(session, str(server.make_url("/")), "u", "p") == Counters(7, 1)
+async def test_counters_are_summed(server: TestServer) -> None:
+    assert await read_counters(str(server.make_url("/")), "u", "p") == Counters(7, 1)
 
 
-async def test_a_refused_login(played: Played, server: TestServer, session: aiohttp.ClientSession) -> None:
+async def test_a_refused_login(played: Played, server: TestServer) -> None:
     played.answer = web.json_response({"error": "wrong"}, status=401)
     with pytest.raises(DemoError, match="401"):
-        await read_counters(session, str(server.make_url("/")), "u", "p")
+        await read_counters(str(server.make_url("/")), "u", "p")

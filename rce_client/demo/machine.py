@@ -1,0 +1,84 @@
+"""A machine of a ROS graph, and what the fleet's programs are called there."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from rce.config.resources import examples_dir
+from rce.ros.packages import PackageIndex
+from rce_client.demo.children import Children, Program
+from rce_client.demo.play import Play
+from rce_client.demo.ports import LOOPBACK
+
+RCE = (sys.executable, "-c", "from rce.cli import main; main()")
+"""The program ``rce`` of this installation."""
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """Where programs run.
+
+    Attributes:
+        name: For people, and for the logs' names.
+        core_uri: The ROS master that its nodes join.
+        address: Its own address.
+        enter: Command before each program's own, which lets it run there.
+    """
+
+    name: str
+    core_uri: str
+    address: str = LOOPBACK
+    enter: tuple[str, ...] = ()
+
+    async def start(
+        self, children: Children, name: str, argv: Iterable[str], *, needed: bool = False
+    ) -> Program:
+        """Start a program here, as a node of this machine's graph."""
+        return await children.start(name, [*self.enter, *argv], env=self._environment(), needed=needed)
+
+    def _environment(self) -> Mapping[str, str]:
+        path = [*PackageIndex.from_environ().path, examples_dir()]
+        return {
+            "ROS_MASTER_URI": self.core_uri,
+            "ROS_NAMESPACE": "",
+            "RCE_PACKAGE_PATH": os.pathsep.join(map(str, path)),
+        }
+
+
+def planner_argv(play: Play) -> list[str]:
+    """The planner, told of the floor by private parameters."""
+    parameters = (f"_{name}:={json.dumps(value)}" for name, value in play.planner_parameters.items())
+    return [*_executable("fleet_planner.py"), *parameters]
+
+
+def move_client_argv(robot: str) -> list[str]:
+    """The move client of a robot."""
+    return [*_executable("move_client.py"), f"__ns:={robot}"]
+
+
+def station_argv(play: Play, planner_core: str) -> list[str]:
+    """The operator station, in the planner's graph."""
+    station = [sys.executable, "-m", "rce_client.station"]
+    return [*station, "--ros-master", planner_core, "--port", str(play.ports.page)]
+
+
+def world_argv(play: Play, planner_core: str, cores: Mapping[str, str]) -> list[str]:
+    """The world, whose robots join the graphs of ``cores`` (robot to URI)."""
+    program = [sys.executable, "-m", "rce_client.simulation", str(play.scene), "--report", str(play.report)]
+    joins = [part for robot, uri in cores.items() for part in ("--core", f"{robot}={uri}")]
+    return [*program, "--planner-core", planner_core, *joins]
+
+
+def node_names(play: Play) -> frozenset[str]:
+    """Global names of all nodes of the demo; a graph may have others."""
+    robots = [f"/{robot}/{node}" for robot in play.scenario.robots for node in ("robot", "move_client")]
+    return frozenset((*robots, "/fleet_planner", "/operator_station", "/world"))
+
+
+def _executable(exe: str) -> list[str]:
+    path = [*PackageIndex.from_environ().path, examples_dir()]
+    return PackageIndex(path).find("fleet").executable(exe)

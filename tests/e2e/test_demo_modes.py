@@ -1,0 +1,100 @@
+"""``rce demo --mode``: the same fleet goes to the same goals, whatever carries its messages."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import shutil
+from typing import Any
+
+import aiohttp
+import psutil
+import pytest
+from support.demo import run_headless, running_demo
+from support.engine import engine_processes, free_ports, until
+
+from rce_client.demo.exceptions import StationAwayError
+from rce_client.demo.floor import draw
+from rce_client.demo.station import StationApi
+
+pytestmark = [pytest.mark.e2e, pytest.mark.needs("pymunk")]
+
+ROBOTS, SEED = 2, 5
+TIMEOUT_S = 120.0
+
+
+def check(code: int, report: dict[str, Any], text: str, mode: str) -> None:
+    """The fleet of the seed is at the goals of the seed."""
+    assert code == 0, text
+    scenario = draw(ROBOTS, SEED)
+    assert report["mode"] == mode
+    assert [
+        (robot["id"], robot["start_cell"], robot["goal_cell"], robot["reached"]) for robot in report["robots"]
+    ] == [
+        (robot, start, goal, True)
+        for robot, start, goal in zip(scenario.robots, scenario.starts, scenario.goals, strict=True)
+    ]
+    assert report["collisions"] == 0
+    assert report["engine"]["messages"] > 0
+    assert report["engine"]["dropped"] == (0 if mode == "cloud" else None)
+
+
+@pytest.mark.timeout(180)
+@pytest.mark.parametrize("mode", ["cloud", "single"])
+async def test_the_same_fleet_goes_to_the_same_goals(mode: str) -> None:
+    options = ("--mode", mode, "--robots", ROBOTS, "--seed", SEED)
+    check(*await run_headless(*options, timeout=TIMEOUT_S), mode=mode)
+
+
+@pytest.mark.timeout(180)
+@pytest.mark.needs("roslaunch")
+async def test_single_with_a_real_roscore() -> None:
+    options = ("--mode", "single", "--core", "roscore", "--robots", ROBOTS, "--seed", SEED)
+    check(*await run_headless(*options, timeout=TIMEOUT_S), mode="single")
+
+
+@pytest.mark.timeout(120)
+async def test_the_page_of_a_single_core_and_its_end() -> None:
+    options = ("--mode", "single", "--robots", 1, "--core-port", free_ports(1)[0], "--no-auto")
+    async with running_demo(*options) as demo, aiohttp.ClientSession() as session:
+        station = StationApi(session, demo.page)
+
+        async def state() -> str:
+            with contextlib.suppress(StationAwayError):
+                fleet = await station.fleet()
+                return fleet.robots[0].state if fleet.robots else ""
+            return ""
+
+        await until(lambda: _is(state(), "idle"), timeout=30, what="the robot is in its place")
+        (robot,) = (await station.fleet()).robots
+        assert robot.pose is not None
+        assert robot.cell is not None
+        await station.set_goal(robot.id, robot.cell)
+        await until(lambda: _is(state(), "arrived"), timeout=30, what="it has its goal")
+        news: dict[str, dict[str, Any]] = {}
+        async with session.ws_connect(f"{demo.page}api/v1/live") as live, asyncio.timeout(20):
+            while not {"engine", "state", "map", "poses"} <= news.keys():
+                message = await live.receive_json()
+                news[message["type"]] = message
+        names = {node["name"] for node in news["engine"]["graph"]["nodes"]}
+        assert {"/fleet_planner", "/Robot1/robot", "/Robot1/move_client", "/world"} <= names
+        assert news["state"]["robots"][0]["state"] == "arrived"
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("mode", ["single"])
+async def test_nothing_is_left_when_the_demo_is_killed(mode: str) -> None:
+    async with running_demo(
+        *("--mode", mode, "--robots", 2, "--core-port", free_ports(1)[0], "--no-auto")
+    ) as demo:
+        children = psutil.Process(demo.process.pid).children(recursive=True)
+        assert len(children) >= 6
+        demo.process.kill()
+        await demo.process.wait()
+        await until(lambda: not engine_processes(demo.folder), timeout=30, what="all programs ended")
+        for folder in demo.folder.glob("rce-demo-*"):
+            shutil.rmtree(folder)  # who is killed cannot
+
+
+async def _is(state: Any, wanted: str) -> bool:
+    return bool(await state == wanted)

@@ -1,0 +1,52 @@
+"""What is played, and what the planner is told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from rce.config.client import loads
+from rce_client.demo.bus import received
+from rce_client.demo.floor import draw
+from rce_client.demo.machine import node_names, planner_argv, world_argv
+from rce_client.demo.play import Play
+from rce_client.demo.ports import Ports
+from rce_client.fleet_config import as_text, fleet_config
+
+PLAY = Play(draw(3, 0), 0, Ports(), Path("/folder"))
+
+
+def test_the_planner_is_not_told_of_hidden_boxes() -> None:
+    parameters, scenario = PLAY.planner_parameters, PLAY.scenario
+    assert parameters["walls"] == sorted(scenario.grid.blocked)
+    assert parameters["blocked"] == list(scenario.known_boxes)
+    assert not {*parameters["walls"], *parameters["blocked"]}.intersection(scenario.hidden_boxes)
+    loads(as_text(fleet_config(None, parameters)))
+
+
+def test_the_planner_gets_its_parameters_on_its_command_line() -> None:
+    argv = planner_argv(PLAY)
+    assert f"_walls:={sorted(PLAY.scenario.grid.blocked)}" in argv
+    assert "_rows:=8" in argv
+    assert any(word.endswith("fleet_planner.py") for word in argv)
+
+
+def test_each_robot_of_the_world_joins_its_own_core() -> None:
+    argv = world_argv(PLAY, "http://c:1/", {"Robot1": "http://a:1/", "Robot2": "http://b:1/"})
+    joins = [argv[place + 1] for place, word in enumerate(argv) if word == "--core"]
+    assert joins == ["Robot1=http://a:1/", "Robot2=http://b:1/"]
+    assert argv[argv.index("--planner-core") + 1] == "http://c:1/"
+
+
+def test_only_the_demos_own_nodes_are_counted() -> None:
+    one = replace(PLAY, scenario=draw(1, 0))
+    assert node_names(one) == {
+        *("/Robot1/robot", "/Robot1/move_client"),
+        *("/fleet_planner", "/operator_station", "/world"),
+    }
+
+
+def test_received_messages_are_summed_over_topics_and_connections() -> None:
+    pose = ["/Robot1/amcl_pose", [[1, 999, 7, -1, True], [2, 999, 5, -1, True]]]
+    answer = [1, "bus stats", [[["/map", 10, [[9, 10, 1, True]]]], [pose, ["/map", []]], []]]
+    assert received(answer) == 12
