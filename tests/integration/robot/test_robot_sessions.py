@@ -235,6 +235,28 @@ async def test_text_that_is_not_utf8_ends_the_connection(cloud: Cloud, robot: An
     assert caught.value.rcvd.code == 1007
 
 
+async def test_requests_that_wait_are_bounded_by_their_bytes(dial: Any, robot_of: Any) -> None:
+    settings = SessionSettings(max_request_bytes=3000, drain_timeout=1.0)
+    async with running_cloud(settings) as cloud, dial(cloud) as socket:
+        released = asyncio.Event()
+
+        async def wait(_: object) -> tuple[str, ...]:
+            await released.wait()
+            return ()
+
+        cloud.master.answer = wait
+        robot = robot_of(socket)
+        for tag in ("first", "second", "third"):
+            parts = [{"containerTag": tag, "name": "p", "value": "x" * 1000}]
+            await robot.send("CN", {"setParam": parts})
+        assert "too many requests wait" in await robot.get("ER")
+        released.set()
+        await cloud.master.changed.until(lambda: len(cloud.master.requests) == 2)
+        await robot.send("CC", {"containerTag": "c"})
+        await cloud.master.changed.until(lambda: len(cloud.master.requests) == 3)
+        assert [kind for _, kind, _ in cloud.master.requests] == ["CN", "CN", "CC"]
+
+
 async def test_a_robot_that_stops_reading_harms_itself_only(dial: Any, robot_of: Any) -> None:
     settings = SessionSettings(
         outbox=OutboxLimits(queue_bytes=2 << 20, total_bytes=4 << 20), ping_interval=None, drain_timeout=1.0
