@@ -33,6 +33,20 @@ def _runs(*argv: str) -> bool:
         return False
 
 
+def _can_make_networks() -> bool:
+    """Try with a namespace of an own name and a pair of interfaces in it."""
+    name = f"rce-check-{os.getpid()}"
+    if not _runs("ip", "netns", "add", name):
+        return False
+    try:
+        inside = ("ip", "-n", name, "link", "add", "name")
+        return _runs(*inside, "left", "type", "veth", "peer", "name", "right") and _runs(
+            *inside, "switch", "type", "bridge"
+        )
+    finally:
+        _runs("ip", "netns", "del", name)
+
+
 _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
     "bwrap": (
         lambda: _runs("bwrap", "--unshare-all", "--ro-bind", "/", "/", "true"),
@@ -81,6 +95,7 @@ _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
         "the folder of public maps and logs is absent (set RCE_DATA)",
     ),
     "root": (lambda: os.geteuid() == 0, "needs root"),
+    "netns": (_can_make_networks, "may not make network namespaces here (needs root and ip)"),
 }
 
 
