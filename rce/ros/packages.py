@@ -187,7 +187,7 @@ def _renamed(root: Path, name: str) -> Path | None:
 
 
 def _is_package(folder: Path) -> bool:
-    return _manifest(folder) is not None or (folder / "msg").is_dir() or (folder / "srv").is_dir()
+    return _manifest(folder) is not None or any((folder / kind).is_dir() for kind in ("msg", "srv", "action"))
 
 
 def _manifest(folder: Path) -> Path | None:
