@@ -21,7 +21,7 @@ from rce.config.settings import Runtime
 from rce_client.demo.exceptions import DemoError
 from rce_client.demo.floor import draw
 from rce_client.demo.headless import run_headless
-from rce_client.demo.play import CoreKind, Mode, Play
+from rce_client.demo.play import CoreKind, Machines, Mode, Play
 from rce_client.demo.ports import ANY, Ports
 from rce_client.demo.roaming import roam
 from rce_client.demo.stage import set_stage
@@ -69,6 +69,9 @@ def demo(
     core_uri: Annotated[
         str, typer.Option(help="A ROS master that runs already, in place of a core of its own.")
     ] = "",
+    machines: Annotated[
+        Machines, typer.Option(help="What stands for the machines of --mode multi.")
+    ] = Machines.AUTO,
     state_dir: Annotated[
         Path | None, typer.Option(help="Keep configs, logs and state in a new folder in here.")
     ] = None,
@@ -97,6 +100,7 @@ def demo(
                 mode=mode,
                 core=core,
                 core_uri=core_uri,
+                machines=machines,
             )
             show = typer.echo if verbose else _ignore
             if headless:

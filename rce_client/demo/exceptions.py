@@ -6,6 +6,7 @@
     +-- PortTakenError      a port that the demo needs is in use
     +-- ChildDiedError      a program of the demo ended before it should
     +-- NotReadyError       something did not come up in time
+    +-- NetworkError        the machines of the mode multi cannot be made
     +-- StationError        the operator station does not do what was asked
         +-- StationAwayError    ... at this moment: it, or the planner, cannot be reached
         +-- WishRefusedError    ... and asking again does not help
@@ -59,6 +60,10 @@ class ChildDiedError(DemoError):
 
 class NotReadyError(DemoError):
     """Something did not come up in time."""
+
+
+class NetworkError(DemoError):
+    """The machines of the mode ``multi`` cannot be made."""
 
 
 class StationError(DemoError):

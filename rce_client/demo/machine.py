@@ -12,7 +12,6 @@ from rce.config.resources import examples_dir
 from rce.ros.packages import PackageIndex
 from rce_client.demo.children import Children, Program
 from rce_client.demo.play import Play
-from rce_client.demo.ports import LOOPBACK
 
 RCE = (sys.executable, "-c", "from rce.cli import main; main()")
 """The program ``rce`` of this installation."""
@@ -25,13 +24,11 @@ class Machine:
     Attributes:
         name: For people, and for the logs' names.
         core_uri: The ROS master that its nodes join.
-        address: Its own address.
         enter: Command before each program's own, which lets it run there.
     """
 
     name: str
     core_uri: str
-    address: str = LOOPBACK
     enter: tuple[str, ...] = ()
 
     async def start(

@@ -55,6 +55,12 @@ ANY = Ports(page=0, http=0, control=0, ws=0, robot_link=0, container_link=0, cor
 """Free ports, so that several demos can run side by side."""
 
 
+def free_ports(count: int) -> list[int]:
+    """Choose free ports for which there are no options."""
+    with contextlib.ExitStack() as held:
+        return [held.enter_context(_hold(0, "")) for _ in range(count)]
+
+
 def option_of(name: str) -> str:
     """The option of ``rce demo`` that sets a port."""
     return "--port" if name == "page" else f"--{name.replace('_', '-')}-port"

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from rce_client.demo.children import Children
 from rce_client.demo.cloud import Cloud
+from rce_client.demo.multi import MultiMaster
 from rce_client.demo.play import Mode, Play
 from rce_client.demo.setting import Setting
 from rce_client.demo.single import SingleMaster
@@ -16,6 +17,7 @@ from rce_client.simulation.report import WorldReport, read_report
 _SETTINGS: dict[Mode, Callable[[Play], Setting]] = {
     Mode.CLOUD: Cloud,
     Mode.SINGLE: SingleMaster,
+    Mode.MULTI: MultiMaster,
 }
 
 

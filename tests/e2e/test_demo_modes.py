@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import re
 import shutil
+from collections.abc import Awaitable
 from typing import Any
 
 import aiohttp
@@ -13,6 +15,7 @@ import pytest
 from support.demo import run_headless, running_demo
 from support.engine import engine_processes, free_ports, until
 
+from rce.ros.xmlrpc import RpcClient
 from rce_client.demo.exceptions import StationAwayError
 from rce_client.demo.floor import draw
 from rce_client.demo.station import StationApi
@@ -21,6 +24,8 @@ pytestmark = [pytest.mark.e2e, pytest.mark.needs("pymunk")]
 
 ROBOTS, SEED = 2, 5
 TIMEOUT_S = 120.0
+# Without a choice, machines are namespaces for root, else ports.
+MODES = [("cloud",), ("single",), ("multi",), ("multi", "--machines", "ports")]
 
 
 def check(code: int, report: dict[str, Any], text: str, mode: str) -> None:
@@ -40,10 +45,10 @@ def check(code: int, report: dict[str, Any], text: str, mode: str) -> None:
 
 
 @pytest.mark.timeout(180)
-@pytest.mark.parametrize("mode", ["cloud", "single"])
-async def test_the_same_fleet_goes_to_the_same_goals(mode: str) -> None:
-    options = ("--mode", mode, "--robots", ROBOTS, "--seed", SEED)
-    check(*await run_headless(*options, timeout=TIMEOUT_S), mode=mode)
+@pytest.mark.parametrize("mode", MODES)
+async def test_the_same_fleet_goes_to_the_same_goals(mode: tuple[str, ...]) -> None:
+    options = ("--mode", *mode, "--robots", ROBOTS, "--seed", SEED)
+    check(*await run_headless(*options, timeout=TIMEOUT_S), mode=mode[0])
 
 
 @pytest.mark.timeout(180)
@@ -82,8 +87,29 @@ async def test_the_page_of_a_single_core_and_its_end() -> None:
 
 
 @pytest.mark.timeout(120)
-@pytest.mark.parametrize("mode", ["single"])
+async def test_machines_of_many_masters_share_only_what_they_must() -> None:
+    async with running_demo("--mode", "multi", "--robots", 2, "--no-auto") as demo, RpcClient() as rpc:
+        (log,) = demo.folder.glob("rce-demo-*/world.log")
+        cores = dict(re.findall(r"robot (Robot\d) ROS_MASTER_URI=(\S+)", log.read_text()))
+        (planner_log,) = log.parent.glob("core-planner.log")
+        (cores["planner"],) = re.findall(r"ROS_MASTER_URI=(\S+)", planner_log.read_text())
+
+        async def published(machine: str) -> set[str]:
+            state = await rpc.call(cores[machine], "getSystemState", ("/test",), timeout=5)
+            return {topic for topic, _ in state[2][0]}
+
+        shared = {f"/Robot{n}/{name}" for n in (1, 2) for name in ("amcl_pose", "moveClient/status")}
+        await until(lambda: _holds(published("planner"), shared), timeout=20, what="the planner hears all")
+        at_robot = {"/map", "/Robot1/goalNodesList", "/Robot1/cancelGoal", "/Robot1/odom"}
+        await until(lambda: _holds(published("Robot1"), at_robot), timeout=20, what="the robot hears it")
+        assert not {"/Robot1/odom", "/Robot1/scan", "/Robot1/move_base/goal"} & await published("planner")
+        assert not [topic for topic in await published("Robot1") if topic.startswith(("/Robot2", "/fleet"))]
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("mode", ["single", "multi"])
 async def test_nothing_is_left_when_the_demo_is_killed(mode: str) -> None:
+    interfaces = set(psutil.net_if_addrs())
     async with running_demo(
         *("--mode", mode, "--robots", 2, "--core-port", free_ports(1)[0], "--no-auto")
     ) as demo:
@@ -92,9 +118,14 @@ async def test_nothing_is_left_when_the_demo_is_killed(mode: str) -> None:
         demo.process.kill()
         await demo.process.wait()
         await until(lambda: not engine_processes(demo.folder), timeout=30, what="all programs ended")
+        await until(lambda: set(psutil.net_if_addrs()) <= interfaces, timeout=10, what="cables are gone")
         for folder in demo.folder.glob("rce-demo-*"):
             shutil.rmtree(folder)  # who is killed cannot
 
 
-async def _is(state: Any, wanted: str) -> bool:
+async def _holds(topics: Awaitable[set[str]], wanted: set[str]) -> bool:
+    return wanted <= await topics
+
+
+async def _is(state: Awaitable[str], wanted: str) -> bool:
     return bool(await state == wanted)

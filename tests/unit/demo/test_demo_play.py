@@ -9,6 +9,7 @@ from rce.config.client import loads
 from rce_client.demo.bus import received
 from rce_client.demo.floor import draw
 from rce_client.demo.machine import node_names, planner_argv, world_argv
+from rce_client.demo.multi import PLANNER, sync_argv
 from rce_client.demo.play import Play
 from rce_client.demo.ports import Ports
 from rce_client.fleet_config import as_text, fleet_config
@@ -50,3 +51,16 @@ def test_received_messages_are_summed_over_topics_and_connections() -> None:
     pose = ["/Robot1/amcl_pose", [[1, 999, 7, -1, True], [2, 999, 5, -1, True]]]
     answer = [1, "bus stats", [[["/map", 10, [[9, 10, 1, True]]]], [pose, ["/map", []]], []]]
     assert received(answer) == 12
+
+
+def test_a_robots_machine_takes_nothing_of_other_robots() -> None:
+    argv = sync_argv("Robot1", ["Robot1", "Robot2"])
+    assert argv[argv.index("--hosts") + 1] == PLANNER
+    assert argv[argv.index("--topics") + 1] == "/Robot1/goalNodesList,/Robot1/cancelGoal,/map"
+
+
+def test_the_planners_machine_takes_little_of_every_robot() -> None:
+    argv = sync_argv(PLANNER, ["Robot1", "Robot2"])
+    topics = argv[argv.index("--topics") + 1].split(",")
+    assert topics[:3] == ["/Robot1/amcl_pose", "/Robot1/moveClient/status", "/Robot1/blockedCells"]
+    assert len(topics) == 6
