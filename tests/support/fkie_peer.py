@@ -1,8 +1,8 @@
 """A stand-in for fkie's master_discovery and master_sync, made of the facts of their wire alone.
 
 Run by any Python, with the standard library only: ``fkie_peer.py MASTER_URI RPC_PORT MCAST_PORT ADDRESS``.
-Sends heartbeats to 226.0.0.0, answers the RPC methods, and registers at its master what others have that it
-finds. Prints a line for each master that it finds or loses.
+Sends heartbeats to 226.0.0.0, answers the RPC methods, registers at its master what others have, and prints a
+line for each master that it finds or loses.
 """
 # ruff: noqa: ANN001, ANN201, ANN204, PT018, T201, UP031
 

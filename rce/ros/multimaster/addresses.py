@@ -59,16 +59,20 @@ def own_address(interface: str, group: str, environ: Mapping[str, str] | None = 
         NoSuchInterface: The interface is not there.
     """
     environ = os.environ if environ is None else environ
-    named = interface or environ.get("ROS_IP", "") or environ.get("ROS_HOSTNAME", "")
+    named = interface or environ.get("ROS_IP", "")
     if named:
         return address_of(named)
+    if hostname := environ.get("ROS_HOSTNAME", ""):
+        address = address_of(hostname)
+        if not is_loopback(address):  # many systems say of their own name that it is on loopback
+            return address
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect((group, 9))  # a lookup in the routing table: nothing is sent
-            address: str = probe.getsockname()[0]
+            found: str = probe.getsockname()[0]
         except OSError:
             return LOOPBACK
-    return address
+    return found
 
 
 def local_addresses() -> frozenset[str]:

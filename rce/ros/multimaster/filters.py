@@ -114,6 +114,9 @@ def _wanted(*pairs: tuple[Patterns, str]) -> bool:
     return any(patterns.match(name) for patterns, name in pairs) or not any(pattern for pattern, _ in pairs)
 
 
+_NOT_HERE = ("sync_topics_on_demand",)
+"""Settings of master_sync that must be off."""
+
 NameList = list[Any]
 """Patterns; an element may be a mapping of a master's name to the patterns that hold for it alone."""
 
@@ -145,6 +148,8 @@ class SyncLists:
         """
         lists = cls()
         for name, value in values.items():
+            if name in _NOT_HERE and not value:
+                continue
             if name not in cls.__slots__:
                 raise MultimasterError(f"{name} is no setting of a synchronization")
             if name == "sync_remote_nodes":

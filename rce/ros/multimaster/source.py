@@ -15,6 +15,9 @@ from rce.ros.multimaster.state import Names
 from rce.ros.node.master import MasterClient
 from rce.ros.xmlrpc.dispatch import SUCCESS
 
+SETTLE = 0.05
+"""Seconds in which changes of a watched core are gathered."""
+
 MAX_CALLS = 2000
 """How many calls go into one ``system.multicall``."""
 
@@ -174,12 +177,19 @@ class CoreSource:
         )
 
     async def wait(self, longest: float) -> None:
-        """Wait for the next change."""
+        """Wait for the next change, and a moment for those that come with it."""
+        if await self._changed(longest):
+            await asyncio.sleep(SETTLE)
+            while await self._changed(0):
+                pass
+
+    async def _changed(self, longest: float) -> bool:
         try:
             async with asyncio.timeout(longest):
                 await anext(self._changes)
         except TimeoutError:
-            return
+            return False
+        return True
 
 
 @asynccontextmanager

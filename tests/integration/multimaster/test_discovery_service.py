@@ -1,0 +1,130 @@
+"""One discovery and its neighbours: lists, changes, unicast, a core in the same process, the programs."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from pathlib import Path
+
+import pytest
+from support.engine import Program, free_ports
+from support.multimaster import STRING, Neighbourhood, node
+
+from rce.ros.core import Core
+from rce.ros.errors import MasterUnreachable
+from rce.ros.multimaster import messages
+from rce.ros.multimaster.discovery import Discovery
+from rce.ros.multimaster.errors import NoDiscovery
+from rce.ros.multimaster.listing import list_masters
+from rce.ros.xmlrpc import RpcClient
+
+
+def program(name: str, *arguments: str, folder: Path) -> Program:
+    text = f"import typer; from rce.cli.{name} import {name}; typer.run({name})"
+    return Program(name, [sys.executable, "-c", text, *arguments], {"ROS_IP": "127.0.0.1"}, folder)
+
+
+async def test_a_core_of_the_same_process_is_watched(neighbourhood: Neighbourhood) -> None:
+    async with Core(port=0) as core:
+        settings = neighbourhood.settings(core.uri, rosmaster_hz=0.01)
+        async with Discovery(settings, core=core) as discovery, node("n", core.uri) as talker:
+            with discovery.watch() as events:
+                await talker.advertise("said", STRING)
+                async with asyncio.timeout(20):
+                    async for _ in events:
+                        if discovery.info is not None and "/said" in discovery.info.publishers:
+                            break
+            assert discovery.info.nodes["/n"].is_local
+
+
+async def test_masters_and_changes_are_shown_in_the_graph(neighbourhood: Neighbourhood) -> None:
+    async with Core(port=0) as a, Core(port=0) as b:
+        with pytest.raises(NoDiscovery):
+            await list_masters(a.uri)
+        async with Discovery(neighbourhood.settings(a.uri, name="a")) as discovery:
+            watcher = node("watcher", a.uri, types=messages.registry())
+            async with watcher as watching, RpcClient() as rpc:
+                changes = await watching.subscribe("/master_discovery/changes", messages.MASTER_STATE)
+                links = await watching.subscribe("/master_discovery/linkstats", messages.LINK_STATES)
+                await changes.wait_for_publishers(timeout=20)
+                async with asyncio.timeout(20), Discovery(neighbourhood.settings(b.uri, name="b")):
+                    async for change in changes:
+                        if change.state == "'new'" and change.master.name == "b":
+                            break
+                    async for stats in links:
+                        if {link.destination for link in stats.links} == {"a", "b"}:
+                            break
+                    assert {master.name: master.online for master in await list_masters(a.uri)} == {
+                        "a": True,
+                        "b": True,
+                    }
+                async with asyncio.timeout(20):
+                    async for change in changes:
+                        if change.state == "'removed'":
+                            break
+                assert change.master.name == "b"
+                contacts = await rpc.call(discovery.monitor_uri, "masterContacts", ())
+                assert contacts[1:4] == [a.uri, "a", "/master_discovery"]
+                assert float(contacts[0]) > 0
+                assert (await rpc.call(discovery.monitor_uri, "getCurrentTime", ()))[0] == a.uri
+                (pair,) = await rpc.call(discovery.monitor_uri, "getTopicsMd5sum", ([STRING, "no/Such"],))
+                assert pair == [STRING, "992ce8a1687cec8c8bd883ec73ca41d1"]
+    with pytest.raises(MasterUnreachable):
+        await list_masters(a.uri)
+
+
+async def test_robot_hosts_find_each_other_without_multicast(neighbourhood: Neighbourhood) -> None:
+    ports = free_ports(2)
+    async with Core(port=0) as a, Core(port=0) as b:
+        first, second = (
+            neighbourhood.settings(
+                core.uri,
+                name=name,
+                mcast_port=own,
+                send_mcast=False,
+                listen_mcast=False,
+                robot_hosts=(f"127.0.0.1:{other}",),
+            )
+            for core, name, own, other in ((a, "a", *ports), (b, "b", *reversed(ports)))
+        )
+        async with Discovery(first) as one, Discovery(second) as two, asyncio.timeout(20):
+            for discovery in (one, two):
+                while {master.name for master in discovery.masters} != {"a", "b"}:
+                    await asyncio.sleep(0.02)
+
+
+async def test_the_relay_program(tmp_path: Path) -> None:
+    async with Core(port=0) as core, node("n", core.uri) as talker:
+        (await talker.advertise("from", STRING, latch=True)).publish(data="kept")
+        heard = await talker.subscribe("to", STRING)
+        running = program("relay", "/from", "/to", "--latch", "--master-uri", core.uri, folder=tmp_path)
+        await running.start(ready="")
+        try:
+            async with asyncio.timeout(20):
+                assert (await anext(aiter(heard))).data == "kept"
+        finally:
+            assert await running.stop() == 0
+        await core.wait_until(lambda graph: graph.publishers("/to") == {}, timeout=20)
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "words"),
+    [
+        ("relay", ("/a", "/a"), "to itself"),
+        ("relay", ("/a", "/b", "--throttle", "0"), "above 0 Hz"),
+        ("sync", ("--as", "no way"), "is no namespace"),
+        ("sync", ("--relay", ":5"), "HOST:PORT"),
+        ("discovery", ("--heartbeat-hz", "30"), "at most 25.5"),
+        ("discovery", ("--list", "--master-uri", "http://127.0.0.1:1/"), "does not answer"),
+    ],
+)
+async def test_programs_say_what_is_wrong(
+    tmp_path: Path, name: str, arguments: tuple[str, ...], words: str
+) -> None:
+    running = program(name, *arguments, folder=tmp_path)
+    await running.start(ready="")
+    assert running.process is not None
+    async with asyncio.timeout(30):
+        assert await running.process.wait() == 1
+    assert words in running.output()
+    assert "Traceback" not in running.output()
