@@ -47,13 +47,17 @@ def relay(
             signals=False,
             master_timeout=None,
         )
-        if node.resolve(source) == node.resolve(target):
-            raise ValueError(f"{source} cannot be relayed to itself")
+        _check(node, source, target)
         uvloop.run(_run(node, TopicRelay(source, target, throttle=chosen, lazy=lazy, latch=latch)))
     except* (RosError, ValueError) as errors:
         error = errors.exceptions[0]
         typer.echo(f"rce relay: {error}", err=True)
         raise typer.Exit(1) from error
+
+
+def _check(node: Node, source: str, target: str) -> None:
+    if node.resolve(source) == node.resolve(target):
+        raise ValueError(f"{source} cannot be relayed to itself")
 
 
 def _throttle(hertz: float | None, max_bytes: float | None, window: float) -> Throttle | None:

@@ -28,6 +28,7 @@ from rce.ros.multimaster.settings import local_master
 from rce.ros.node import Node
 from rce.ros.node.master import MasterClient
 from rce.ros.tasks import TaskScope
+from rce.ros.types.exceptions import TypesError
 from rce.ros.xmlrpc import RpcClient
 
 _log = logging.getLogger(__name__)
@@ -154,7 +155,7 @@ class MasterSync:
                 masters = await masters_known_at(self._node, self._master)
                 await self._listen_for_changes()
                 self._own_uri = await self._ask_own_uri()
-            except (NoDiscovery, ServiceError, MasterError) as error:
+            except (NoDiscovery, ServiceError, MasterError, TypesError) as error:
                 if has_discovery:
                     _log.warning("%s", error)
                 has_discovery = False

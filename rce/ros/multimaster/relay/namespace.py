@@ -84,7 +84,15 @@ class NamespaceRemote(Remote):
 
     async def _run_relay(self) -> None:
         _log.info("master %s is relayed as %s", self.master.name, self._namespace)
-        there = Node(
+        try:
+            async with self._make_node() as there, TaskScope() as tasks:
+                remote = MasterClient(self.master.uri, there.name, there.uri, self._rpc)
+                await self._join(there, remote, tasks)
+        except (RosError, OSError, ValueError) as error:
+            _log.warning("the relay of %s ends: %s", self.master.name, error)
+
+    def _make_node(self) -> Node:
+        return Node(
             "master_sync_relay",
             argv=[],
             master_uri=self.master.uri,
@@ -92,13 +100,6 @@ class NamespaceRemote(Remote):
             anonymous=True,
             master_timeout=None,
         )
-        try:
-            async with there, TaskScope() as tasks:
-                await self._join(
-                    there, MasterClient(self.master.uri, there.name, there.uri, self._rpc), tasks
-                )
-        except (RosError, OSError) as error:
-            _log.warning("the relay of %s ends: %s", self.master.name, error)
 
     async def _join(self, there: Node, remote: MasterClient, tasks: TaskScope) -> None:
         """Run two pairs of ends, one for each direction."""
