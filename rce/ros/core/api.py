@@ -85,7 +85,7 @@ class MasterApi:
 
     def _register_service(self, caller: str, service: Any, service_uri: Any, uri: Any) -> Answer:
         service = _name("service", service, caller)
-        service_uri = _uri("service_api", service_uri, "rosrpc")
+        service_uri = _uri("service_api", service_uri)
         self._perform(self._graph.register_service(service, service_uri, caller, _slave("caller_api", uri)))
         return SUCCESS, f"{caller} provides {service}", 1
 
@@ -101,7 +101,7 @@ class MasterApi:
 
     def _unregister_service(self, caller: str, service: Any, service_uri: Any) -> Answer:
         service = _name("service", service, caller)
-        return self._unregister(Kind.SERVICE, service, caller, _uri("service_api", service_uri, "rosrpc"))
+        return self._unregister(Kind.SERVICE, service, caller, _uri("service_api", service_uri))
 
     def _unregister(self, kind: Kind, name: str, caller: str, uri: str) -> Answer:
         was_there, outcome = self._graph.unregister(kind, name, caller, uri)
@@ -215,11 +215,13 @@ def _type(value: Any) -> str:
     return value
 
 
-def _uri(role: str, value: Any, scheme: str) -> str:
-    if not isinstance(value, str) or not value.startswith(f"{scheme}://"):
-        raise BadArgument(f"parameter [{role}] is not a URI of the form {scheme}://host:port")
+def _uri(role: str, value: Any) -> str:
+    if not isinstance(value, str) or "://" not in value:
+        raise BadArgument(f"parameter [{role}] is not a URI of the form scheme://host:port")
     return value
 
 
 def _slave(role: str, value: Any) -> str:
-    return _uri(role, value, "http")
+    if not _uri(role, value).startswith("http://"):
+        raise BadArgument(f"parameter [{role}] is not a URI of the form http://host:port")
+    return str(value)

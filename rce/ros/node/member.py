@@ -288,8 +288,8 @@ class GraphMember:
             self.shutdown,
         )
 
-    def _parameter_changed(self, name: str, value: object) -> None:
-        self._parameters.changed(name, value)
+    def _parameter_changed(self, name: str, value: object) -> bool:
+        return self._parameters.changed(name, value)
 
     def _accept_service(self, connection: Connection, fields: dict[str, str]) -> None:
         service = self._services.get(fields["service"])

@@ -31,6 +31,8 @@ class Parameters:
         self._watchers: dict[str, list[ParameterCallback]] = {}
         self._known: dict[str, Any] = {}
         """What the master has told of subscribed parameters."""
+        self._early: dict[str, list[tuple[str, Any]]] = {}
+        """Changes told before the master's answer to a subscription has come."""
 
     async def get(self, name: str, default: Any = REQUIRED) -> Any:
         """Return a parameter, or all of a namespace as a dictionary.
@@ -122,24 +124,40 @@ class Parameters:
             if self._known[name] != before:
                 self._tell(name, self._known[name])
 
-    def changed(self, name: str, value: Any) -> None:
-        """Tell those who watch of a new value."""
+    def changed(self, name: str, value: Any) -> bool:
+        """Take a new value and tell those who watch; tell whether the parameter was subscribed to."""
         name = names.canonical(name)
-        self._note(name, value)
+        is_known = self._note(name, value)
         self._tell(name, value)
+        return is_known
 
     async def _subscribe(self, name: str) -> None:
-        self._known[name] = await self._master.call("subscribeParam", self._master.slave_uri, name)
+        early = self._early.setdefault(name, [])
+        try:
+            self._known[name] = await self._master.call("subscribeParam", self._master.slave_uri, name)
+        finally:
+            self._early.pop(name, None)
+        for changed, value in early:
+            self._note(changed, value)
 
-    def _note(self, name: str, value: Any) -> None:
+    def _note(self, name: str, value: Any) -> bool:
         """Put a change into what is known of it, of the namespaces above it and of what is below it."""
         path = names.segments(name)
+        is_known = False
         for known in self._known:
             own = names.segments(known)
             if path[: len(own)] == own:
                 self._known[known] = _replaced(self._known[known], path[len(own) :], value)
+                is_known = True
             elif own[: len(path)] == path:
                 self._known[known] = _within(value, own[len(path) :])
+                is_known = True
+        for awaited, changes in self._early.items():
+            own = names.segments(awaited)
+            if path[: len(own)] == own or own[: len(path)] == path:
+                changes.append((name, value))
+                is_known = True
+        return is_known
 
     def _tell(self, name: str, value: Any) -> None:
         for watched, callbacks in self._watchers.items():

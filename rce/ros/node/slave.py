@@ -26,8 +26,8 @@ class SlaveApi:
     """Where subscribers connect to."""
     on_shutdown: Callable[[str], None]
     """Takes the reason for which the node is told to stop."""
-    on_parameter: Callable[[str, Any], None]
-    """Takes a parameter's name and new value."""
+    on_parameter: Callable[[str, Any], bool]
+    """Takes a parameter's name and new value; tells whether the node subscribed to it."""
 
     def methods(self) -> dict[str, Method]:
         """Return the method table."""
@@ -65,7 +65,8 @@ class SlaveApi:
     def _param_update(self, _caller: str, key: Any, value: Any) -> Answer:
         if not isinstance(key, str) or not key:
             raise BadArgument("parameter [key] must be a non-empty string")
-        self.on_parameter(key, value)
+        if not self.on_parameter(key, value):
+            return ERROR, f"not subscribed to {key}", 0  # the master then forgets the subscription
         return SUCCESS, "", 0
 
     def _shutdown(self, caller: str, reason: Any = "") -> Answer:

@@ -163,7 +163,7 @@ def test_searching_goes_upwards_by_the_first_segment() -> None:
         ("registerPublisher", ("t", "a/B", "n:1")),
         ("registerPublisher", (5, "a/B", "http://n:1/")),
         ("registerSubscriber", ("http://t", "a/B", "http://n:1/")),
-        ("registerService", ("s", "http://n:1/", "http://n:1/")),
+        ("registerService", ("s", "no uri", "http://n:1/")),
         ("registerService", ("/", "rosrpc://n:1", "http://n:1/")),
         ("getParam", ("",)),
         ("setParam", (3, 4)),
