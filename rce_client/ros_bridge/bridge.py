@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING
 from rce.protocol.names import Role
 from rce.ros.errors import MasterError
 from rce.ros.node import Node
+from rce_client.exceptions import ClientError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rce.ros.types import TypeRegistry
     from rce_client.connection import Connection
+    from rce_client.ends import Publisher
     from rce_client.ros_bridge.plan import Plan, Span
 
 MASTER_PATIENCE = 2.0
@@ -69,12 +71,8 @@ async def lay(span: Span, conn: Connection, node: Node) -> None:
     """Join one interface with its topic or service. Messages are passed on as they are."""
     match span.role:
         case Role.SUBSCRIBER:
-            to_cloud = await conn.publisher(span.tag, span.cls, raw=True)
-
-            def send(payload: bytes, _latched: bool) -> None:
-                to_cloud.publish(payload)
-
-            await node.subscribe_serialized(span.addr, span.cls, send)
+            uplink = Uplink(conn, await conn.publisher(span.tag, span.cls, raw=True))
+            await node.subscribe_serialized(span.addr, span.cls, uplink.send)
         case Role.PUBLISHER:
             publisher = await node.advertise(span.addr, span.cls)
             await conn.subscriber(span.tag, span.cls, publisher.publish_serialized, raw=True)
@@ -92,6 +90,39 @@ async def lay(span: Span, conn: Connection, node: Node) -> None:
                 return bytes(await service.call_serialized(request, timeout=CALL_TIMEOUT))
 
             await conn.service_provider(span.tag, span.cls, ask_robot, raw=True)
+
+
+class Uplink:
+    """A topic of the robot on its way to the cloud, where nothing is sent before somebody hears it.
+
+    The engine makes an interface some time after it was asked to, and would complain of messages before. A
+    latched message waits for its time; any other would be out of date by then.
+
+    Args:
+        conn: What it goes over.
+        publisher: Its interface.
+    """
+
+    def __init__(self, conn: Connection, publisher: Publisher[bytes]) -> None:
+        self._conn = conn
+        self._publisher = publisher
+        self._latched: bytes | None = None
+
+    def send(self, payload: bytes, latched: bool) -> None:
+        """Take a message of the robot's graph."""
+        if self._conn.active.get(self._publisher.tag, False):
+            self._publisher.publish(payload)
+        elif latched:
+            if self._latched is None:
+                self._conn.spawn(self._send_latched())
+            self._latched = bytes(payload)
+
+    async def _send_latched(self) -> None:
+        with contextlib.suppress(ClientError):  # closed for good: nobody will hear it
+            await self._publisher.wait_active()
+            if self._latched is not None:
+                self._publisher.publish(self._latched)
+        self._latched = None
 
 
 async def wait_ready(plan: Plan, conn: Connection, say: Callable[[str], None]) -> None:
