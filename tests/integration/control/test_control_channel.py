@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from websockets.asyncio.client import connect
+from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from rce.config.secret import Secret
@@ -279,6 +280,22 @@ async def test_garbage_closes_the_peer_with_a_reason_and_nothing_else(
             assert (bad.close_reason or "").startswith("garbage: ")
         assert (await robots.channel.login("still here", "r", "p")).reason == "still here"
         assert [peer.process for peer in master.server.peers] == ["robots-1"]
+
+
+async def test_a_task_set_that_stops_takes_its_leave() -> None:
+    left: asyncio.Future[int | None] = asyncio.get_running_loop().create_future()
+
+    async def welcome(socket: ServerConnection) -> None:
+        await socket.recv()
+        await socket.send(encode(Welcome(version=CONTROL_VERSION, master="master")))
+        await socket.wait_closed()
+        left.set_result(socket.close_code)
+
+    async with serve(welcome, "127.0.0.1", 0) as server:
+        port = next(iter(server.sockets)).getsockname()[1]
+        async with TaskSet(port).running() as robots:
+            await robots.channel.wait_connected()
+        assert await asyncio.wait_for(left, 5) == 1000
 
 
 async def test_first_message_must_be_hello() -> None:
