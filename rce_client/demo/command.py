@@ -102,7 +102,7 @@ def demo(
                 core_uri=core_uri,
                 machines=machines,
             )
-            show = typer.echo if verbose else _ignore
+            show = typer.echo if verbose else _show_warning
             if headless:
                 code = _run(_headless(play, timeout, report, show), stopped=1)
             else:
@@ -201,5 +201,7 @@ def _folder(state_dir: Path | None) -> Iterator[Path]:
     yield Path(tempfile.mkdtemp(prefix=stamp, dir=state_dir.absolute()))
 
 
-def _ignore(_: str) -> None:
-    """Show nothing."""
+def _show_warning(line: str) -> None:
+    """Show a line of a program if it warns: that containers are not isolated, for instance."""
+    if " WARNING " in line or " ERROR " in line:
+        typer.echo(line, err=True)
