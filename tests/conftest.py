@@ -78,7 +78,7 @@ _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
     ),
     "rosbag": (
         lambda: shutil.which("rosbag") is not None and _runs("/usr/bin/python3", "-c", "import rosbag"),
-        "rosbag is missing (Debian: python3-rosbag rosbag)",
+        "rosbag is missing (Debian: python3-rosbag)",
     ),
     "rosmsg": (lambda: shutil.which("rosmsg") is not None, "rosmsg is missing (Debian: python3-rosmsg)"),
     "topic_tools": (
