@@ -1,7 +1,8 @@
 """A simulated robot as a ROS node: sensors go out, ``move_base`` goals come in.
 
 Topics, relative to the node's namespace: publishes ``amcl_pose``, ``odom``, ``scan``, ``blockedCells``,
-``move_base/status`` and ``move_base/result``; subscribes to ``move_base/goal`` and ``move_base/cancel``.
+``move_base/status`` and ``move_base/result``; subscribes to ``move_base/goal`` and ``move_base/cancel``. On
+``/tf`` it tells where ``odom``, ``base_link`` and ``base_scan`` are on the ``map``.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import numpy as np
 from rce.fleet.angles import quaternion_z
 from rce.fleet.simulation.move_base import SimulatedMoveBase
 from rce.fleet.simulation.obstacles import hit_points
-from rce.ros.tf import frames
+from rce.ros.tf import StampedTransform, Transform, frames
+from rce.ros.tf.broadcaster import KIND, TF
 from rce.ros.types import Time
 
 if TYPE_CHECKING:
@@ -44,6 +46,7 @@ class _Topics:
     blocked: Publisher
     status: Publisher
     result: Publisher
+    frames: Publisher
 
 
 class RobotDriver:
@@ -90,6 +93,7 @@ class RobotDriver:
             blocked=await node.advertise("blockedCells", "std_msgs/Int32MultiArray"),
             status=await node.advertise("move_base/status", "actionlib_msgs/GoalStatusArray"),
             result=await node.advertise("move_base/result", "move_base_msgs/MoveBaseActionResult"),
+            frames=await node.advertise(TF, KIND),
         )
         await node.subscribe("move_base/goal", "move_base_msgs/MoveBaseActionGoal", self._take_goal)
         await node.subscribe("move_base/cancel", "actionlib_msgs/GoalID", self._take_cancel)
@@ -131,6 +135,8 @@ class RobotDriver:
             header={"stamp": stamp, "frame_id": "map"},
             pose={"pose": _pose_fields(robot.estimate), "covariance": _covariance(robot.covariance)},
         )
+        if topics.frames.connections:
+            topics.frames.publish(transforms=[edge.fields for edge in self._tree(stamp)])
         twist = robot.twist
         topics.odometry.publish(
             header={"stamp": stamp, "frame_id": self._odom},
@@ -150,6 +156,16 @@ class RobotDriver:
                 ranges=np.where(ranges < spec.max_range, ranges, math.inf).tolist(),
             )
 
+    def _tree(self, stamp: Time) -> list[StampedTransform]:
+        """The robot's frames, from the map down; the laser is in the robot's middle."""
+        map_from_base, odom_from_base = map(_transform, (self._robot.estimate, self._robot.odometry))
+        map_from_odom = map_from_base @ odom_from_base.inverse()
+        return [
+            StampedTransform("map", self._odom, map_from_odom, stamp),
+            StampedTransform(self._odom, self._base_link, odom_from_base, stamp),
+            StampedTransform(self._base_link, self._base_scan, Transform(), stamp),
+        ]
+
     def _list(self, topics: _Topics, stamp: Time) -> None:
         """Publish the list of goals, and cells found blocked for as long as they stop the robot."""
         if self._base.blocked:
@@ -157,6 +173,10 @@ class RobotDriver:
         topics.status.publish(
             header={"stamp": stamp}, status_list=[_status_of(goal) for goal in self._base.goals]
         )
+
+
+def _transform(pose: Pose) -> Transform:
+    return Transform.make(pose.x, pose.y, yaw=pose.yaw)
 
 
 def _pose_fields(pose: Pose) -> dict[str, Any]:

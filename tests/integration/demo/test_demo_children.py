@@ -6,6 +6,7 @@ import asyncio
 import signal
 import sys
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -98,3 +99,22 @@ async def test_all_end_when_the_work_is_cancelled(tmp_path: Path) -> None:
     with pytest.raises(asyncio.CancelledError):
         await task
     assert not any(psutil.pid_exists(pid) for pid in pids)
+
+
+async def test_what_others_need_is_ended_after_them(tmp_path: Path) -> None:
+    ended: list[str] = []
+    leaving = (
+        "import signal, time\nsignal.signal(signal.SIGTERM, lambda *_: exit())\nprint('up')\ntime.sleep(600)"
+    )
+    async with Children(tmp_path, ignore) as children:
+        for name, needed in (("network", True), ("core", True), ("node", False)):
+            program = await children.start(name, python(leaving), needed=needed)
+            await children.wait_line(program, "up", 20)
+            stop = program.child.stop
+
+            async def noted(name: str = name, stop: Any = stop, **options: float) -> None:
+                await stop(**options)
+                ended.append(name)
+
+            program.child.stop = noted  # type: ignore[assignment]
+    assert ended == ["node", "core", "network"]

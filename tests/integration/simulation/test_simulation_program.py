@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 from support.engine import Program, until
 
+from rce.ros.core import Core
 from rce.ros.node import Node
+from rce.ros.tf import TransformListener
 from rce_client.simulation.report import read_report
 from rce_client.simulation.scene import RobotStart, Scene
 
@@ -58,6 +60,50 @@ async def test_each_robot_is_a_graph_of_its_own_and_drives_to_goals(tmp_path: Pa
     assert last.boxes == [9]
     assert last.robot("Robot1").distance_m > 0.5
     assert last.robot("Robot2").distance_m == 0
+
+
+async def test_robots_that_share_a_graph_have_namespaces_and_frames_of_their_own(tmp_path: Path) -> None:
+    (tmp_path / "scene.json").write_text(SCENE.model_dump_json())
+    argv = [sys.executable, "-m", "rce_client.simulation", str(tmp_path / "scene.json")]
+    async with Core(port=0) as core:
+        program = Program("simulation", [*argv, "--core", core.uri], dict(os.environ), tmp_path)
+        await program.start(ready="simulation ready:")
+        try:
+            assert uri_of(program, "Robot1") == uri_of(program, "Robot2") == core.uri
+            node = Node("t", argv=(), master_uri=core.uri, signals=False)
+            async with node, TransformListener(node) as tf, asyncio.timeout(20):
+                assert await node.get_param("/Robot2/tf_prefix") == "Robot2"
+                for robot, middle in (("Robot1", 0.5), ("Robot2", 7.5)):
+                    place = (await tf.wait_for("map", f"{robot}/base_scan")).transform.translation
+                    assert (place.x, place.y) == pytest.approx((middle, middle), abs=0.1)
+                odometry = await node.subscribe("/Robot2/odom", "nav_msgs/Odometry")
+                async for message in odometry:
+                    assert message.header.frame_id == "Robot2/odom"
+                    assert message.child_frame_id == "Robot2/base_link"
+                    break
+        finally:
+            assert await program.stop() == 0
+
+
+async def test_the_planners_cells_get_boxes_from_its_graph(tmp_path: Path) -> None:
+    (tmp_path / "scene.json").write_text(SCENE.model_dump_json())
+    report = tmp_path / "world.json"
+    argv = [sys.executable, "-m", "rce_client.simulation", str(tmp_path / "scene.json")]
+    async with Core(port=0) as core, Node("p", argv=(), master_uri=core.uri, signals=False) as node:
+        cells = await node.advertise("/fleet/blockedCells", "std_msgs/Int32MultiArray", latch=True)
+        cells.publish(data=[20])
+        options = ["--planner-core", core.uri, "--report", str(report)]
+        program = Program("simulation", [*argv, *options], dict(os.environ), tmp_path)
+        await program.start(ready="simulation ready:")
+        try:
+
+            def has_box() -> bool:
+                seen = read_report(report)
+                return seen is not None and 20 in seen.boxes
+
+            await until(has_box, timeout=20, what="cell 20 has a box")
+        finally:
+            assert await program.stop() == 0
 
 
 async def test_a_bad_scene_ends_the_program(tmp_path: Path) -> None:
