@@ -142,7 +142,10 @@ class Peer:
             self.beat()
         elif self.others.get(key) != (secs, nsecs):
             monitor = xmlrpc.client.ServerProxy(f"http://{host}:{port}")
-            stamp, uri, name, node, _ = monitor.masterContacts()
+            try:
+                stamp, uri, name, node, _ = monitor.masterContacts()
+            except OSError:
+                return  # it just left
             if float(stamp) == 0:
                 return
             assert node.startswith("/") and re.match(r"http://.*:\d+/?$", uri), (node, uri)

@@ -82,6 +82,7 @@ class MasterSync:
         self._master_uri = local_master(self.settings.master_uri)
         self._remotes: dict[str, Remote] = {}
         self._own_uri = ""
+        self._is_leaving = False
         self._changes_topics: set[str] = set()
         self._stack = AsyncExitStack()
         self._links = RelayLinks(LinkIdentity(""), self._make_ends)
@@ -128,6 +129,7 @@ class MasterSync:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._is_leaving = True
         await self._stack.aclose()
 
     async def _take_back(self) -> None:
@@ -202,7 +204,7 @@ class MasterSync:
             self._tasks.start(self._run(remote), name=f"synchronize with {master.name}")
 
     def _is_wanted(self, master: Neighbour) -> bool:
-        if self._own_uri in ("", master.uri) or master.name in self._links.connected:
+        if self._is_leaving or self._own_uri in ("", master.uri) or master.name in self._links.connected:
             return False
         return self.settings.lists.takes_host(master.name)
 

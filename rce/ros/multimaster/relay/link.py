@@ -146,7 +146,10 @@ class RelayLinks:
                 tasks.start(exporter.run(), name=f"offer to {name}")
                 tasks.start(importer.run(), name=f"take from {name}")
                 tasks.start(link.ping(), name=f"ping {name}")
-                await link.ended
+                try:
+                    await link.ended
+                finally:
+                    link.stop()  # a scope that is being left must not be given new tasks
         finally:
             self.connected.discard(name)
             self._running.discard(link)
@@ -162,6 +165,7 @@ class _Link(asyncio.Protocol):
         self.gone = asyncio.Event()
         self._ends: tuple[Callable[[Frame], None], ...] = ()
         self.refused = False
+        self._stopped = False
         self._transport: asyncio.Transport | None = None
         self._early: list[Frame] = []
         self._backlog: list[Frame] = []
@@ -188,6 +192,10 @@ class _Link(asyncio.Protocol):
         backlog, self._backlog = self._backlog, []
         for frame in backlog:
             self._take(frame)
+
+    def stop(self) -> None:
+        """Ignore what comes from now on."""
+        self._stopped = True
 
     async def ping(self) -> None:
         """Say now and then that this side is there; end the link when the other does not."""
@@ -238,6 +246,8 @@ class _Link(asyncio.Protocol):
         self._fail(LinkBroken(f"the connection is lost: {error or 'the other side closed it'}"))
 
     def _take(self, frame: Frame) -> None:
+        if self._stopped:
+            return
         if isinstance(frame, Hello):
             if not self.hello.done():
                 self.hello.set_result(frame)
