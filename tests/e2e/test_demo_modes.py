@@ -45,7 +45,7 @@ def check(code: int, report: dict[str, Any], text: str, mode: str) -> None:
 
 
 @pytest.mark.timeout(180)
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", MODES, ids=" ".join)
 async def test_the_same_fleet_goes_to_the_same_goals(mode: tuple[str, ...]) -> None:
     options = ("--mode", *mode, "--robots", ROBOTS, "--seed", SEED)
     check(*await run_headless(*options, timeout=TIMEOUT_S), mode=mode[0])
