@@ -36,12 +36,28 @@ def build_app(points: list[EntryPoint]) -> typer.Typer:
     app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
     app.callback()(_root)
     for point in points:
-        plugged: Any = point.load()
+        try:
+            plugged: Any = point.load()
+        except ModuleNotFoundError as error:
+            if error.name is None or error.name.startswith("rce"):
+                raise
+            _add_unavailable(app, point.name, error.name)
+            continue
         if isinstance(plugged, typer.Typer):
             app.add_typer(plugged, name=point.name)
         else:
             app.command(name=point.name)(plugged)
     return app
+
+
+def _add_unavailable(app: typer.Typer, name: str, module: str) -> None:
+    """Add a command that only says what it misses, so that the others work without an extra's packages."""
+    text = f"Not available: the package {module} is missing; install RCE with its extra 'fleet'."
+
+    @app.command(name, help=text, context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+    def unavailable() -> None:
+        typer.echo(f"rce {name}: {text[0].lower()}{text[1:]}", err=True)
+        raise typer.Exit(1)
 
 
 def main() -> None:
