@@ -58,8 +58,7 @@ class MultiMaster:
         await _machine_of(planner).start(children, "planner", planner_argv(play))
         for number, site in enumerate(others, start=1):
             await _machine_of(site).start(children, f"move_client{number}", move_client_argv(site.name))
-        for site in network.sites:
-            await _join(site, network, sync_argv(site.name, robots), children)
+        await _join_machines(network, robots, children)
         page = await children.wait_line(station, "rce ui ready:", START_TIMEOUT)
         await children.wait_line(world, "simulation ready:", START_TIMEOUT)
         return page
@@ -109,8 +108,12 @@ async def _start_cores(network: Network, children: Children) -> None:
         await children.wait_line(core, "rce core ready:", START_TIMEOUT)
 
 
-async def _join(site: Site, network: Network, sync: list[str], children: Children) -> None:
-    """Let a machine find others, and take of them what it needs."""
-    machine = _machine_of(site)
-    await machine.start(children, f"discovery-{site.name}", discovery_argv(site, network))
-    await machine.start(children, f"sync-{site.name}", sync)
+async def _join_machines(network: Network, robots: Iterable[str], children: Children) -> None:
+    """Let machines find each other, and take of each other what they need."""
+    discoveries = [
+        await _machine_of(site).start(children, f"discovery-{site.name}", discovery_argv(site, network))
+        for site in network.sites
+    ]
+    for site, discovery in zip(network.sites, discoveries, strict=True):
+        await children.wait_line(discovery, "rce discovery ready:", START_TIMEOUT)
+        await _machine_of(site).start(children, f"sync-{site.name}", sync_argv(site.name, robots))
