@@ -24,15 +24,24 @@ def run_dir(environ: Mapping[str, str] | None = None) -> Path:
     """Return this user's folder for sockets, ``$XDG_RUNTIME_DIR/rce`` or ``/tmp/rce-UID``; made if need be.
 
     It is short, because the path of a unix socket may have at most 107 bytes, and only its owner may enter.
+    ``$XDG_RUNTIME_DIR`` counts only if it is this user's: ``su`` and ``sudo`` may hand on another one's.
 
     Raises:
         RunDirError: It cannot be made, is no folder, or belongs to somebody else.
     """
     environ = os.environ if environ is None else environ
     runtime = environ.get("XDG_RUNTIME_DIR", "")
-    if runtime and Path(runtime).is_dir():
+    if runtime and _is_mine(Path(runtime)):
         return private_folder(Path(runtime) / "rce")
     return private_folder(Path(f"/tmp/rce-{os.getuid()}"))  # noqa: S108 - private_folder checks whose it is
+
+
+def _is_mine(path: Path) -> bool:
+    try:
+        found = path.stat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid()
 
 
 def private_folder(path: Path) -> Path:

@@ -155,6 +155,17 @@ def test_run_dir_is_private(tmp_path: Path) -> None:
     assert run_dir({}) == Path(f"/tmp/rce-{os.getuid()}")
 
 
+def test_runtime_folder_of_somebody_else_does_not_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rce.config.folders.private_folder", lambda path: path)
+    other = os.getuid() + 1
+    assert run_dir({"XDG_RUNTIME_DIR": str(tmp_path)}) == tmp_path / "rce"
+    monkeypatch.setattr(os, "getuid", lambda: other)
+    assert run_dir({"XDG_RUNTIME_DIR": str(tmp_path)}) == Path(f"/tmp/rce-{other}")
+    assert run_dir({"XDG_RUNTIME_DIR": str(tmp_path / "nothing")}) == Path(f"/tmp/rce-{other}")
+
+
 def test_run_dir_of_somebody_else_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = os.getuid()
     monkeypatch.setattr(os, "getuid", lambda: real + 1)
