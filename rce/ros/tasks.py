@@ -18,6 +18,7 @@ class TaskScope:
     def __init__(self) -> None:
         self._group = asyncio.TaskGroup()
         self._tasks: set[asyncio.Task[Any]] = set()
+        self._leaving = False
 
     async def __aenter__(self) -> Self:
         await self._group.__aenter__()
@@ -26,12 +27,13 @@ class TaskScope:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._leaving = True
         for task in self._tasks:
             task.cancel()
         await self._group.__aexit__(None, None, None)
 
     def start(self, work: Coroutine[Any, Any, None], *, name: str) -> asyncio.Task[None]:
-        """Run ``work`` as a task of this scope.
+        """Run ``work`` as a task of this scope; one that is begun while the block is left does nothing.
 
         Raises:
             RuntimeError: The scope has not begun or has ended.
@@ -39,4 +41,6 @@ class TaskScope:
         task = self._group.create_task(work, name=name)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
+        if self._leaving:
+            task.cancel()
         return task
