@@ -195,6 +195,9 @@ async def test_rosbag(ours: Graph, make_node: MakeNode) -> None:
                 await asyncio.sleep(1)  # the recorder tells nobody when it has taken a message
             recording.send_signal(2)
             await recording.wait()
+            async with asyncio.timeout(40):
+                while not bag.exists():  # the command may end before the recorder that it started
+                    await asyncio.sleep(0.05)
         info = await ours.tool("rosbag", "info", str(bag))
         assert f"geometry_msgs/PoseStamped [{pose.type.md5sum}]" in info
         assert f"std_msgs/String           [{text.type.md5sum}]" in info
