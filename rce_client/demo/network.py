@@ -6,6 +6,7 @@ import asyncio
 import os
 import secrets
 import shutil
+import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv4Network
@@ -159,18 +160,18 @@ async def _ip(commands: Sequence[str], holder: int | None = None) -> None:
 
 
 async def _run(*argv: str, given: str = "") -> None:
-    try:
-        process = await asyncio.create_subprocess_exec(
-            *argv,
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.STDOUT,
+    # Not by asyncio: under uvloop, what is given to a program that has ended already is a RuntimeError.
+    def run() -> subprocess.CompletedProcess[str]:
+        return subprocess.run(  # noqa: S603 - its words are this module's own
+            argv, input=given, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
         )
+
+    try:
+        ended = await asyncio.to_thread(run)
     except OSError as error:
         raise NetworkError(f"{argv[0]}: {error.strerror}") from error
-    said, _ = await process.communicate(given.encode())
-    if process.returncode != 0:
-        raise NetworkError(said.decode(errors="replace").strip())
+    if ended.returncode != 0:
+        raise NetworkError(ended.stdout.strip())
 
 
 def _entering(holder: int) -> tuple[str, ...]:

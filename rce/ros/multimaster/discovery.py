@@ -68,7 +68,8 @@ class Discovery:
         self._watches: set[EventQueue[PeerEvent]] = set()
         self._beat_now = asyncio.Event()
         self._is_master_up = True
-        self._is_leaving = False
+        self._is_listening = False
+        """Heartbeats that come before or after are left alone: they are repeated."""
         self._last_request = 0.0
         self._stack = AsyncExitStack()
         self._monitor: MasterMonitor
@@ -150,13 +151,14 @@ class Discovery:
             self._tasks.start(self._watch_master(source.wait), name="watch the master")
             self._tasks.start(self._send_heartbeats(), name="send heartbeats")
             self._tasks.start(self._pass_time(), name="look for silent masters")
+            self._is_listening = True
             self._stack = stack.pop_all()
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._is_leaving = True
+        self._is_listening = False
         await self._stack.aclose()
 
     def _make_node(self) -> Node:
@@ -264,7 +266,7 @@ class Discovery:
             _log.debug("from %s: %s", sender, error)
             return
         host = sender[0]
-        if self._is_leaving:
+        if not self._is_listening:
             return
         if beat.rpc_port == self._own.rpc_port and host in addresses.local_addresses():
             return  # the own one
