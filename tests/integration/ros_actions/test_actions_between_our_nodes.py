@@ -50,8 +50,8 @@ async def pair(
     async with (
         make_node("server") as a,
         make_node("client") as b,
-        server(a, "work", FIBONACCI, handler, **options) as provider,
-        ActionClient(b, "work", FIBONACCI, patience=20) as client,
+        server(a, "job", FIBONACCI, handler, **options) as provider,
+        ActionClient(b, "job", FIBONACCI, patience=20) as client,
     ):
         async with asyncio.timeout(30):
             yield provider, client
@@ -212,8 +212,8 @@ async def test_goals_that_wait_at_a_simple_server_are_replaced_and_recalled(make
 
 
 async def test_a_server_that_stops_aborts_its_goals(make_node: MakeNode) -> None:
-    async with make_node("client") as b, ActionClient(b, "work", FIBONACCI) as client:
-        async with make_node("server") as a, SimpleActionServer(a, "work", FIBONACCI, until_cancelled):
+    async with make_node("client") as b, ActionClient(b, "job", FIBONACCI) as client:
+        async with make_node("server") as a, SimpleActionServer(a, "job", FIBONACCI, until_cancelled):
             goal = await client.send(order=1)
             await anext(aiter(goal))
         with pytest.raises(GoalFailed, match="aborted: the server stopped"):
@@ -221,7 +221,7 @@ async def test_a_server_that_stops_aborts_its_goals(make_node: MakeNode) -> None
 
 
 async def test_a_server_that_starts_anew_has_lost_the_goal(core: Core, make_node: MakeNode) -> None:
-    async with make_node("client") as b, ActionClient(b, "work", FIBONACCI) as client:
+    async with make_node("client") as b, ActionClient(b, "job", FIBONACCI) as client:
         async with asyncio.timeout(30):
             async with make_node("server") as a:
                 # A server that dies without a word: its status topic alone.
@@ -241,7 +241,7 @@ async def test_a_server_that_starts_anew_has_lost_the_goal(core: Core, make_node
                 received = await anext(aiter(goals))
                 status.publish(status_list=[{"goal_id": {"id": received.goal_id.id}, "status": 1}])
                 await active.wait()
-            async with make_node("server") as a, ActionServer(a, "work", FIBONACCI, fibonacci):
+            async with make_node("server") as a, ActionServer(a, "job", FIBONACCI, fibonacci):
                 with pytest.raises(GoalFailed, match="does not list the goal any longer"):
                     await goal.result()
                 assert goal.state is GoalState.LOST
@@ -251,8 +251,8 @@ async def test_a_silent_server_loses_the_goal(make_node: MakeNode) -> None:
     async with (
         make_node("server") as a,
         make_node("client") as b,
-        ActionServer(a, "work", FIBONACCI, until_cancelled),
-        ActionClient(b, "work", FIBONACCI, patience=0.01) as client,
+        ActionServer(a, "job", FIBONACCI, until_cancelled),
+        ActionClient(b, "job", FIBONACCI, patience=0.01) as client,
     ):
         goal = await client.send(order=1)
         with pytest.raises(GoalFailed, match="the server is silent"):
@@ -279,7 +279,7 @@ async def test_a_goal_that_got_lost_on_the_way_is_sent_again(
 
 
 async def test_waiting_has_an_end(make_node: MakeNode) -> None:
-    async with make_node("client") as b, ActionClient(b, "work", FIBONACCI) as client:
+    async with make_node("client") as b, ActionClient(b, "job", FIBONACCI) as client:
         with pytest.raises(TimeoutError):
             await client.wait_for_server(0.01)
     async with pair(make_node, until_cancelled) as (_, client):
@@ -304,7 +304,7 @@ async def test_goals_end_for_a_client_that_leaves_or_whose_node_stops(make_node:
 async def test_what_servers_publish_and_remember(core: Core, make_node: MakeNode) -> None:
     """As real actionlib: a latched list, five times a second, with goals that are over for some seconds."""
     core.set_param("/actionlib_status_frequency", 50)
-    core.set_param("/work/status_list_timeout", 0.1)
+    core.set_param("/job/status_list_timeout", 0.1)
     async with pair(make_node, fibonacci) as (_, client):
         lists = await client._node.subscribe("work/status", "actionlib_msgs/GoalStatusArray")
         assert (await anext(aiter(lists))).status_list == []
@@ -324,7 +324,7 @@ async def test_goals_without_name_and_time_get_both(make_node: MakeNode) -> None
         async def keep(goal: ServerGoal) -> None:
             arrived.put_nowait(goal)
 
-        async with ActionServer(a, "work", FIBONACCI, keep):
+        async with ActionServer(a, "job", FIBONACCI, keep):
             publisher = await b.advertise("work/goal", "actionlib_tutorials/FibonacciActionGoal")
             await publisher.wait_for_subscribers(timeout=20)
             publisher.publish(goal={"order": 5})
