@@ -174,7 +174,7 @@ async def test_a_handler_that_fails_aborts_its_goal(
             await (await client.send(order=1)).result()
         with pytest.raises(GoalFailed, match=r"aborted: SerializationError: .*sequence"):
             await (await client.send(order=0)).result()
-        assert "the handler of /work failed" in caplog.text
+        assert "the handler of /job failed" in caplog.text
         with pytest.raises(SerializationError):
             await client.send(order="many")
 
@@ -225,11 +225,11 @@ async def test_a_server_that_starts_anew_has_lost_the_goal(core: Core, make_node
         async with asyncio.timeout(30):
             async with make_node("server") as a:
                 # A server that dies without a word: its status topic alone.
-                status = await a.advertise("work/status", "actionlib_msgs/GoalStatusArray", latch=True)
+                status = await a.advertise("job/status", "actionlib_msgs/GoalStatusArray", latch=True)
                 for topic, kind in (("result", "ActionResult"), ("feedback", "ActionFeedback")):
-                    await a.advertise(f"work/{topic}", f"actionlib_tutorials/Fibonacci{kind}")
-                goals = await a.subscribe("work/goal", "actionlib_tutorials/FibonacciActionGoal")
-                await a.subscribe("work/cancel", "actionlib_msgs/GoalID", lambda _: None)
+                    await a.advertise(f"job/{topic}", f"actionlib_tutorials/Fibonacci{kind}")
+                goals = await a.subscribe("job/goal", "actionlib_tutorials/FibonacciActionGoal")
+                await a.subscribe("job/cancel", "actionlib_msgs/GoalID", lambda _: None)
                 status.publish()
                 active = asyncio.Event()
 
@@ -306,7 +306,7 @@ async def test_what_servers_publish_and_remember(core: Core, make_node: MakeNode
     core.set_param("/actionlib_status_frequency", 50)
     core.set_param("/job/status_list_timeout", 0.1)
     async with pair(make_node, fibonacci) as (_, client):
-        lists = await client._node.subscribe("work/status", "actionlib_msgs/GoalStatusArray")
+        lists = await client._node.subscribe("job/status", "actionlib_msgs/GoalStatusArray")
         assert (await anext(aiter(lists))).status_list == []
         goal = await client.send(order=1)
         seen = set()
@@ -325,7 +325,7 @@ async def test_goals_without_name_and_time_get_both(make_node: MakeNode) -> None
             arrived.put_nowait(goal)
 
         async with ActionServer(a, "job", FIBONACCI, keep):
-            publisher = await b.advertise("work/goal", "actionlib_tutorials/FibonacciActionGoal")
+            publisher = await b.advertise("job/goal", "actionlib_tutorials/FibonacciActionGoal")
             await publisher.wait_for_subscribers(timeout=20)
             publisher.publish(goal={"order": 5})
             goal = await asyncio.wait_for(arrived.get(), 20)
