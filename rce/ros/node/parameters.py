@@ -170,6 +170,8 @@ def _replaced(tree: Any, path: list[str], value: Any) -> Any:
     """Return a copy of a tree with another value at a path; an unset one is left out."""
     if not path:
         return value
+    if value == UNSET and not isinstance(tree, dict):
+        return tree  # nothing is below a value, so nothing was taken from it
     branch = dict(tree) if isinstance(tree, dict) else {}
     below = _replaced(branch.get(path[0], UNSET), path[1:], value)
     if len(path) == 1 and below == UNSET:

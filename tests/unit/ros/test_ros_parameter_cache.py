@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rce.ros.core.graph import Graph
@@ -44,6 +44,7 @@ def plain(value: Any) -> Any:
     return {key: inner for key, item in value.items() if (inner := plain(item)) != {}}
 
 
+@example(watched=["/a", "/a/a"], changes=[("/a", 0, False)])
 @given(watched=st.lists(NAMES, min_size=1, max_size=3), changes=st.lists(CHANGES, max_size=12))
 def test_the_cache_follows_the_core(watched: list[str], changes: list[tuple[str, Any, bool]]) -> None:
     graph = Graph()
