@@ -40,6 +40,16 @@ class MachineInfo(Struct, frozen=True, kw_only=True, omit_defaults=True, tag_fie
     runtime: str = ""
     """The runtime in use; container task sets only."""
     labels: tuple[str, ...] = ()
+    slots: int = 0
+    """How many slots its containers may take in all; 0 if nobody counts."""
+    limits: str = ""
+    """How limits are enforced: ``cgroup2``, ``cgroup1``, ``rlimit``; container task sets only."""
+    networks: tuple[str, ...] = ("none",)
+    """The values of :class:`rce.control.model.Network` that containers can have here."""
+    runtimes: tuple[str, ...] = ()
+    """All runtimes that work here."""
+    draining: bool = False
+    """It takes no new containers: its operator said so where it runs."""
     detail: str = ""
     """What is missing on this machine, in words."""
 

@@ -27,6 +27,15 @@ class InterfaceSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """ROS name of the topic or service; container ends only."""
 
 
+class RestartPolicy(Enum):
+    """When a node that ended by itself is started again."""
+
+    NEVER = "never"
+    ON_FAILURE = "on-failure"
+    """After any end but exit code 0."""
+    ALWAYS = "always"
+
+
 class NodeSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """A node of a container."""
 
@@ -37,6 +46,15 @@ class NodeSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Split as a POSIX shell splits, never given to one. May hold ``$(find PKG)`` and ``$(env VAR)``."""
     name: str = ""
     namespace: str = ""
+    restart: RestartPolicy = RestartPolicy.NEVER
+    max_restarts: int = 5
+    """How often in a row it is started again; one that ran well for a while counts anew. 0: no limit."""
+    after: tuple[str, ...] = ()
+    """Tags of nodes that must be ready before this one starts."""
+    heartbeat: str = ""
+    """A topic that the node publishes as long as it is well; empty for none."""
+    heartbeat_timeout: float = 5.0
+    """Seconds without a message on the heartbeat topic after which the node is taken for stuck."""
 
 
 class ParameterSpec(Struct, frozen=True, kw_only=True):
@@ -46,12 +64,26 @@ class ParameterSpec(Struct, frozen=True, kw_only=True):
     value: ParameterValue
 
 
+class Network(Enum):
+    """What a container sees of the network, beside its own loopback and its links."""
+
+    NONE = "none"
+    GROUP = "group"
+    """The containers of the same user and group, on the same machine, at their ``group_ip``."""
+    HOST = "host"
+    """The machine's own network; for containers of administrators only."""
+
+
 class Resources(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """What a container asks for. Zero or empty means: no wish."""
 
     group: str = ""
     group_ip: str = ""
+    network: Network = Network.NONE
+    image: str = ""
+    """Root file system: an OCI image's name, or a folder of the machine; needs the runtime ``podman``."""
     size: int = 1
+    """Slots of the machine that it takes; the limits it does not set itself are so many times a slot's."""
     cpu: float = 0.0
     """Cores."""
     memory: int = 0
@@ -93,6 +125,19 @@ class ConnectionSpec(Struct, frozen=True, kw_only=True):
     peer_interface: str
 
 
+class BundleSpec(Struct, frozen=True, kw_only=True):
+    """A version of a package that a user brought to the engine; mounted read-only on the package path."""
+
+    name: str
+    version: str
+    sha256: str
+    """Of the archive, in hex; names its content everywhere."""
+    signature: str
+    """Ed25519, in hex, over what :mod:`rce.bundles` says."""
+    key: str
+    """The public key that made the signature, in hex."""
+
+
 class EndpointKind(Enum):
     """What an endpoint is."""
 
@@ -112,14 +157,19 @@ class EndpointSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
     resources: Resources = Resources()
     nodes: tuple[NodeSpec, ...] = ()
     parameters: tuple[ParameterSpec, ...] = ()
+    bundles: tuple[BundleSpec, ...] = ()
 
 
 class NodeState(Enum):
     """Where a node is in its life."""
 
+    WAITING = "waiting"
+    """Not started (again) yet: nodes that it comes after are not ready, or it ended and pauses."""
     STARTING = "starting"
     """The process was started and has not registered with the container's ROS core yet."""
     RUNNING = "running"
+    STUCK = "stuck"
+    """Runs, but its heartbeat stays away."""
     STOPPING = "stopping"
     EXITED = "exited"
     """Ended by itself with exit code 0."""
@@ -135,6 +185,8 @@ class NodeStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     pid: int = 0
     exit_code: int | None = None
     """As :attr:`subprocess.Popen.returncode`: negative for a signal."""
+    restarts: int = 0
+    """How often it was started again by itself."""
     detail: str = ""
 
 
@@ -144,6 +196,8 @@ class EndpointState(Enum):
     STARTING = "starting"
     RUNNING = "running"
     """A container whose environment answers; a robot that is connected."""
+    DEGRADED = "degraded"
+    """A container that runs, with a node that failed, is stuck, or pauses after a failure."""
     ABSENT = "absent"
     """A robot whose connection dropped and that may still come back."""
     STOPPING = "stopping"
@@ -181,12 +235,38 @@ class InterfaceUsage(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Messages that a full queue threw away."""
 
 
+class NodeUsage(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What a node consumes, with all processes that it started."""
+
+    cpu_s: float = 0.0
+    memory: int = 0
+    """Bytes, proportional share (PSS)."""
+    processes: int = 0
+
+
 class EndpointUsage(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What an endpoint consumes."""
+    """What an endpoint consumes. All but the interfaces: containers only."""
 
     interfaces: dict[str, InterfaceUsage] = {}
+    nodes: dict[str, NodeUsage] = {}
     cpu_s: float = 0.0
-    """CPU seconds since start; containers only."""
+    """CPU seconds since start."""
+    throttled_s: float = 0.0
+    """Seconds in which it was held back by its CPU limit."""
     memory: int = 0
-    """Resident bytes; containers only."""
+    """Bytes in use."""
+    memory_peak: int = 0
+    """Bytes, the most since the start; 0 if nobody counts."""
+    memory_limit: int = 0
+    """Bytes; 0 if there is no limit."""
+    cpu_limit: float = 0.0
+    """Cores; 0 if there is no limit."""
+    oom_kills: int = 0
+    """Processes that were killed because memory ran out."""
+    io_read: int = 0
+    """Bytes read from disks."""
+    io_written: int = 0
+    link_in: int = 0
+    """Bytes that came in on its links."""
+    link_out: int = 0
     processes: int = 0
