@@ -83,6 +83,7 @@ def _check_features(value: Any) -> Any:
 
 
 Name = Annotated[str, _matches(messages.Name)]
+PackageName = Annotated[str, _matches(messages.PackageName)]
 Text = Annotated[str, _matches(messages.Text)]
 RosName = Annotated[str, _matches(messages.RosName)]
 ClassName = Annotated[str, _matches(messages.ClassName)]
@@ -113,7 +114,7 @@ class Node(Strict):
 
     container: Name = Field(alias="cTag")
     tag: Name = Field(alias="nTag")
-    pkg: Name
+    pkg: PackageName
     exe: Annotated[str, _matches(messages.Executable)]
     args: Text = ""
     name: Annotated[str, _matches(messages.OptionalName)] = ""

@@ -12,7 +12,15 @@ from typing import Annotated, Any, TypeAlias
 from msgspec import Meta, Struct, field
 
 from rce.protocol.limits import MAX_MESSAGE_ID_LENGTH
-from rce.protocol.names import CLASS_PATTERN, MAX_NAME_LENGTH, NAME_PATTERN, Form, Role
+from rce.protocol.names import (
+    CLASS_PATTERN,
+    MAX_NAME_LENGTH,
+    MAX_VERSION_LENGTH,
+    NAME_PATTERN,
+    VERSION_PATTERN,
+    Form,
+    Role,
+)
 
 ROS_NAME_PATTERN = r"[~/]?[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*"
 """What a ROS topic, service, parameter or namespace may be called."""
@@ -24,6 +32,14 @@ _EXECUTABLE_PATTERN = r"(?!/)(?!(.*/)?\.\.(/|\Z))[^\x00-\x1f\x7f]+"
 
 Name = Annotated[str, Meta(pattern=rf"^{NAME_PATTERN}\Z", max_length=MAX_NAME_LENGTH)]
 """Names a user, robot, container, node or interface."""
+PackageName = Annotated[
+    str,
+    Meta(
+        pattern=rf"^{NAME_PATTERN}(@{VERSION_PATTERN})?\Z",
+        max_length=MAX_NAME_LENGTH + 1 + MAX_VERSION_LENGTH,
+    ),
+]
+"""A package, ``NAME``, or a version of one that a user brought, ``NAME@VERSION``."""
 ClassName = Annotated[str, Meta(pattern=rf"^{CLASS_PATTERN}\Z", max_length=2 * MAX_NAME_LENGTH)]
 """A message or service class, ``package/Type``."""
 TypeName = Annotated[str, Meta(pattern=rf"^{_TYPE_PATTERN}\Z")]
@@ -56,6 +72,10 @@ UPDATE_TOPIC = "iu"
 HUMAN_PATTERNS: dict[str, str] = {
     rf"^{NAME_PATTERN}\Z": "must be a name: letters, digits and '_', a letter first",
     rf"^({NAME_PATTERN})?\Z": "must be a name: letters, digits and '_', a letter first",
+    rf"^{NAME_PATTERN}(@{VERSION_PATTERN})?\Z": (
+        "must be a package's name (letters, digits and '_', a letter first), or NAME@VERSION such as"
+        " nav@1.2.0"
+    ),
     rf"^{CLASS_PATTERN}\Z": "must be a class of the form package/Type",
     rf"^{_TYPE_PATTERN}\Z": (
         f"must be an interface type: one of {', '.join(r.value for r in Role)},"
@@ -115,7 +135,7 @@ class AddNode(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="came
 
     container_tag: Name
     node_tag: Name
-    pkg: Name
+    pkg: PackageName
     exe: Executable
     args: Text = ""
     name: OptionalName = ""

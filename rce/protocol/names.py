@@ -15,10 +15,15 @@ NAME_PATTERN = r"[A-Za-z][A-Za-z0-9_]*"
 CLASS_PATTERN = rf"{NAME_PATTERN}/{NAME_PATTERN}"
 """What a message or service class may be called: ``package/Type``."""
 
+VERSION_PATTERN = r"[0-9]{1,9}(\.[0-9]{1,9}){0,3}(-[0-9A-Za-z]+(\.[0-9A-Za-z]+)*)?"
+"""What a package's version looks like: up to four numbers, and a label of what comes before a release."""
+
 MAX_NAME_LENGTH = 128
+MAX_VERSION_LENGTH = 64
 
 _NAME = re.compile(NAME_PATTERN)
 _CLASS = re.compile(CLASS_PATTERN)
+_VERSION = re.compile(VERSION_PATTERN)
 
 
 def is_name(text: str) -> bool:
@@ -29,6 +34,11 @@ def is_name(text: str) -> bool:
 def is_class_name(text: str) -> bool:
     """Tell whether ``text`` may name a message or service class (``std_msgs/String``)."""
     return len(text) <= 2 * MAX_NAME_LENGTH and _CLASS.fullmatch(text) is not None
+
+
+def is_version(text: str) -> bool:
+    """Tell whether ``text`` may be the version of a package (``1.2.0``, ``2.0-rc1``)."""
+    return len(text) <= MAX_VERSION_LENGTH and _VERSION.fullmatch(text) is not None
 
 
 class Role(Enum):

@@ -11,15 +11,17 @@ points of the group ``rce.nodes``, named ``PKG:EXE``.
     name: Test                  # optional: the folder's name
     description: What it is for
     python: engine              # .py files run with the engine's Python; system: as their first line says
+    version: '1.2.0'            # optional; of a package that is brought to an engine (``rce package push``)
 """
 
 from __future__ import annotations
 
 import os
 import re
+import reprlib
 import sys
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -59,6 +61,8 @@ class Package(NamedTuple):
     description: str = ""
     python: str = "system"
     """``engine``: .py files run with the engine's Python; ``system``: as their first line says."""
+    version: str = ""
+    """As the manifest says it; empty if it does not."""
     scripts: tuple[tuple[str, str], ...] = ()
     """Executables that are Python functions: name and ``module:function``."""
 
@@ -210,38 +214,61 @@ def _read_package(folder: Path, name: str) -> Package:
     manifest = _manifest(folder)
     if manifest is None:
         return Package(name, folder)
-    if manifest.suffix == ".xml":
-        return _read_xml(manifest, name)
-    return _read_yaml(manifest, name)
+    try:
+        text = manifest.read_bytes()
+    except OSError as error:
+        raise BadPackage(f"{manifest}: {error}") from error
+    return parse_manifest(manifest, text, name)
 
 
-def _read_yaml(manifest: Path, name: str) -> Package:
+def parse_manifest(manifest: Path, text: bytes, name: str) -> Package:
+    """Read the text of a manifest.
+
+    Args:
+        manifest: Where it is from; its suffix tells its kind.
+        text: What it holds.
+        name: The package's name if the manifest gives none.
+
+    Raises:
+        BadPackage: It cannot be read.
+    """
+    return (_parse_xml if manifest.suffix == ".xml" else _parse_yaml)(manifest, text, name)
+
+
+def _parse_yaml(manifest: Path, text: bytes, name: str) -> Package:
     import yaml
 
     try:
-        data = yaml.safe_load(manifest.read_bytes()) or {}
-    except (OSError, yaml.YAMLError) as error:
+        data = yaml.safe_load(text) or {}
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise BadPackage(f"{manifest}: {error}") from error
     if not isinstance(data, dict):
         raise BadPackage(f"{manifest}: must hold 'key: value' lines")
     python = data.get("python", "engine")
     if python not in _PYTHONS:
-        raise BadPackage(f"{manifest}: python is {python!r}, must be one of {', '.join(_PYTHONS)}")
+        raise BadPackage(f"{manifest}: python is {reprlib.repr(python)}, must be one of {', '.join(_PYTHONS)}")
     declared = data.get("name", name)
     if declared != "" and (not isinstance(declared, str) or _NAME.fullmatch(declared) is None):
-        raise BadPackage(f"{manifest}: {declared!r} is not a package name")
-    return Package(declared, manifest.parent, str(data.get("description", "")), python)
+        raise BadPackage(f"{manifest}: {reprlib.repr(declared)} is not a package name")
+    return Package(declared, manifest.parent, _text(data, "description"), python, _text(data, "version"))
 
 
-def _read_xml(manifest: Path, name: str) -> Package:
+def _text(data: dict[Any, Any], key: str) -> str:
+    # Of anything else no text is made: a few lines of aliases may stand for a tree of any size.
+    found = data.get(key, "")
+    return found if isinstance(found, str) else ""
+
+
+def _parse_xml(manifest: Path, text: bytes, name: str) -> Package:
     from xml.etree import ElementTree as ET
 
     try:
-        root = ET.fromstring(manifest.read_bytes())  # noqa: S314  # a file of the machine's owner
-    except (OSError, ET.ParseError) as error:
+        root = ET.fromstring(text)  # noqa: S314  # expat limits what entities may become
+    except (ET.ParseError, ValueError, LookupError) as error:
         raise BadPackage(f"{manifest}: {error}") from error
     declared = (root.findtext("name") or name).strip()
-    return Package(declared, manifest.parent, " ".join((root.findtext("description") or "").split()))
+    description = " ".join((root.findtext("description") or "").split())
+    return Package(declared, manifest.parent, description, version=(root.findtext("version") or "").strip())
 
 
 def _scripts(package: str) -> tuple[tuple[str, str], ...]:

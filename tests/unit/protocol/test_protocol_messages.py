@@ -146,7 +146,7 @@ def test_bad_items_are_reported_and_good_ones_kept() -> None:
         "data.addInterfaces[0].addr",
         "data.setParam[0].value",
     ]
-    assert "a name: letters, digits and '_', a letter first, not '9'" in read.faults[1]
+    assert "a package's name (letters, digits and '_', a letter first)" in read.faults[1]
 
 
 def test_bad_connection_is_reported_and_the_good_one_kept() -> None:
