@@ -38,6 +38,11 @@ class Record(Struct, frozen=True, kw_only=True):
     """The outermost process of the container."""
     start: int
     """Its start time, so that a reused pid is told apart."""
+    namespaces_pid: int = 0
+    """See :attr:`rce_container.runtimes.base.Handle.namespaces_pid`."""
+    environment: int = 0
+    """The environment's pid, if it does not descend from the outermost process; else 0."""
+    environment_start: int = 0
 
 
 class ContainerFolder:

@@ -171,7 +171,7 @@ class Manager:
             self._tasks.create_task(self._prune(folder), name=f"prune {folder.mark}")
             return
         runtime = self._runtimes.get(record.runtime, self._runtime)
-        unit = self._own(record.id, folder, runtime.adopt(process, folder.mark), isolated=runtime.isolated)
+        unit = self._own(record.id, folder, runtime.adopt(process, record), isolated=runtime.isolated)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._settings.adopt_timeout):
                 await unit.reported.wait()
@@ -319,7 +319,7 @@ class Manager:
             await asyncio.sleep(self._settings.usage_interval)
             for unit in self._units.values():
                 unit.poll()
-            wanted = {u.id: (u.handle.process.pid, u.counters) for u in self._units.values()}
+            wanted = {u.id: (u.handle, u.counters) for u in self._units.values()}
             usage = await asyncio.to_thread(self._meter.measure, wanted)
             times = self._process.cpu_times()
             memory = self._process.memory_info().rss

@@ -20,7 +20,7 @@ from rce_container.environment import messages as m
 from rce_container.environment import proc
 from rce_container.environment.channel import Channel, connect
 from rce_container.environment.exceptions import ChannelError
-from rce_container.exceptions import KillError
+from rce_container.exceptions import KillError, StartError, StateError
 from rce_container.folder import ContainerFolder
 from rce_container.logs import read_log
 from rce_container.runtimes.base import Handle
@@ -133,6 +133,7 @@ class Unit:
         """Talk with the environment until it is gone; returns why."""
         try:
             async with asyncio.timeout(self._office.settings.start_timeout) as self._deadline:
+                await self._launch()
                 self._channel = await connect(str(self.folder.control_socket))
                 self._open_handover(self._channel)
                 if self._stopping:
@@ -145,11 +146,35 @@ class Unit:
             return (
                 "its environment did not end in time" if self._stopping else "its environment does not answer"
             )
+        except (StartError, StateError) as error:
+            return str(error)
         except (OSError, ChannelError, msgspec.DecodeError) as error:
             return f"its environment cannot be talked to: {error}"
         finally:
             await self._hang_up()
         return "its environment died"
+
+    async def _launch(self) -> None:
+        """Bring the environment to life, and note who it is for a later manager.
+
+        Raises:
+            StartError: It cannot be started.
+            StateError: It cannot be noted.
+        """
+        handle = self.handle
+        before = handle.environment
+        await handle.launch()
+        record = self.folder.read_record()
+        if handle.environment is before or handle.environment is None or record is None:
+            return
+        self.folder.write_record(
+            msgspec.structs.replace(
+                record,
+                namespaces_pid=handle.namespaces_pid,
+                environment=handle.environment.pid,
+                environment_start=handle.environment.start,
+            )
+        )
 
     async def _hang_up(self) -> None:
         self._deadline = None
@@ -186,7 +211,7 @@ class Unit:
     def _with_outer_pids(self, status: EndpointStatus) -> tuple[NodeStatus, ...]:
         """Replace the nodes' pids inside the container by those outside."""
         if any(node.pid and node.pid not in self._pids for node in status.nodes):
-            inside = proc.descendants(self.handle.process.pid, proc.table())
+            inside = self.handle.members(proc.table())
             self._pids = {proc.inner_pid(process.pid): process.pid for process in inside}
         return tuple(
             msgspec.structs.replace(node, pid=self._pids.get(node.pid, 0)) if node.pid else node

@@ -6,25 +6,26 @@ from collections.abc import Mapping
 
 from rce.control.model import EndpointUsage, InterfaceUsage
 from rce_container.environment import proc
+from rce_container.runtimes.base import Handle
 
 _PSS_EVERY = 5
 """A process's share of memory costs time to read, so it is read anew in every fifth measurement only."""
 
 
 class UsageMeter:
-    """Measures containers, each by its outermost process."""
+    """Measures containers, each by its processes."""
 
     def __init__(self) -> None:
         self._shares: dict[tuple[int, int], int] = {}
         self._round = 0
 
     def measure(
-        self, containers: Mapping[str, tuple[int, Mapping[str, InterfaceUsage]]]
+        self, containers: Mapping[str, tuple[Handle, Mapping[str, InterfaceUsage]]]
     ) -> dict[str, EndpointUsage]:
         """Measure all containers.
 
         Args:
-            containers: Pid of the outermost process and counters of the interfaces, by id.
+            containers: Processes and counters of the interfaces, by id.
 
         Returns:
             The usage by id. Memory is the proportional share (PSS), or the resident size where that may not
@@ -34,8 +35,8 @@ class UsageMeter:
         processes = proc.table()
         shares: dict[tuple[int, int], int] = {}
         usage = {}
-        for id_, (pid, counters) in containers.items():
-            own = proc.descendants(pid, processes)
+        for id_, (handle, counters) in containers.items():
+            own = handle.members(processes)
             for process in own:
                 shares[process.pid, process.start] = self._share(process)
             usage[id_] = EndpointUsage(

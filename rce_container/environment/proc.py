@@ -95,6 +95,11 @@ def marked(mark: str, *, variable: str = MARK) -> list[Process]:
     return found
 
 
+def same(process: Process, other: Process | None) -> bool:
+    """Tell whether two looks at a pid saw the same process."""
+    return other is not None and (process.pid, process.start) == (other.pid, other.start)
+
+
 def alive(pid: int, start: int) -> bool:
     """Tell whether the process that had this pid and start time still runs."""
     process = read(pid)

@@ -13,8 +13,9 @@ import os
 import subprocess
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import ClassVar, NamedTuple
 
 import msgspec
@@ -23,15 +24,20 @@ from rce_container.environment import proc
 from rce_container.environment.logs import ENVIRONMENT_LOG, segment_path
 from rce_container.environment.messages import Boot, encode
 from rce_container.exceptions import KillError, StartError
-from rce_container.folder import ContainerFolder
+from rce_container.folder import ContainerFolder, Record
 
 SHELL = "/bin/sh"
 
 _SHIM = """
 trap : HUP INT TERM
-folder=$1 run=$2 linger=$3 python=$4 sweeper=$5 mark=$6
+folder=$1 run=$2 linger=$3 python=$4 sweeper=$5 mark=$6 joined=1
 shift 6
-"$@" && linger=0
+while [ "$1" != -- ]; do
+    echo $$ >"$1" || joined=
+    shift
+done
+shift
+[ "$joined" ] && "$@" && linger=0
 exec 0</dev/null 1>&2
 [ "$linger" = 0 ] || sleep "$linger"
 [ -z "$sweeper" ] || "$python" -SE "$sweeper" "$mark"
@@ -53,6 +59,16 @@ class Order(NamedTuple):
     """Descriptor of the listening control socket."""
     links: int
     """Descriptor of the listening link socket."""
+    join: tuple[str, ...] = ()
+    """Files into which a process of the container writes its pid before it does anything else."""
+    rlimits: Mapping[int, int] = MappingProxyType({})
+    """Limits of each node's process by the numbers of :mod:`resource`, soft and hard alike."""
+    host_network: bool = False
+    """Whether the container sees the machine's own network."""
+
+
+Prepare = Callable[[int], Awaitable[None]]
+"""Readies a container's namespaces, given the pid of a process in them, before anything else runs there."""
 
 
 class Handle:
@@ -68,6 +84,10 @@ class Handle:
         self, process: proc.Process, mark: str, popen: subprocess.Popen[bytes] | None = None
     ) -> None:
         self.process = process
+        self.namespaces_pid = 0
+        """A process that lives as long as the container's namespaces, and in them; 0 if there are none."""
+        self.environment: proc.Process | None = None
+        """The environment, if it does not descend from :attr:`process`."""
         self._mark = mark
         self._popen = popen
 
@@ -75,6 +95,24 @@ class Handle:
     def alive(self) -> bool:
         """Whether the shim runs."""
         return proc.alive(self.process.pid, self.process.start)
+
+    async def launch(self, prepare: Prepare | None = None) -> None:
+        """Bring the environment to life; returns at once where it lives already.
+
+        Args:
+            prepare: Awaited when the namespaces exist and before the environment starts.
+
+        Raises:
+            StartError: It cannot be started.
+        """
+
+    def members(self, processes: dict[int, proc.Process]) -> list[proc.Process]:
+        """Find all processes of the container in a table of the machine's."""
+        found: list[proc.Process] = []
+        for root in (self.process, self.environment):
+            if root is not None and proc.same(root, processes.get(root.pid)):
+                found += proc.descendants(root.pid, processes)
+        return found
 
     async def wait(self) -> None:
         """Wait until the shim has ended."""
@@ -98,8 +136,7 @@ class Handle:
         deadline = loop.time() + _KILL_TIMEOUT_S
         while True:
             processes = proc.table()
-            if self.alive:
-                seen.update((found.pid, found) for found in proc.descendants(self.process.pid, processes))
+            seen.update((found.pid, found) for found in self.members(processes))
             if self._mark:
                 seen.update((found.pid, found) for found in proc.marked(self._mark))
             left = [one for one in seen.values() if proc.alive(one.pid, one.start)]
@@ -160,7 +197,7 @@ class Runtime(ABC):
         folder = order.folder
         sweeper = "" if self.isolated else proc.__file__
         shim = [SHELL, "-c", _SHIM, "rce-container-shim", str(folder.path), str(folder.run)]
-        shim += [f"{order.boot.grace:g}", sys.executable, sweeper, folder.mark, *argv]
+        shim += [f"{order.boot.grace:g}", sys.executable, sweeper, folder.mark, *order.join, "--", *argv]
         try:
             with segment_path(folder.logs, ENVIRONMENT_LOG, 0).open("ab") as log:
                 popen = subprocess.Popen(  # noqa: S603
@@ -173,9 +210,19 @@ class Runtime(ABC):
             raise StartError(f"{SHELL} ended at once with code {popen.wait()}")
         return Handle(process, "" if self.isolated else folder.mark, popen)
 
-    def adopt(self, process: proc.Process, mark: str) -> Handle:
-        """Take over a container that an earlier manager started."""
-        return Handle(process, "" if self.isolated else mark)
+    def adopt(self, process: proc.Process, record: Record) -> Handle:
+        """Take over a container that an earlier manager started.
+
+        Args:
+            process: The shim, which was found alive.
+            record: What the earlier manager noted.
+        """
+        handle = Handle(process, "" if self.isolated else record.mark)
+        handle.namespaces_pid = record.namespaces_pid
+        environment = proc.read(record.environment) if record.environment else None
+        if environment is not None and environment.start == record.environment_start:
+            handle.environment = environment
+        return handle
 
 
 def encode_boot(boot: Boot, home: str, logs: str) -> str:
