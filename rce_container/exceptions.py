@@ -3,7 +3,10 @@
 ContainerError
 ├── RuntimeUnavailableError   no runtime of that name works on this machine
 ├── StartError                a container could not be started
+├── NetworkError              a container cannot be joined to its network
 ├── KillError                 a container could not be ended
+├── LimitError                a limit of a container could not be put in force
+├── LimitsUnavailableError    a way to enforce limits does not work on this machine
 └── StateError                the state directory cannot be used
 """
 
@@ -30,8 +33,20 @@ class StartError(ContainerError):
     """A container could not be started; the text says what to do."""
 
 
+class NetworkError(ContainerError):
+    """A container cannot be joined to its network; the text says why."""
+
+
 class KillError(ContainerError):
     """Processes of a container do not die, not even by SIGKILL."""
+
+
+class LimitError(ContainerError):
+    """A limit of a container could not be put in force; the text says what to do."""
+
+
+class LimitsUnavailableError(ContainerError):
+    """A way to enforce limits does not work on this machine; the text says why."""
 
 
 class StateError(ContainerError):

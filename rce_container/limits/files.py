@@ -1,0 +1,76 @@
+"""Control files of cgroups: read, written, and their folders made and removed."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+PROCS = "cgroup.procs"
+
+
+def write(path: Path, value: int | str) -> None:
+    """Write a control file.
+
+    Raises:
+        OSError: There is none, or the kernel does not take the value; names the file.
+    """
+    fd = os.open(path, os.O_WRONLY | os.O_TRUNC | os.O_CLOEXEC)
+    try:
+        os.write(fd, str(value).encode())
+    except OSError as error:
+        error.filename = str(path)
+        raise
+    finally:
+        os.close(fd)
+
+
+def read(path: Path) -> str:
+    """Read a control file; empty if there is none."""
+    try:
+        return path.read_text()
+    except OSError:
+        return ""
+
+
+def number(path: Path) -> int:
+    """Read a file with one number; 0 if there is none, or it says ``max``."""
+    word = read(path).strip()
+    return int(word) if word.lstrip("-").isdigit() else 0
+
+
+def keyed(text: str) -> dict[str, int]:
+    """Read lines of a key and a number."""
+    pairs = (line.split() for line in text.splitlines())
+    return {pair[0]: int(pair[1]) for pair in pairs if len(pair) == 2}  # noqa: PLR2004
+
+
+def tree(folder: Path) -> Iterator[Path]:
+    """All cgroups from ``folder`` down, children before parents; none if it does not exist."""
+    return (Path(path) for path, _, _ in os.walk(folder, topdown=False))
+
+
+def pids(folder: Path) -> list[int]:
+    """The processes in a cgroup and below it."""
+    return [int(word) for one in tree(folder) for word in read(one / PROCS).split()]
+
+
+def make(folder: Path) -> None:
+    """Make a cgroup, if it is not there.
+
+    Raises:
+        OSError: It cannot be made.
+    """
+    folder.mkdir(exist_ok=True)
+
+
+def drop(folder: Path) -> None:
+    """Remove a cgroup and those below it; nothing happens if it does not exist.
+
+    Raises:
+        OSError: A process is in there.
+    """
+    for one in tree(folder):
+        with contextlib.suppress(FileNotFoundError):  # the container's last process removes it too
+            one.rmdir()
