@@ -32,8 +32,13 @@ ENTRY_POINTS = "rce.nodes"
 PATH_VARIABLES = ("RCE_PACKAGE_PATH", "ROS_PACKAGE_PATH")
 """Environment variables that hold package paths, the more important first."""
 
+FOLDERS = ("", "nodes", "scripts", "bin", "lib")
+"""Folders below a package in which a node's file is looked for."""
+
+MANIFESTS = ("package.yaml", "package.xml")
+"""What a manifest may be called, the more important first."""
+
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
-_FOLDERS = ("", "nodes", "scripts", "bin", "lib")
 _PYTHONS = ("engine", "system")
 
 
@@ -91,7 +96,7 @@ class Package(NamedTuple):
         )
 
     def _folders(self) -> Iterator[Path]:
-        for folder in _FOLDERS:
+        for folder in FOLDERS:
             yield self.path / folder
         if self.path.parent.name == "share":
             yield self.path.parent.parent / "lib" / self.name
@@ -195,7 +200,7 @@ def _is_package(folder: Path) -> bool:
 
 
 def _manifest(folder: Path) -> Path | None:
-    for name in ("package.yaml", "package.xml"):
+    for name in MANIFESTS:
         file = folder / name
         if file.is_file():
             return file
@@ -246,7 +251,9 @@ def _parse_yaml(manifest: Path, text: bytes, name: str) -> Package:
         raise BadPackage(f"{manifest}: must hold 'key: value' lines")
     python = data.get("python", "engine")
     if python not in _PYTHONS:
-        raise BadPackage(f"{manifest}: python is {reprlib.repr(python)}, must be one of {', '.join(_PYTHONS)}")
+        raise BadPackage(
+            f"{manifest}: python is {reprlib.repr(python)}, must be one of {', '.join(_PYTHONS)}"
+        )
     declared = data.get("name", name)
     if declared != "" and (not isinstance(declared, str) or _NAME.fullmatch(declared) is None):
         raise BadPackage(f"{manifest}: {reprlib.repr(declared)} is not a package name")

@@ -1,0 +1,43 @@
+"""What can be wrong with a bundle.
+
+::
+
+    BundleError
+    +-- BadBundle        a folder or an archive cannot be one; each fault is told
+    +-- BadSignature     it is not what its owner signed
+    +-- BadKey           a key cannot be read
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+_SHOWN = 20
+
+
+class BundleError(Exception):
+    """Base of all that can be wrong with a bundle."""
+
+
+class BadBundle(BundleError):  # noqa: N818
+    """A folder or an archive cannot be a bundle.
+
+    Attributes:
+        faults: All that is wrong with it, each with its place and what to do.
+    """
+
+    def __init__(self, faults: str | Iterable[str]) -> None:
+        self.faults = (faults,) if isinstance(faults, str) else tuple(faults)
+        super().__init__(self.faults)
+
+    def __str__(self) -> str:
+        more = len(self.faults) - _SHOWN
+        return "; ".join(self.faults[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
+
+
+class BadSignature(BundleError):  # noqa: N818
+    """A bundle is not what the owner of a key signed."""
+
+
+class BadKey(BundleError):  # noqa: N818
+    """A key cannot be read."""

@@ -1,0 +1,27 @@
+"""How large a bundle may be; checked where it is packed, where it is kept and where it is unpacked."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class BundleLimits(NamedTuple):
+    """Limits of one bundle."""
+
+    archive: int = 256 << 20
+    """Bytes, compressed."""
+    unpacked: int = 1 << 30
+    """Bytes of all files."""
+    ratio: int = 200
+    """How many times its size an archive may unpack to, once it is beyond :attr:`free`."""
+    free: int = 32 << 20
+    """Bytes that any archive may unpack to."""
+    entries: int = 20_000
+    """Files, folders and links."""
+    depth: int = 32
+    """Folders within each other."""
+    manifest: int = 64 << 10
+    """Bytes of the manifest, and of ``requirements.txt``."""
+
+
+DEFAULT_LIMITS = BundleLimits()

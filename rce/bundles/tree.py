@@ -1,0 +1,155 @@
+"""The files of a bundle, and the rules they keep: the same where it is packed and where it is unpacked."""
+
+from __future__ import annotations
+
+import posixpath
+from dataclasses import dataclass
+from enum import Enum
+
+from rce.bundles.exceptions import BadBundle
+from rce.bundles.limits import DEFAULT_LIMITS, BundleLimits
+
+_MAX_PART = 255
+_MAX_HOPS = 8
+
+
+class Kind(Enum):
+    """What an entry is."""
+
+    FILE = "file"
+    FOLDER = "folder"
+    LINK = "link"
+    """A symbolic link to something inside the bundle."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Entry:
+    """A file, a folder or a link of a bundle."""
+
+    path: str
+    """From the bundle's root, with ``/``; the first part is the package's name."""
+    kind: Kind
+    size: int = 0
+    """Bytes; files only."""
+    executable: bool = False
+    """Files only."""
+    target: str = ""
+    """Links only."""
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The path's parts; their order is the order of the entries."""
+        return tuple(self.path.split("/"))
+
+
+class Tree:
+    """All entries of a bundle. They come in the order of their paths, folders before what is in them."""
+
+    def __init__(self, limits: BundleLimits = DEFAULT_LIMITS) -> None:
+        self.entries: dict[str, Entry] = {}
+        self.size = 0
+        """Bytes of all files."""
+        self._limits = limits
+        self._last: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """The only folder at the root: the package's name."""
+        return next(iter(self.entries), "")
+
+    @property
+    def files(self) -> int:
+        """How many files there are."""
+        return sum(entry.kind is Kind.FILE for entry in self.entries.values())
+
+    def add(self, entry: Entry) -> None:
+        """Take the next entry.
+
+        Raises:
+            BadBundle: It breaks a rule.
+        """
+        fault = path_fault(entry.path) or self._place_fault(entry)
+        if fault:
+            raise BadBundle(f"{entry.path!r}: {fault}")
+        self.entries[entry.path] = entry
+        self._last = entry.parts
+        self.size += entry.size
+        if len(self.entries) > self._limits.entries:
+            raise BadBundle(f"it has more than {self._limits.entries} files, folders and links")
+        if self.size > self._limits.unpacked:
+            raise BadBundle(f"its files have more than {self._limits.unpacked} bytes")
+
+    def finish(self) -> None:
+        """Check what can only be checked of the whole.
+
+        Raises:
+            BadBundle: It is empty, or a link leads nowhere or out of it.
+        """
+        if not self.entries:
+            raise BadBundle("it is empty")
+        faults = [
+            f"{path!r}: {fault}"
+            for path, entry in self.entries.items()
+            if entry.kind is Kind.LINK and (fault := self._link_fault(entry))
+        ]
+        if faults:
+            raise BadBundle(faults)
+
+    def _place_fault(self, entry: Entry) -> str:
+        parts = entry.parts
+        if not self.entries and (len(parts) != 1 or entry.kind is not Kind.FOLDER):
+            return "the first entry must be the package's folder"
+        if self.entries and parts[0] != self.name:
+            return f"it is outside of the folder {self.name!r}"
+        if parts <= self._last:
+            return "it is out of order, or comes twice"
+        if len(parts) > self._limits.depth:
+            return f"it is more than {self._limits.depth} folders deep"
+        parent = self.entries.get("/".join(parts[:-1]))
+        if len(parts) > 1 and (parent is None or parent.kind is not Kind.FOLDER):
+            return "it is in no folder of the bundle"
+        return ""
+
+    def _link_fault(self, entry: Entry) -> str:
+        seen = 0
+        while entry.kind is Kind.LINK:
+            seen += 1
+            found = self._follow(entry)
+            if isinstance(found, str):
+                return found
+            if seen > _MAX_HOPS:
+                return "it leads through too many links"
+            entry = found
+        return ""
+
+    def _follow(self, link: Entry) -> Entry | str:
+        """Find what a link leads to, step by step: a folder on the way may not be a link itself."""
+        if not link.target or posixpath.isabs(link.target):
+            return f"it is a link to {link.target!r}; links must be relative and stay in the package"
+        at = link.parts[:-1]
+        for part in link.target.split("/"):
+            here = self.entries.get("/".join(at))
+            if here is not None and here.kind is not Kind.FOLDER:
+                return f"it is a link through {here.path!r}, which is no folder"
+            if part == "..":
+                at = at[:-1]
+            elif part not in ("", "."):
+                at = (*at, part)
+            if not at:
+                return f"it is a link to {link.target!r}, out of the package"
+        found = self.entries.get("/".join(at))
+        if found is None:
+            return f"it is a link to {link.target!r}, which is not in the package"
+        return found
+
+
+def path_fault(path: str) -> str:
+    """Say what is wrong with a path; empty if nothing is."""
+    for part in path.split("/"):
+        if part in ("", ".", ".."):
+            return "its path must be plain: no '..', nothing absolute"
+        if not part.isprintable():
+            return "its name holds characters that cannot be printed"
+        if len(part.encode("utf-8", "surrogateescape")) > _MAX_PART:
+            return "its name is too long"
+    return ""

@@ -1,0 +1,57 @@
+"""Lays a bundle out on a disk."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from rce.bundles.archive import read_archive
+from rce.bundles.limits import DEFAULT_LIMITS, BundleLimits
+from rce.bundles.tree import Entry, Kind, Tree
+
+_CREATE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_FOLDER, _FILE, _EXECUTABLE = 0o755, 0o444, 0o555
+
+
+def unpack(file: BinaryIO, into: Path, limits: BundleLimits = DEFAULT_LIMITS) -> tuple[Tree, str]:
+    """Unpack an archive. Blocks.
+
+    Files come out read-only and readable by everybody, never with another right: who may reach them is
+    up to the folder that they are in.
+
+    Args:
+        file: The archive.
+        into: An empty folder that nobody else can change.
+        limits: How large it may be.
+
+    Returns:
+        As :func:`rce.bundles.archive.read_archive`.
+
+    Raises:
+        BadBundle: It is no bundle. What was unpacked until then is left behind.
+        OSError: It cannot be written.
+    """
+
+    # A folder that an entry lies in is a folder that was made here, and not a link: Tree sees to that.
+    def write(entry: Entry, data: Iterator[bytes]) -> None:
+        path = into / entry.path
+        match entry.kind:
+            case Kind.FOLDER:
+                path.mkdir(_FOLDER)
+                path.chmod(_FOLDER)
+            case Kind.LINK:
+                path.symlink_to(entry.target)
+            case Kind.FILE:
+                _write(path, data, _EXECUTABLE if entry.executable else _FILE)
+
+    return read_archive(file, write, limits)
+
+
+def _write(path: Path, data: Iterator[bytes], mode: int) -> None:
+    fd = os.open(path, _CREATE, mode)
+    with os.fdopen(fd, "wb") as file:
+        for chunk in data:
+            file.write(chunk)
+        os.fchmod(file.fileno(), mode)
