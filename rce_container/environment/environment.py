@@ -24,6 +24,7 @@ from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce.ros.xmlrpc import RpcClient
 from rce_container.environment import messages as m
+from rce_container.environment.causes import Causes
 from rce_container.environment.channel import Channel, accept
 from rce_container.environment.exceptions import ChannelError
 from rce_container.environment.interfaces import InterfaceMaker, Readiness
@@ -71,6 +72,7 @@ class Environment:
         self._handover: HandoverReceiver | None = None
         self._packages = PackageIndex(boot.packages)
         self._operator = Operator(self._ask)
+        self._causes = Causes(self._ask)
 
     async def run(self) -> None:
         """Live; returns when every process, socket and task of the container has ended."""
@@ -138,6 +140,7 @@ class Environment:
             terminate_timeout=self._boot.terminate_timeout,
             on_change=self._changed,
             on_fault=self._fault,
+            why_killed=self._causes.ask,
         )
 
     def _environ(self) -> dict[str, str]:
@@ -273,6 +276,8 @@ class Environment:
                 channel.send(m.encode(m.Counters(interfaces=self._endpoint.usage())))
             case m.Dialed(request=request, error=error):
                 self._operator.answered(request, error or socket.socket(fileno=channel.take_fd()))
+            case m.Cause(request=request, text=text):
+                self._causes.answered(request, text)
             case m.Handover():
                 if self._handover is not None:
                     await self._handover.close()
@@ -280,7 +285,7 @@ class Environment:
             case m.Stop():
                 self.end("the manager says so")
 
-    def _ask(self, message: m.Dial) -> bool:
+    def _ask(self, message: m.Dial | m.Killed) -> bool:
         if self._channel is None:
             return False
         self._channel.send(m.encode(message))

@@ -63,6 +63,14 @@ class Dialed(_Message):
     error: str = ""
 
 
+class Cause(_Message):
+    """Answer to :class:`Killed`."""
+
+    request: int
+    text: str = ""
+    """In words; empty if no cause is known."""
+
+
 class Poll(_Message):
     """Asks for :class:`Counters`."""
 
@@ -100,8 +108,14 @@ class Dial(_Message):
     address: LinkAddress
 
 
-ToEnvironment = Apply | Handover | Dialed | Poll | Stop
-ToManager = Report | Fault | Counters | Dial
+class Killed(_Message):
+    """A process ended by SIGKILL: why? Answered by :class:`Cause`."""
+
+    request: int
+
+
+ToEnvironment = Apply | Handover | Dialed | Cause | Poll | Stop
+ToManager = Report | Fault | Counters | Dial | Killed
 
 encode = msgspec.json.Encoder().encode
 """Write a message as JSON; holds no newline."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
@@ -41,6 +41,8 @@ class Workshop:
     """Some node's status is another one."""
     on_fault: Callable[[str], None]
     """A node failed; a text for the user."""
+    why_killed: Callable[[], Awaitable[str]]
+    """Says why a process ended by SIGKILL just now that nobody here sent; empty if nobody knows."""
     lives: Iterable[int] = field(default_factory=count)
 
 
@@ -163,7 +165,7 @@ class _Node:
             finally:
                 pump.close()
             self.settled_at = 0.0
-            self._note_end(code, log.last_line)
+            await self._note_end(code, log.last_line)
         finally:
             log.close()
 
@@ -197,13 +199,14 @@ class _Node:
             child.signal_group(signal.SIGKILL)
         return await child.ended
 
-    def _note_end(self, code: int, last_line: str) -> None:
+    async def _note_end(self, code: int, last_line: str) -> None:
         if self.status.state is NodeState.STOPPING:
             return
         if code == 0:
             self._become(NodeState.EXITED, exit_code=0, detail="ended by itself")
             return
-        reason = describe_exit(code)
+        cause = await self._workshop.why_killed() if code == -signal.SIGKILL else ""
+        reason = cause or describe_exit(code)
         if last_line:
             reason += f"; its last words: {last_line[:_LAST_LINE_LENGTH]}"
         self._fail(f"node {self._tag} failed: {reason}", exit_code=code, detail=reason)

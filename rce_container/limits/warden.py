@@ -1,0 +1,123 @@
+"""Looks after the cell of one life of one container: its limits, and what it tells of deaths in there."""
+
+from __future__ import annotations
+
+import asyncio
+
+from rce.control.limits import MEGABYTE
+from rce.control.model import Resources
+from rce_container.exceptions import LimitError
+from rce_container.limits.base import Cell, SlotSettings, in_megabytes, limits_of
+
+_REACHED = 0.9
+"""A container whose memory never came near its limit did not die of that limit."""
+
+
+class Warden:
+    """The warden of one cell.
+
+    The kernel counts the processes that it kills for want of memory before it kills them, and says no more.
+    So whoever finds a process killed asks :meth:`claim`, and kills that nobody claims come out of
+    :meth:`review` a while later: processes that nodes had started.
+
+    Args:
+        tag: The container's tag, for texts.
+        cell: The cell; it belongs to this warden.
+        settings: How much a slot is.
+    """
+
+    def __init__(self, tag: str, cell: Cell, settings: SlotSettings) -> None:
+        self.cell = cell
+        self._tag = tag
+        self._settings = settings
+        self._claimed, self._refused = cell.troubles()
+        self._unclaimed = 0
+        self._is_refusing = False
+        self._told = ""
+        self._size = 1
+        self._applying = asyncio.Lock()
+
+    async def apply(self, resources: Resources) -> str:
+        """Put the limits in force that follow from what the container asks for.
+
+        Returns:
+            Why that cannot be, in words for the user; the old limits stay then. Empty if all is well, or if
+            the same was said before.
+        """
+        async with self._applying:
+            self._size = max(1, resources.size)
+            try:
+                await asyncio.to_thread(self.cell.apply, limits_of(resources, self._settings))
+            except LimitError as error:
+                text = f"{error}; the limits stay as they were"
+            else:
+                text = ""
+            text, self._told = ("" if text == self._told else text), text
+            return text
+
+    def claim(self) -> str:
+        """Say why the kernel killed a process, if the reason is memory; each kill is claimed once."""
+        if self.cell.troubles().oom_kills <= self._claimed:
+            return ""
+        self._claimed += 1
+        self._unclaimed = 0
+        return self._out_of_memory()
+
+    def claim_all(self) -> str:
+        """Say why the whole container died, if a reason is memory."""
+        text = self.claim()
+        self._claimed = max(self._claimed, self.cell.troubles().oom_kills)
+        return text
+
+    def review(self) -> list[str]:
+        """Look for troubles since the last time.
+
+        Returns:
+            Texts for the user.
+        """
+        troubles = self.cell.troubles()
+        texts = []
+        unclaimed = troubles.oom_kills - self._claimed
+        if settled := min(unclaimed, self._unclaimed):
+            self._claimed += settled
+            killed = "a process that a node started was" if settled == 1 else f"{settled} processes were"
+            texts.append(f"{killed} killed: {self._out_of_memory()}")
+        self._unclaimed = unclaimed - settled
+        refusing = troubles.refused_forks > self._refused
+        if refusing and not self._is_refusing:
+            texts.append(self._out_of_processes())
+        self._is_refusing, self._refused = refusing, troubles.refused_forks
+        return texts
+
+    async def end(self) -> None:
+        """Kill all that is in the cell.
+
+        Raises:
+            KillError: Something does not die.
+        """
+        await asyncio.to_thread(self.cell.kill)
+
+    async def remove(self) -> None:
+        """Remove the cell.
+
+        Raises:
+            LimitError: Something is left in it.
+        """
+        await asyncio.to_thread(self.cell.remove)
+
+    def _out_of_memory(self) -> str:
+        limit = self.cell.limits.memory
+        peak = self.cell.usage().memory_peak
+        if not limit or 0 < peak < _REACHED * limit:
+            return "out of memory: its machine has no more"
+        more = 2 * -(-limit // MEGABYTE)
+        return (
+            f"out of memory: the container's limit of {in_megabytes(limit)}; "
+            f"ask for more with `rce resize {self._tag} --memory {more}M`"
+        )
+
+    def _out_of_processes(self) -> str:
+        return (
+            f"its limit of {self.cell.limits.processes} processes and threads is reached, so it cannot "
+            f"start more; ask for more slots with `rce resize {self._tag} --size {self._size + 1}`"
+        )
