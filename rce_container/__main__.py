@@ -13,6 +13,7 @@ import uvloop
 
 from rce.config.exceptions import RunDirError, SecretError
 from rce.config.secret import load_secret
+from rce.control.limits import MEGABYTE
 from rce_container.app import AUTO, RUNTIMES, App, package_path
 from rce_container.exceptions import ContainerError
 from rce_container.settings import ContainerSettings
@@ -51,6 +52,16 @@ def container(
         list[str] | None,
         typer.Option(help="What this machine has (special features of containers); may be repeated."),
     ] = None,
+    slots: Annotated[
+        int,
+        typer.Option(help="Slots that this machine offers [default: one for each 64 MB of memory]", min=0),
+    ] = 0,
+    slot_memory: Annotated[
+        int, typer.Option(metavar="MB", help="Memory of a container for each of its slots.", min=32)
+    ] = 512,
+    slot_processes: Annotated[
+        int, typer.Option(help="Processes and threads of a container for each of its slots.", min=16)
+    ] = 256,
     name: Annotated[str, typer.Option(help="Name of this task set [default: made up once, then kept]")] = "",
     machine: Annotated[str, typer.Option(help="Name of this machine [default: its host name]")] = "",
     secret_file: Annotated[Path | None, typer.Option(help="File with the engine's shared secret.")] = None,
@@ -68,6 +79,9 @@ def container(
         packages=package_path(package_path_ or ()),
         labels=tuple(label or ()),
         grace=grace,
+        slots=slots,
+        slot_memory=slot_memory * MEGABYTE,
+        slot_processes=slot_processes,
     )
     try:
         program = App(

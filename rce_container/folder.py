@@ -154,7 +154,7 @@ class StateFolder:
         except OSError as error:
             self.__exit__()
             raise StateError(f"cannot use the state directory {self._state}: {error}") from error
-        self._run = self._run_base / f"c-{self._word('run', secrets.token_hex(4))}"
+        self._run = self._run_base / f"c-{self.token}"
         self._run.mkdir(mode=0o700, parents=True, exist_ok=True)
         longest = len(os.fsencode(self._run / ("0" * 12) / "control.sock"))
         if longest > _MAX_SOCKET_PATH:
@@ -182,6 +182,16 @@ class StateFolder:
                 raise StateError(f"{wish!r} cannot name a task set: use letters, digits, '_', '-' and '.'")
             (self._state / "name").write_text(wish)
         return self._word("name", f"container-{secrets.token_hex(4)}")
+
+    @property
+    def token(self) -> str:
+        """Names this state directory on its machine, for ever."""
+        return self._word("run", secrets.token_hex(4))
+
+    @property
+    def cgroups(self) -> Path:
+        """A file that says where the containers' cgroups are."""
+        return self._state / "cgroups"
 
     def create(self) -> ContainerFolder:
         """Make the folder of a new life of a container.

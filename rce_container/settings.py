@@ -6,6 +6,8 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from rce.control.limits import MEGABYTE
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ContainerSettings:
@@ -33,6 +35,12 @@ class ContainerSettings:
     cleanup_timeout: float = 10.0
     """What a container has on top of its nodes' times to end by itself, before it is killed."""
     usage_interval: float = 2.0
+    slots: int = 0
+    """What this machine offers in all; 0: as many as its memory says."""
+    slot_memory: int = 512 * MEGABYTE
+    """Memory of a container for each of its slots (bytes), unless it asks for another amount."""
+    slot_processes: int = 256
+    """Processes and threads of a container for each of its slots."""
 
     @property
     def stop_timeout(self) -> float:
