@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, TypeVar
 
+from msgspec.structs import replace
+
 from rce.protocol.messages import (
     AddInterface,
     AddNode,
@@ -15,6 +17,7 @@ from rce.protocol.messages import (
     DestroyContainer,
     RemoveInterface,
     RemoveNode,
+    ResizeContainer,
     SetParam,
 )
 
@@ -35,6 +38,8 @@ class Desired:
 
     def __init__(self) -> None:
         self.containers: dict[str, CreateContainer] = {}
+        self.sizes: dict[str, ResizeContainer] = {}
+        """By the tag of a container of ours; what several requests said, in one."""
         self.nodes: dict[tuple[str, str], AddNode] = {}
         """By container tag and node tag."""
         self.parameters: dict[tuple[str, str], SetParam] = {}
@@ -49,6 +54,8 @@ class Desired:
         match request:
             case CreateContainer():
                 self.containers[request.container_tag] = request
+            case ResizeContainer():
+                self._resize(request)
             case DestroyContainer():
                 self._forget_container(request.container_tag)
             case ConfigureComponents():
@@ -61,7 +68,7 @@ class Desired:
 
     def restore(self) -> list[Request]:
         """Return the requests that make everything again; the engine takes what is there already silently."""
-        requests: list[Request] = list(self.containers.values())
+        requests: list[Request] = [*self.containers.values(), *self.sizes.values()]
         if self.nodes or self.parameters or self.interfaces:
             requests.append(
                 ConfigureComponents(
@@ -102,6 +109,16 @@ class Desired:
         """Yield what does not vanish with a container of ours."""
         return (item for (endpoint, _), item in items.items() if endpoint not in self.containers)
 
+    def _resize(self, request: ResizeContainer) -> None:
+        if request.container_tag not in self.containers:
+            return  # whoever made it makes it again
+        before, now = self.sizes.get(request.container_tag), request.container_data
+        if before is not None:
+            given = {key: getattr(now, key) for key in now.__struct_fields__}
+            changed = {key: value for key, value in given.items() if value is not None}
+            request = replace(request, container_data=replace(before.container_data, **changed))
+        self.sizes[request.container_tag] = request
+
     def _configure(self, request: ConfigureComponents) -> None:
         for node in request.remove_nodes:
             self.nodes.pop((node.container_tag, node.node_tag), None)
@@ -119,6 +136,7 @@ class Desired:
 
     def _forget_container(self, tag: str) -> None:
         self.containers.pop(tag, None)
+        self.sizes.pop(tag, None)
         _discard_of(self.nodes, tag)
         _discard_of(self.parameters, tag)
         _discard_of(self.interfaces, tag)

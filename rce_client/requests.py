@@ -17,11 +17,13 @@ from rce.protocol.messages import (
     DestroyContainer,
     RemoveInterface,
     RemoveNode,
+    ResizeContainer,
+    ResizeData,
     SetParam,
 )
 
 if TYPE_CHECKING:
-    from rce.protocol.messages import Request, Value
+    from rce.protocol.messages import Quantity, Request, Value
 
 
 class Requests(ABC):
@@ -34,6 +36,30 @@ class Requests(ABC):
     async def create_container(self, tag: str, **resources: Any) -> None:
         """Make a container; ``resources`` are fields of :class:`rce.protocol.messages.ContainerData`."""
         await self.request(CreateContainer(container_tag=tag, container_data=ContainerData(**resources)))
+
+    async def resize_container(
+        self,
+        tag: str,
+        *,
+        size: int | None = None,
+        cpu: Quantity | None = None,
+        memory: Quantity | None = None,
+        bandwidth: Quantity | None = None,
+    ) -> None:
+        """Change what a container may use, while it runs.
+
+        What is not given stays as it is; zero takes a wish back. If its machine has no room for it, an error
+        text says so and nothing changes.
+
+        Args:
+            tag: The container's.
+            size: Slots.
+            cpu: Cores, or a text such as ``"50%"``.
+            memory: MB, or a text such as ``"256M"``.
+            bandwidth: Bytes per second, or a text such as ``"10Mbit"``.
+        """
+        data = ResizeData(size=size, cpu=cpu, memory=memory, bandwidth=bandwidth)
+        await self.request(ResizeContainer(container_tag=tag, container_data=data))
 
     async def destroy_container(self, tag: str) -> None:
         """Remove a container and all that is in it."""
@@ -49,10 +75,21 @@ class Requests(ABC):
         args: str = "",
         name: str = "",
         namespace: str = "",
+        **life: Any,
     ) -> None:
-        """Start a node."""
+        """Start a node.
+
+        ``life`` are further fields of :class:`rce.protocol.messages.AddNode`: ``restart="on-failure"``, ...
+        """
         node = AddNode(
-            container_tag=container, node_tag=tag, pkg=pkg, exe=exe, args=args, name=name, namespace=namespace
+            container_tag=container,
+            node_tag=tag,
+            pkg=pkg,
+            exe=exe,
+            args=args,
+            name=name,
+            namespace=namespace,
+            **life,
         )
         await self.request(ConfigureComponents(add_nodes=(node,)))
 

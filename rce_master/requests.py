@@ -1,13 +1,14 @@
-"""Turns a client's request (``CC``, ``DC``, ``CN``, ``CX``) into commands on the state."""
+"""Turns a client's request (``CC``, ``RC``, ``DC``, ``CN``, ``CX``) into commands on the state."""
 
 from __future__ import annotations
 
 from functools import singledispatch
 from typing import TYPE_CHECKING, Any
 
-from rce.control.model import InterfaceSpec, NodeSpec, Resources
+from rce.control.model import InterfaceSpec, Network, NodeSpec, Resources, RestartPolicy
 from rce.protocol import messages
 from rce.protocol.exceptions import MessageError
+from rce.protocol.quantities import read_bandwidth, read_cores, read_memory
 from rce.protocol.reading import read_request
 from rce_master.state import commands
 
@@ -25,7 +26,7 @@ def read(user: str, kind: str, data: Any) -> tuple[list[commands.Request], list[
 
     Args:
         user: Who asks.
-        kind: ``CC``, ``DC``, ``CN`` or ``CX``.
+        kind: ``CC``, ``RC``, ``DC``, ``CN`` or ``CX``.
         data: The message's ``data``, as it came.
 
     Returns:
@@ -68,8 +69,22 @@ def _command(item: Struct, user: str) -> commands.Request:
 
 @_command.register
 def _(item: messages.CreateContainer, user: str) -> commands.Request:
+    data = item.container_data
     return commands.CreateContainer(
-        user=user, tag=item.container_tag, resources=resources(item.container_data)
+        user=user, tag=item.container_tag, resources=resources(data), wait=data.wait
+    )
+
+
+@_command.register
+def _(item: messages.ResizeContainer, user: str) -> commands.Request:
+    data = item.container_data
+    return commands.ResizeContainer(
+        user=user,
+        tag=item.container_tag,
+        size=data.size,
+        cpu=None if data.cpu is None else read_cores(data.cpu),
+        memory=None if data.memory is None else read_memory(data.memory),
+        bandwidth=None if data.bandwidth is None else read_bandwidth(data.bandwidth),
     )
 
 
@@ -116,10 +131,12 @@ def resources(data: messages.ContainerData) -> Resources:
     return Resources(
         group=data.group,
         group_ip=data.group_ip,
-        size=data.size,
-        cpu=data.cpu,
-        memory=data.memory,
-        bandwidth=data.bandwidth,
+        network=Network.GROUP if data.joins_group else Network(data.network or Network.NONE.value),
+        image=data.image,
+        size=max(1, data.size),
+        cpu=read_cores(data.cpu),
+        memory=read_memory(data.memory),
+        bandwidth=read_bandwidth(data.bandwidth),
         special_features=data.features,
     )
 
@@ -133,4 +150,9 @@ def node_spec(item: messages.AddNode) -> NodeSpec:
         args=item.args,
         name=item.name,
         namespace=item.namespace,
+        restart=RestartPolicy(item.restart),
+        max_restarts=item.max_restarts,
+        after=item.after,
+        heartbeat=item.heartbeat,
+        heartbeat_timeout=item.heartbeat_timeout,
     )

@@ -9,7 +9,7 @@ import re
 from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import urlsplit
 
-from pydantic import AfterValidator, Field, SecretStr, ValidationError
+from pydantic import AfterValidator, BeforeValidator, Field, SecretStr, ValidationError
 
 from rce.config import client_checks
 from rce.config.documents import parse, read_file
@@ -17,6 +17,7 @@ from rce.config.exceptions import ConfigError, Fault
 from rce.config.validation import Strict, faults_of
 from rce.protocol import messages
 from rce.protocol.messages import (
+    CHOICES,
     HUMAN_PATTERNS,
     AddInterface,
     AddNode,
@@ -33,8 +34,10 @@ from rce.protocol.messages import (
     SetParam,
 )
 from rce.protocol.names import InterfaceType
+from rce.protocol.quantities import read_bandwidth, read_cores, read_memory
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
 
@@ -82,6 +85,25 @@ def _check_features(value: Any) -> Any:
     return value
 
 
+def _quantity(read: Callable[[object], float]) -> AfterValidator:
+    """Check an amount with the reader that the protocol has for it; it stays as it was written."""
+
+    def check(value: Any) -> Any:
+        read(value)
+        return value
+
+    return AfterValidator(check)
+
+
+def _one_of(key: str) -> BeforeValidator:
+    def check(value: Any) -> Any:
+        if value not in CHOICES[key]:
+            raise ValueError(f"must be one of {', '.join(CHOICES[key])}")
+        return value
+
+    return BeforeValidator(check)
+
+
 Name = Annotated[str, _matches(messages.Name)]
 PackageName = Annotated[str, _matches(messages.PackageName)]
 Text = Annotated[str, _matches(messages.Text)]
@@ -96,17 +118,37 @@ class Container(Strict):
     tag: Name = Field(alias="cTag")
     group: Text = ""
     group_ip: Text = Field(default="", alias="groupIp")
-    size: int = Field(default=1, ge=0, le=2**31)
-    cpu: float = Field(default=0.0, ge=0, allow_inf_nan=False)
-    """Cores."""
-    memory: int = Field(default=0, ge=0, lt=2**63)
-    """Bytes."""
-    bandwidth: int = Field(default=0, ge=0, lt=2**63)
-    """Bytes per second."""
+    network: Annotated[Any, _one_of("network")] = ""
+    image: Text = ""
+    size: int = Field(default=1, ge=0, le=2**16)
+    """Slots of the machine."""
+    cpu: Annotated[Any, _quantity(read_cores)] = 0
+    """Cores, or a text such as ``50%``."""
+    memory: Annotated[Any, _quantity(read_memory)] = 0
+    """MB, or a text such as ``256M``."""
+    bandwidth: Annotated[Any, _quantity(read_bandwidth)] = 0
+    """Bytes per second, or a text such as ``10Mbit``."""
+    wait: bool = False
+    """Wait for room if no machine has any."""
     special_features: Annotated[Any, AfterValidator(_check_features)] = Field(
         default="", alias="specialFeatures"
     )
     """Labels that the machine must have: a list of strings, or one string of words."""
+
+    def data(self) -> ContainerData:
+        """The same as the protocol has it."""
+        return ContainerData(
+            group=self.group,
+            group_ip=self.group_ip,
+            network=self.network,
+            image=self.image,
+            size=self.size,
+            cpu=self.cpu,
+            memory=self.memory,
+            bandwidth=self.bandwidth,
+            special_features=self.special_features,
+            wait=self.wait,
+        )
 
 
 class Node(Strict):
@@ -119,6 +161,33 @@ class Node(Strict):
     args: Text = ""
     name: Annotated[str, _matches(messages.OptionalName)] = ""
     namespace: Annotated[str, _matches(messages.OptionalNamespace)] = ""
+    restart: Annotated[Any, _one_of("restart")] = "never"
+    """When it is started again after it ended by itself."""
+    max_restarts: int = Field(default=5, alias="maxRestarts", ge=0, lt=2**31)
+    """In a row; 0 for no limit."""
+    after: tuple[Name, ...] = Field(default=(), strict=False)
+    """Tags of nodes that must be ready before it starts."""
+    heartbeat: Annotated[str, _matches(messages.OptionalRosName)] = ""
+    """A topic that it publishes as long as it is well."""
+    heartbeat_timeout: float = Field(default=5.0, alias="heartbeatTimeout", ge=0.1, le=86400)
+    """Seconds."""
+
+    def message(self) -> AddNode:
+        """The same as the protocol has it."""
+        return AddNode(
+            container_tag=self.container,
+            node_tag=self.tag,
+            pkg=self.pkg,
+            exe=self.exe,
+            args=self.args,
+            name=self.name,
+            namespace=self.namespace,
+            restart=self.restart,
+            max_restarts=self.max_restarts,
+            after=self.after,
+            heartbeat=self.heartbeat,
+            heartbeat_timeout=self.heartbeat_timeout,
+        )
 
 
 class Parameter(Strict):
@@ -180,8 +249,7 @@ class ClientConfig(Strict):
     def setup(self) -> list[Request]:
         """Return the requests that make everything, in the order in which they must be sent."""
         requests: list[Request] = [
-            CreateContainer(container_tag=item.tag, container_data=_container_data(item))
-            for item in self.containers
+            CreateContainer(container_tag=item.tag, container_data=item.data()) for item in self.containers
         ]
         if self.nodes or self.parameters or self.interfaces:
             requests.append(self._components())
@@ -218,18 +286,7 @@ class ClientConfig(Strict):
                 SetParam(container_tag=item.container, name=item.name, value=item.value)
                 for item in self.parameters
             ),
-            add_nodes=tuple(
-                AddNode(
-                    container_tag=item.container,
-                    node_tag=item.tag,
-                    pkg=item.pkg,
-                    exe=item.exe,
-                    args=item.args,
-                    name=item.name,
-                    namespace=item.namespace,
-                )
-                for item in self.nodes
-            ),
+            add_nodes=tuple(item.message() for item in self.nodes),
             add_interfaces=tuple(
                 AddInterface(
                     endpoint_tag=item.endpoint,
@@ -244,18 +301,6 @@ class ClientConfig(Strict):
 
     def _links(self) -> tuple[Connection, ...]:
         return tuple(Connection(tag_a=item.a, tag_b=item.b) for item in self.connections)
-
-
-def _container_data(item: Container) -> ContainerData:
-    return ContainerData(
-        group=item.group,
-        group_ip=item.group_ip,
-        size=item.size,
-        cpu=item.cpu,
-        memory=item.memory,
-        bandwidth=item.bandwidth,
-        special_features=item.special_features,
-    )
 
 
 def load(path: Path) -> ClientConfig:

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from rce.config.exceptions import Fault
 from rce.protocol.names import Form, Role, is_name
+from rce.protocol.wishes import container_faults, find_circle
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Iterator, Mapping
@@ -55,7 +56,13 @@ class Parts:
 
 def check(parts: Parts) -> list[Fault]:
     """Find everything that does not fit together."""
-    return [*_check_tags(parts), *_check_interfaces(parts), *_check_connections(parts)]
+    return [
+        *_check_tags(parts),
+        *_check_wishes(parts),
+        *_check_order(parts),
+        *_check_interfaces(parts),
+        *_check_connections(parts),
+    ]
 
 
 def _check_tags(parts: Parts) -> Iterator[Fault]:
@@ -88,6 +95,31 @@ def _repeated(key: str, field_: str, items: Iterable[tuple[int, Hashable]]) -> I
             place = f"{key}[{index}].{field_}" if field_ else f"{key}[{index}]"
             yield Fault(place, f"is the same as in {key}[{first[identity]}]")
         first.setdefault(identity, index)
+
+
+def _check_wishes(parts: Parts) -> Iterator[Fault]:
+    addresses: dict[Hashable, int] = {}
+    for index, container in parts.containers:
+        place = f"containers[{index}]"
+        data = container.data()
+        for fault in container_faults(data):
+            yield Fault(f"{place}.{fault.key}", fault.problem)
+        if data.joins_group and data.group_ip:
+            first = addresses.setdefault((data.group, data.group_ip.partition("/")[0]), index)
+            if first != index:
+                problem = f"is the address of containers[{first}] in the group {data.group!r}"
+                yield Fault(f"{place}.groupIp", problem)
+
+
+def _check_order(parts: Parts) -> Iterator[Fault]:
+    """Find nodes that wait for one another, in a circle."""
+    after: dict[str, dict[str, tuple[str, ...]]] = {}
+    for _, node in parts.nodes:
+        after.setdefault(node.container, {})[node.tag] = node.after
+    for index, node in parts.nodes:
+        circle = find_circle(node.tag, after[node.container])
+        if circle:
+            yield Fault(f"nodes[{index}].after", f"goes round in a circle: {' after '.join(circle)}")
 
 
 def _check_interfaces(parts: Parts) -> Iterator[Fault]:

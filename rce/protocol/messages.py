@@ -7,7 +7,7 @@ Wire source: ``docs/protocol.md``.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 from msgspec import Meta, Struct, field
 
@@ -60,6 +60,12 @@ MessageId = Annotated[str, Meta(max_length=MAX_MESSAGE_ID_LENGTH)]
 """Echoed in the answer to a service request."""
 Text = Annotated[str, Meta(max_length=65536, pattern=r"^[^\x00]*\Z")]
 """Free text without a NUL, which no argument and no file name may hold."""
+Quantity: TypeAlias = int | float | Text
+"""An amount, as :mod:`rce.protocol.quantities` reads it."""
+NetworkName: TypeAlias = Literal["", "none", "group", "host"]
+"""What a container sees of the network; empty for the default."""
+RestartName: TypeAlias = Literal["never", "on-failure", "always"]
+"""When a node that ended by itself is started again."""
 Scalar: TypeAlias = bool | int | float | str
 Value: TypeAlias = bool | int | float | str | list[Scalar]
 """A parameter's value."""
@@ -89,6 +95,11 @@ HUMAN_PATTERNS: dict[str, str] = {
     r"^[^\x00]*\Z": "must not hold a NUL character",
 }
 """What to tell a client instead of a regular expression."""
+CHOICES: dict[str, tuple[str, ...]] = {
+    "network": ("none", "group", "host"),
+    "restart": ("never", "on-failure", "always"),
+}
+"""The values that a key may have, by the key."""
 
 
 class _Part(Struct, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
@@ -100,15 +111,22 @@ class ContainerData(_Part, frozen=True, kw_only=True, omit_defaults=True, rename
 
     group: Text = ""
     group_ip: Text = ""
-    size: Annotated[int, Meta(ge=0, le=2**31)] = 1
-    cpu: Annotated[float, Meta(ge=0, le=2**31)] = 0.0
-    """Cores."""
-    memory: Annotated[int, Meta(ge=0, le=2**62)] = 0
-    """Bytes."""
-    bandwidth: Annotated[int, Meta(ge=0, le=2**62)] = 0
-    """Bytes per second."""
+    """IPv4, with or without ``/NN``."""
+    network: NetworkName = ""
+    image: Text = ""
+    """Root file system: an OCI image's name, or a folder of the machine."""
+    size: Annotated[int, Meta(ge=0, le=2**16)] = 1
+    """Slots."""
+    cpu: Quantity = 0.0
+    """Cores, or a text such as ``"50%"``."""
+    memory: Quantity = 0
+    """MB, or a text such as ``"256M"``."""
+    bandwidth: Quantity = 0
+    """Bytes per second, or a text such as ``"10Mbit"``."""
     special_features: list[Text] | Text = []
     """Labels that the machine must have; a string is a list of its words."""
+    wait: bool = False
+    """Wait for a machine with room if there is none now; else that is an error."""
 
     @property
     def features(self) -> tuple[str, ...]:
@@ -116,12 +134,33 @@ class ContainerData(_Part, frozen=True, kw_only=True, omit_defaults=True, rename
         given = self.special_features
         return tuple(given.split()) if isinstance(given, str) else tuple(given)
 
+    @property
+    def joins_group(self) -> bool:
+        """Whether it is to be in the network of its group: that is said, or an address there is given."""
+        return self.network == "group" or (not self.network and bool(self.group_ip))
+
+
+class ResizeData(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
+    """What is to change of a container's wishes; None leaves a wish as it is, zero takes it back."""
+
+    size: Annotated[int, Meta(ge=1, le=2**16)] | None = None
+    cpu: Quantity | None = None
+    memory: Quantity | None = None
+    bandwidth: Quantity | None = None
+
 
 class CreateContainer(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
     """``CC``: make a container."""
 
     container_tag: Name
     container_data: ContainerData = ContainerData()
+
+
+class ResizeContainer(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
+    """``RC``: change what a container may use, while it runs."""
+
+    container_tag: Name
+    container_data: ResizeData
 
 
 class DestroyContainer(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
@@ -140,6 +179,15 @@ class AddNode(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="came
     args: Text = ""
     name: OptionalName = ""
     namespace: OptionalNamespace = ""
+    restart: RestartName = "never"
+    max_restarts: Annotated[int, Meta(ge=0, le=2**31 - 1)] = 5
+    """In a row; 0 for no limit."""
+    after: tuple[Name, ...] = ()
+    """Tags of nodes of the same container that must be ready before this one starts."""
+    heartbeat: OptionalRosName = ""
+    """A topic that the node publishes as long as it is well."""
+    heartbeat_timeout: Annotated[float, Meta(ge=0.1, le=86400.0)] = 5.0
+    """Seconds."""
 
 
 class RemoveNode(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
@@ -235,7 +283,9 @@ class ErrorReport(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="
     text: str
 
 
-Request: TypeAlias = CreateContainer | DestroyContainer | ConfigureComponents | ConfigureConnections
+Request: TypeAlias = (
+    CreateContainer | ResizeContainer | DestroyContainer | ConfigureComponents | ConfigureConnections
+)
 """What a client may ask of the master."""
 ClientMessage: TypeAlias = Request | DataMessage | InterfaceStatus | ErrorReport
 """Any message of the protocol."""
@@ -245,6 +295,7 @@ REQUEST_TYPES: dict[str, type[Request]] = {
     "DC": DestroyContainer,
     "CN": ConfigureComponents,
     "CX": ConfigureConnections,
+    "RC": ResizeContainer,
 }
 TYPES: dict[str, type[ClientMessage]] = {
     **REQUEST_TYPES,
@@ -253,7 +304,7 @@ TYPES: dict[str, type[ClientMessage]] = {
     "ER": ErrorReport,
 }
 """The value of ``type`` to the class of the message."""
-UPWARD = frozenset(("CC", "DC", "CN", "CX", "DM"))
+UPWARD = frozenset(("CC", "DC", "CN", "CX", "RC", "DM"))
 """Types that a client sends."""
 DOWNWARD = frozenset(("DM", "ST", "ER"))
 """Types that the engine sends."""

@@ -16,6 +16,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType, field
 from rce.protocol.exceptions import MessageError
 from rce.protocol.limits import DEFAULT_LIMITS
 from rce.protocol.messages import (
+    CHOICES,
     HUMAN_PATTERNS,
     NO_ID,
     REQUEST_TYPES,
@@ -27,6 +28,7 @@ from rce.protocol.messages import (
     ConfigureComponents,
     ConfigureConnections,
     Connection,
+    CreateContainer,
     DataMessage,
     DeleteParam,
     ErrorReport,
@@ -35,9 +37,11 @@ from rce.protocol.messages import (
     RemoveInterface,
     RemoveNode,
     Request,
+    ResizeContainer,
     SetParam,
 )
 from rce.protocol.names import Form
+from rce.protocol.wishes import container_faults, resize_faults
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -259,7 +263,27 @@ def read_request(kind: str, data: Any) -> Request:
         return msgspec.convert(_read_items(data, _CONNECTION_ITEMS), ConfigureConnections)
     if data.get("containerData", ...) is None:
         data = {key: value for key, value in data.items() if key != "containerData"}
-    return _convert(data, cls, "data")
+    return _checked(_convert(data, cls, "data"))
+
+
+def _checked(request: Request) -> Request:
+    """Check what a container asks for; all that is wrong is told at once."""
+    match request:
+        case CreateContainer():
+            faults = list(container_faults(request.container_data))
+        case ResizeContainer():
+            faults = list(resize_faults(request.container_data))
+        case _:
+            return request
+    if faults:
+        texts = [f"{_below('data.containerData', fault.key)}: {fault.problem}" for fault in faults]
+        place, problem = texts[0].split(": ", 1)
+        raise MessageError(place, "; ".join((problem, *texts[1:])))
+    return request
+
+
+def _below(place: str, key: str) -> str:
+    return f"{place}.{key}" if key else place
 
 
 def _read_items(data: dict[str, Any], kinds: dict[str, type[Struct]]) -> dict[str, Any]:
@@ -307,6 +331,10 @@ def _convert(value: Any, cls: type[T], place: str) -> T:
 def _reworded(text: str, value: Any, place: str) -> MessageError:
     found = _PLACE.fullmatch(text)
     problem, inner = found.groups() if found else (text, "")
+    key = inner.rpartition(".")[2]
+    if problem.startswith("Invalid enum value") and key in CHOICES:
+        given = _short(_look_up(value, inner))
+        return MessageError(place + inner, f"must be one of {', '.join(CHOICES[key])}, not {given}")
     missing = _MISSING.fullmatch(problem)
     if missing:
         return MessageError(f"{place}{inner}.{missing[1]}", "is missing")

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from rce.config.client import ClientConfig
-from rce.protocol.messages import AddNode, ConfigureComponents, RemoveNode, Request
+from rce.protocol.messages import ConfigureComponents, RemoveNode, Request
 
 _ENDED = frozenset({"failed", "exited"})
+_UP = frozenset({"running", "degraded"})
 
 
 def repairs(config: ClientConfig, engine: dict[str, Any]) -> list[Request]:
@@ -21,23 +22,14 @@ def repairs(config: ClientConfig, engine: dict[str, Any]) -> list[Request]:
     """
     requests: list[Request] = []
     for container in engine.get("containers", ()):
-        if container["state"] != "running":
+        if container["state"] not in _UP:
             continue
         states = {node["tag"]: node["state"] for node in container["nodes"]}
         for node in config.nodes:
             if node.container != container["tag"]:
                 continue
             if node.tag not in states:
-                add = AddNode(
-                    container_tag=node.container,
-                    node_tag=node.tag,
-                    pkg=node.pkg,
-                    exe=node.exe,
-                    args=node.args,
-                    name=node.name,
-                    namespace=node.namespace,
-                )
-                requests.append(ConfigureComponents(add_nodes=(add,)))
+                requests.append(ConfigureComponents(add_nodes=(node.message(),)))
             elif states[node.tag] in _ENDED:
                 remove = RemoveNode(container_tag=node.container, node_tag=node.tag)
                 requests.append(ConfigureComponents(remove_nodes=(remove,)))

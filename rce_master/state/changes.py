@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from msgspec.structs import replace
 
 from rce_master.state.records import (
+    Bundle,
     Container,
     ContainerLive,
     Counter,
     Endpoint,
     Link,
+    PackageKey,
     Presence,
     Robot,
     RobotLive,
@@ -130,7 +132,17 @@ class Transaction:
         self._make_token = make_token
 
     def put(
-        self, record: User | Token | Endpoint | TaskSet | RobotLive | ContainerLive | Presence | Tombstone
+        self,
+        record: User
+        | Token
+        | PackageKey
+        | Bundle
+        | Endpoint
+        | TaskSet
+        | RobotLive
+        | ContainerLive
+        | Presence
+        | Tombstone,
     ) -> None:
         """Write a record into its table."""
         self._assign(self._table_of(record), record)
@@ -211,6 +223,8 @@ class Transaction:
         by_type: dict[type, Table[Any]] = {
             User: tables.users,
             Token: tables.tokens,
+            PackageKey: tables.package_keys,
+            Bundle: tables.bundles,
             Robot: tables.endpoints,
             Container: tables.endpoints,
             TaskSet: tables.task_sets,

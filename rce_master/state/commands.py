@@ -14,7 +14,7 @@ from rce.control.model import Resources
 if TYPE_CHECKING:
     from rce.control.messages import Hello
     from rce.control.model import EndpointStatus, InterfaceSpec, NodeSpec, ParameterValue
-    from rce_master.state.records import Token, User
+    from rce_master.state.records import Bundle, PackageKey, Token, User
 
 
 _NO_WISHES = Resources()
@@ -57,6 +57,41 @@ class RemoveToken:
     """Forget a bearer token."""
 
     digest: str
+
+
+# Packages that users bring
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AddPackageKey:
+    """Trust a user's key."""
+
+    key: PackageKey
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RemovePackageKey:
+    """Trust a user's key no more."""
+
+    user: str
+    id: str
+    """As :func:`rce.bundles.signing.key_id` names it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AddBundle:
+    """Take a version of a package; whoever sends this has verified it."""
+
+    bundle: Bundle
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RemoveBundle:
+    """Remove a version of a package; refused while a node needs it."""
+
+    user: str
+    name: str
+    version: str
 
 
 # Task sets
@@ -134,6 +169,24 @@ class CreateContainer:
     user: str
     tag: str
     resources: Resources = _NO_WISHES
+    wait: bool = False
+    """Whether to wait for room if no machine has any now; else that is refused."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResizeContainer:
+    """``RC``; None leaves a wish as it is, zero takes it back."""
+
+    user: str
+    tag: str
+    size: int | None = None
+    """Slots."""
+    cpu: float | None = None
+    """Cores."""
+    memory: int | None = None
+    """Bytes."""
+    bandwidth: int | None = None
+    """Bytes per second."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -219,6 +272,7 @@ class Disconnect:
 
 Request: TypeAlias = (
     CreateContainer
+    | ResizeContainer
     | DestroyContainer
     | AddNode
     | RemoveNode
@@ -237,6 +291,10 @@ Command: TypeAlias = (
     | RemoveUser
     | AddToken
     | RemoveToken
+    | AddPackageKey
+    | RemovePackageKey
+    | AddBundle
+    | RemoveBundle
     | TaskSetArrived
     | TaskSetLeft
     | StatusReported

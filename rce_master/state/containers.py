@@ -17,7 +17,7 @@ from rce.control.model import (
     ParameterValue,
 )
 from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
-from rce_master.state import endpoints
+from rce_master.state import endpoints, packages
 from rce_master.state.lifecycle import ContainerEvent, ContainerPhase, next_phase
 from rce_master.state.records import Container, ContainerLive, TaskSet, tombstone_key
 
@@ -85,6 +85,7 @@ def add_node(tx: Transaction, command: AddNode) -> None:
         raise Conflict(
             f"node {node.tag!r} of container {container.tag!r} exists with other settings; remove it first"
         )
+    packages.check_node(tx.tables, command.user, node)
     if len(container.nodes) >= tx.settings.max_nodes:
         raise LimitReached(f"container {container.tag!r} has {tx.settings.max_nodes} nodes already")
     size = endpoints.grown(tx, container, node)

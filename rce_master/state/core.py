@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from rce_master.exceptions import StoreError
-from rce_master.state import commands, containers, robots, task_sets, users, wiring
+from rce_master.state import commands, containers, packages, robots, task_sets, users, wiring
 from rce_master.state.changes import Changes, Transaction
 from rce_master.state.invariants import validate
 from rce_master.state.settings import StateSettings
@@ -27,6 +27,10 @@ _HANDLERS: dict[type, Callable[[Transaction, Any], None]] = {
     commands.RemoveUser: users.remove_user,
     commands.AddToken: users.add_token,
     commands.RemoveToken: users.remove_token,
+    commands.AddPackageKey: packages.add_key,
+    commands.RemovePackageKey: packages.remove_key,
+    commands.AddBundle: packages.add_bundle,
+    commands.RemoveBundle: packages.remove_bundle,
     commands.TaskSetArrived: task_sets.arrived,
     commands.TaskSetLeft: task_sets.left,
     commands.StatusReported: task_sets.status_reported,

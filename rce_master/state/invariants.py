@@ -28,6 +28,8 @@ def validate(tables: Tables) -> None:
         _check_link(tables, link)
     _check_connections(tables)
     _check_observed(tables)
+    for record in (*tables.bundles, *tables.package_keys):
+        assert record.user in tables.users, f"{record.id}: its user is unknown"
 
 
 def _check_indexes(tables: Tables) -> None:

@@ -55,6 +55,64 @@ class Token(Struct, frozen=True, kw_only=True):
     """Seconds since 1970."""
 
 
+class PackageKey(Struct, frozen=True, kw_only=True):
+    """A public key by which a user signs packages."""
+
+    user: str
+    key: str
+    """In hex."""
+    label: str = ""
+    created: float
+    """Seconds since 1970."""
+
+    @property
+    def id(self) -> str:
+        """Its key in the table."""
+        return package_key_key(self.user, self.key)
+
+
+def package_key_key(user: str, key: str) -> str:
+    """Tell the key, in the table, of a user's public key."""
+    return f"{user}/{key}"
+
+
+class Bundle(Struct, frozen=True, kw_only=True):
+    """A version of a package that a user brought. It never changes."""
+
+    user: str
+    name: str
+    version: str
+    sha256: str
+    """Of the archive, in hex."""
+    digest: str
+    """SHA-256, in hex, of what the archive unpacks to."""
+    signature: str
+    key: str
+    """The public key that made the signature, in hex."""
+    packed: int
+    """Bytes of the archive."""
+    size: int
+    """Bytes of all files."""
+    files: int
+    created: float
+    """Seconds since 1970."""
+    description: str = ""
+    executables: tuple[str, ...] = ()
+    """What nodes can name."""
+    requirements: bool = False
+    """Whether it has a ``requirements.txt``."""
+
+    @property
+    def id(self) -> str:
+        """``user/name@version``."""
+        return bundle_key(self.user, self.name, self.version)
+
+
+def bundle_key(user: str, name: str, version: str) -> str:
+    """Tell the key of a bundle."""
+    return f"{user}/{name}@{version}"
+
+
 class _Endpoint(Struct, frozen=True, kw_only=True):
     """What robots and containers have in common."""
 

@@ -29,6 +29,12 @@ class StateSettings:
     """Of one endpoint."""
     max_connections: int = 4000
     """Of one endpoint."""
+    max_package_keys: int = 20
+    """Of one user."""
+    max_packages: int = 500
+    """Versions of packages of one user."""
+    max_package_bytes: int = 2 * 2**30
+    """All archives of one user's packages together."""
     max_endpoint_bytes: int = 2 * 2**20
     """What the nodes, parameters and interfaces of one endpoint take when they are written down. A change of
     any of them is stored and sent with all the others."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rce.control.model import ConnectionSpec, EndpointSpec, LinkAddress, LinkSpec, ParameterSpec
-from rce_master.state import endpoints
+from rce_master.state import endpoints, packages
 from rce_master.state.records import Container, Link
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ def _with_contents(spec: EndpointSpec, container: Container) -> EndpointSpec:
         connections=spec.connections,
         resources=container.resources,
         nodes=tuple(container.nodes.values()),
+        bundles=packages.bundle_specs(tables, container),
         parameters=tuple(ParameterSpec(name=n, value=v) for n, v in container.parameters.items()),
     )
 

@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 import msgspec
 
 from rce_master.state.records import (
+    Bundle,
     Container,
     ContainerLive,
     Counter,
     Endpoint,
     Link,
     Live,
+    PackageKey,
     Presence,
     Robot,
     RobotLive,
@@ -146,6 +148,17 @@ class Tables:
     def __init__(self) -> None:
         self.users = Table[User]("users", type_=User, key=lambda u: u.name)
         self.tokens = Table[Token]("tokens", type_=Token, key=lambda t: t.digest, user=lambda t: [t.user])
+        self.package_keys = Table[PackageKey](
+            "package_keys", type_=PackageKey, key=lambda k: k.id, user=lambda k: [k.user]
+        )
+        self.bundles = Table[Bundle](
+            "bundles",
+            type_=Bundle,
+            key=lambda b: b.id,
+            user=lambda b: [b.user],
+            package=lambda b: [f"{b.user}/{b.name}"],
+            sha256=lambda b: [b.sha256],
+        )
         self.endpoints = Table[Endpoint](
             "endpoints",
             type_=Robot | Container,
@@ -168,6 +181,8 @@ class Tables:
         return (
             self.users,
             self.tokens,
+            self.package_keys,
+            self.bundles,
             self.endpoints,
             self.links,
             self.task_sets,

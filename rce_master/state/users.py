@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from rce.protocol.names import is_name
 from rce_master.exceptions import Conflict, Invalid, NotFound
-from rce_master.state import endpoints
+from rce_master.state import endpoints, packages
 from rce_master.state.records import User, UserRole
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ def remove_user(tx: Transaction, command: RemoveUser) -> None:
     for endpoint in tx.tables.endpoints.by("user", user.name):
         endpoints.remove(tx, endpoint.id, "the user was removed")
     _forget_tokens(tx, user.name)
+    packages.forget_user(tx, user.name)
     tx.delete(tx.tables.users, user.name)
     tx.happen("user_removed", user.name, user="")
 

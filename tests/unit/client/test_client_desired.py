@@ -17,6 +17,8 @@ from rce.protocol.messages import (
     RemoveInterface,
     RemoveNode,
     Request,
+    ResizeContainer,
+    ResizeData,
     SetParam,
 )
 from rce_client.desired import Desired
@@ -39,6 +41,12 @@ def interface(endpoint: str, tag: str) -> AddInterface:
 REQUESTS: st.SearchStrategy[Request] = st.one_of(
     st.builds(lambda tag: CreateContainer(container_tag=tag), TAGS),
     st.builds(lambda tag: DestroyContainer(container_tag=tag), TAGS),
+    st.builds(
+        lambda tag, **data: ResizeContainer(container_tag=tag, container_data=ResizeData(**data)),
+        TAGS,
+        cpu=st.sampled_from([None, 1, "50%"]),
+        memory=st.sampled_from([None, 5]),
+    ),
     st.builds(
         lambda c, n: components(add_nodes=AddNode(container_tag=c, node_tag=n, pkg="p", exe="e")), TAGS, NAMES
     ),
@@ -118,3 +126,13 @@ def test_who_is_named_first_in_a_connection_means_nothing() -> None:
     desired.apply(ConfigureConnections(connect=(Connection(tag_a="a/x", tag_b="b/x"),)))
     desired.apply(ConfigureConnections(disconnect=(Connection(tag_a="b/x", tag_b="a/x"),)))
     assert not desired.connections
+
+
+def test_a_container_is_made_again_as_it_was_and_then_resized() -> None:
+    desired = Desired()
+    made = CreateContainer(container_tag="a")
+    desired.apply(made)
+    for data in (ResizeData(cpu=1), ResizeData(memory="1G"), ResizeData(cpu="50%")):
+        desired.apply(ResizeContainer(container_tag="a", container_data=data))
+    resized = ResizeContainer(container_tag="a", container_data=ResizeData(cpu="50%", memory="1G"))
+    assert desired.restore() == [made, resized]

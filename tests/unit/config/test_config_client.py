@@ -163,7 +163,7 @@ def test_every_fault_is_listed() -> None:
     data["userID"] = "9"
     data["password"] = ""
     data["nodez"] = []
-    data["containers"].append({"cTag": "c", "cpu": "1", "memory": -1})
+    data["containers"].append({"cTag": "c", "cpu": "much", "memory": -1})
     data["nodes"][0] |= {"exe": "/bin/sh", "nTag": 3}
     data["parameters"][0]["value"] = {"a": 1}
     data["interfaces"][0] |= {"iType": "Publisher", "iCls": "String"}
@@ -347,3 +347,72 @@ def test_any_document_is_read_or_refused(change: dict[str, Any]) -> None:
 def test_any_text_is_refused(text: str) -> None:
     with pytest.raises(ConfigError):
         loads(text)
+
+
+def test_amounts_are_read_as_the_protocol_reads_them() -> None:
+    data = good()
+    wishes = {
+        "cpu": "50%",
+        "memory": "256M",
+        "bandwidth": "10Mbit",
+        "wait": True,
+        "network": "none",
+        "image": "debian:12",
+    }
+    data["containers"][0] |= wishes
+    (made,) = [r for r in loads(json.dumps(data)).setup() if isinstance(r, CreateContainer)]
+    for key, value in wishes.items():
+        assert getattr(made.container_data, key) == value
+
+
+def test_faults_of_wishes_are_named_by_their_keys() -> None:
+    data = good()
+    data["containers"] = [
+        {"cTag": "a", "memory": "lots", "network": "all"},
+        {"cTag": "b", "network": "group"},
+        {"cTag": "c", "group": "g", "groupIp": "10.0.0.2"},
+        {"cTag": "d", "group": "g", "groupIp": "10.0.0.2/24"},
+        {"cTag": "e", "memory": 200000000},
+    ]
+    data["nodes"] = []
+    found = faults(data)
+    assert [fault.split(": ")[0] for fault in found] == [
+        "containers[0].network",
+        "containers[0].memory",
+        "containers[4].memory",
+        "containers[1].group",
+        "containers[3].groupIp",
+    ]
+    assert "must be one of none, group, host" in found[0]
+    assert "is the address of containers[2] in the group 'g'" in found[-1]
+
+
+def test_how_a_node_lives_is_passed_on() -> None:
+    data = good()
+    life = {
+        "restart": "always",
+        "maxRestarts": 2,
+        "after": ["map"],
+        "heartbeat": "/beat",
+        "heartbeatTimeout": 1,
+    }
+    data["nodes"][0] |= life
+    (made,) = [r for r in loads(json.dumps(data)).setup() if isinstance(r, ConfigureComponents)]
+    (node,) = made.add_nodes
+    assert (node.restart, node.max_restarts, node.after, node.heartbeat, node.heartbeat_timeout) == (
+        "always", 2, ("map",), "/beat", 1.0,
+    )  # fmt: skip
+    data["nodes"][0] |= {"restart": "often", "heartbeatTimeout": 0}
+    assert [fault.split(": ")[0] for fault in faults(data)] == [
+        "nodes[0].restart",
+        "nodes[0].heartbeatTimeout",
+    ]
+
+
+def test_nodes_that_wait_for_one_another_are_found() -> None:
+    data = good()
+    data["nodes"] = [
+        {"cTag": "cTag_01", "nTag": tag, "pkg": "p", "exe": "e", "after": [after]}
+        for tag, after in ("ab", "bc", "ca")
+    ]
+    assert [fault.split(": ")[0] for fault in faults(data)] == [f"nodes[{index}].after" for index in range(3)]

@@ -1,0 +1,174 @@
+"""Packages that users bring: their versions, and the keys by which these are signed.
+
+What a version holds is kept elsewhere, under its hash; here is what is known of it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rce.bundles.signing import key_id
+from rce.bundles.versions import newest, split_package
+from rce.control.model import BundleSpec
+from rce.protocol.names import is_name, is_version
+from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
+from rce_master.state.records import Bundle, Container, PackageKey, bundle_key, package_key_key
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from rce.control.model import NodeSpec
+    from rce_master.state.changes import Transaction
+    from rce_master.state.commands import AddBundle, AddPackageKey, RemoveBundle, RemovePackageKey
+    from rce_master.state.tables import Tables
+
+
+def add_key(tx: Transaction, command: AddPackageKey) -> None:
+    """Trust a key; the same one again is accepted silently."""
+    key = command.key
+    if key.user not in tx.tables.users:
+        raise NotFound(f"there is no user {key.user!r}")
+    if key.id in tx.tables.package_keys:
+        return
+    if tx.tables.package_keys.count("user", key.user) >= tx.settings.max_package_keys:
+        raise LimitReached(f"you have {tx.settings.max_package_keys} keys already; revoke one first")
+    tx.put(key)
+    tx.happen("package_key_registered", f"{key.user}/{key_id(key.key)}", key.label)
+
+
+def remove_key(tx: Transaction, command: RemovePackageKey) -> None:
+    """Trust a key no more. What it signed before stays until it is removed."""
+    found = [key for key in tx.tables.package_keys.by("user", command.user) if key_id(key.key) == command.id]
+    if not found:
+        raise NotFound(f"you have no key {command.id!r}")
+    tx.delete(tx.tables.package_keys, found[0].id)
+    tx.happen("package_key_revoked", f"{command.user}/{command.id}")
+
+
+def check_new(tables: Tables, bundle: Bundle) -> bool:
+    """Tell whether a version is new; the same one again is not.
+
+    Raises:
+        Invalid: Its name or version cannot be one.
+        NotFound: Its key is not registered.
+        Conflict: There is another one of the same version.
+    """
+    if not is_name(bundle.name) or not is_version(bundle.version):
+        raise Invalid(f"{bundle.name}@{bundle.version} cannot be the name and the version of a package")
+    if package_key_key(bundle.user, bundle.key) not in tables.package_keys:
+        raise NotFound(
+            f"the key {key_id(bundle.key)} is not registered with your account, or was revoked;"
+            " run: rce package key register"
+        )
+    there = tables.bundles.get(bundle.id)
+    if there is not None and there.digest != bundle.digest:
+        raise Conflict(
+            f"{bundle.name} {bundle.version} is there with other contents, and a version never changes; give"
+            " this one another version, or remove that one first"
+        )
+    return there is None
+
+
+def add_bundle(tx: Transaction, command: AddBundle) -> None:
+    """Take a version; the same one again is accepted silently. What names the package is told of it."""
+    bundle = command.bundle
+    if bundle.user not in tx.tables.users:
+        raise NotFound(f"there is no user {bundle.user!r}")
+    if not check_new(tx.tables, bundle):
+        return
+    check_room(tx.tables, bundle.user, bundle.packed, tx.settings.max_packages, tx.settings.max_package_bytes)
+    tx.put(bundle)
+    _touch_users_of(tx, bundle)
+    tx.happen("package_pushed", bundle.id)
+
+
+def check_room(tables: Tables, user: str, size: int, most: int, most_bytes: int) -> None:
+    """Check that a user may keep one more version.
+
+    Raises:
+        LimitReached: There are too many, or they are too large.
+    """
+    kept = tables.bundles.by("user", user)
+    if len(kept) >= most:
+        raise LimitReached(f"you have {most} versions of packages already; remove one first")
+    held = sum(bundle.packed for bundle in kept)
+    if held + size > most_bytes:
+        raise LimitReached(
+            f"your packages would have {held + size} bytes, {most_bytes} are allowed; remove a version first"
+        )
+
+
+def remove_bundle(tx: Transaction, command: RemoveBundle) -> None:
+    """Remove a version that no node needs."""
+    found = tx.tables.bundles.get(bundle_key(command.user, command.name, command.version))
+    if found is None:
+        raise NotFound(f"there is no package {command.name!r} of version {command.version!r}")
+    users = [
+        f"{container.tag}/{node.tag}"
+        for container in tx.tables.containers(found.user)
+        for node in container.nodes.values()
+        if find(tx.tables, found.user, node.pkg) == found
+    ]
+    if users:
+        raise Conflict(
+            f"{found.name} {found.version} is used by {', '.join(users)}; remove the nodes first, or let them"
+            " name another version"
+        )
+    tx.delete(tx.tables.bundles, found.id)
+    tx.happen("package_removed", found.id)
+
+
+def forget_user(tx: Transaction, user: str) -> None:
+    """Remove a user's packages and keys."""
+    for bundle in tx.tables.bundles.by("user", user):
+        tx.delete(tx.tables.bundles, bundle.id)
+    for key in tx.tables.package_keys.by("user", user):
+        tx.delete(tx.tables.package_keys, key.id)
+
+
+def find(tables: Tables, user: str, pkg: str) -> Bundle | None:
+    """Find what a node names: the version that it says, or the newest; None if the user brought none."""
+    name, version = split_package(pkg)
+    if version:
+        return tables.bundles.get(bundle_key(user, name, version))
+    return newest(tables.bundles.by("package", f"{user}/{name}"), lambda bundle: bundle.version)
+
+
+def check_node(tables: Tables, user: str, node: NodeSpec) -> None:
+    """Check that there is the version which a node names.
+
+    Raises:
+        NotFound: There is not.
+    """
+    name, version = split_package(node.pkg)
+    if version and find(tables, user, node.pkg) is None:
+        raise NotFound(
+            f"node {node.tag!r}: you have no package {name!r} of version {version!r}; see: rce package list"
+        )
+
+
+def bundle_specs(tables: Tables, container: Container) -> tuple[BundleSpec, ...]:
+    """Tell what the nodes of a container need, in the order of names and versions."""
+    found = (find(tables, container.user, node.pkg) for node in container.nodes.values())
+    needed = {bundle.id: bundle for bundle in found if bundle is not None}
+    return tuple(_spec(needed[id_]) for id_ in sorted(needed))
+
+
+def _spec(bundle: Bundle) -> BundleSpec:
+    return BundleSpec(
+        name=bundle.name,
+        version=bundle.version,
+        sha256=bundle.sha256,
+        signature=bundle.signature,
+        key=bundle.key,
+    )
+
+
+def _touch_users_of(tx: Transaction, bundle: Bundle) -> None:
+    for container in tx.tables.containers(bundle.user):
+        if _names(container.nodes.values(), bundle.name):
+            tx.touch(container.id)
+
+
+def _names(nodes: Iterable[NodeSpec], name: str) -> bool:
+    return any(node.pkg == name for node in nodes)
