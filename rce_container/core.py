@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import msgspec
 
 from rce.control.messages import Fault, Gone, Status
-from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress
+from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress, Resources
 from rce_container.events import (
     Adopted,
     Apply,
@@ -134,6 +134,11 @@ class ManagerCore:
     def statuses(self) -> tuple[EndpointStatus, ...]:
         """What there is, for the master."""
         return tuple(container.status for container in self.containers.values())
+
+    def resources(self, id_: str) -> Resources:
+        """What a container that is desired asks for."""
+        desired = self.containers[id_].desired
+        return desired.resources if desired is not None else Resources()
 
     def validate(self) -> None:
         """Check the invariants; for tests."""

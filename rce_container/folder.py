@@ -43,6 +43,10 @@ class Record(Struct, frozen=True, kw_only=True):
     environment: int = 0
     """The environment's pid, if it does not descend from the outermost process; else 0."""
     environment_start: int = 0
+    group: str = ""
+    """The group whose private network it is in; empty if it is in none."""
+    address: str = ""
+    """Its address there, with the prefix."""
 
 
 class ContainerFolder:
@@ -55,6 +59,7 @@ class ContainerFolder:
         self.home = self.path / "home"
         self.logs = self.path / "logs"
         self.etc = self.path / "etc"
+        self.hosts = self.etc / "hosts"
         self.control_socket = self.run / "control.sock"
         self.link_socket = self.run / "link.sock"
 

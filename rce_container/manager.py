@@ -25,7 +25,7 @@ from rce.control.messages import (
     ToTaskSet,
     Usage,
 )
-from rce.control.model import EndpointStatus, LinkAddress
+from rce.control.model import EndpointStatus, LinkAddress, Network
 from rce.protocol.names import EndpointId, is_name
 from rce_container import core, events
 from rce_container.environment import messages as m
@@ -33,10 +33,11 @@ from rce_container.environment import proc
 from rce_container.environment.channel import connect
 from rce_container.environment.exceptions import ChannelError
 from rce_container.environment.process import strike_all
-from rce_container.exceptions import ContainerError, StateError
+from rce_container.exceptions import ContainerError, NetworkError, StartError, StateError
 from rce_container.folder import ContainerFolder, Record
 from rce_container.life import Phase
 from rce_container.logs import read_log
+from rce_container.network import Networks
 from rce_container.runtimes.base import Handle, Order
 from rce_container.unit import Office, Unit
 from rce_container.usage import UsageMeter
@@ -50,6 +51,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 ROS_PORT = 11311
+LOOPBACK = "127.0.0.1"
+PODMAN = "podman"
+"""The runtime of containers that have an image."""
 
 
 class Manager:
@@ -90,7 +94,8 @@ class Manager:
         self._links = links
         self.send: Callable[[ToMaster], None] = lambda _: None
         self._core = core.ManagerCore()
-        self._office = Office(settings=settings, doorman=doorman, feed=self._feed)
+        self._networks = Networks()
+        self._office = Office(settings=settings, doorman=doorman, feed=self._feed, networks=self._networks)
         self._units: dict[str, Unit] = {}
         """All lives of which something may be left, by mark."""
         self._queue: deque[str] = deque()
@@ -143,16 +148,17 @@ class Manager:
             ready: Called when the past is dealt with.
             quit_: Ends the manager.
         """
-        async with asyncio.TaskGroup() as self._tasks:
-            await self._deal_with_the_past()
-            ready()
-            usage = self._tasks.create_task(self._report_usage(), name="usage")
-            await quit_.wait()
-            self._feed(events.Quit())
-            self._start_waiting()
-            if self._units:
-                await self._empty.wait()
-            usage.cancel()
+        with contextlib.closing(self._networks):
+            async with asyncio.TaskGroup() as self._tasks:
+                await self._deal_with_the_past()
+                ready()
+                usage = self._tasks.create_task(self._report_usage(), name="usage")
+                await quit_.wait()
+                self._feed(events.Quit())
+                self._start_waiting()
+                if self._units:
+                    await self._empty.wait()
+                usage.cancel()
 
     def kill_all(self) -> None:
         """End all containers at once; for a quit that takes too long."""
@@ -171,6 +177,11 @@ class Manager:
             self._tasks.create_task(self._prune(folder), name=f"prune {folder.mark}")
             return
         runtime = self._runtimes.get(record.runtime, self._runtime)
+        if record.group:
+            try:
+                self._networks.adopt(EndpointId.parse(record.id), record, folder.hosts)
+            except NetworkError as error:
+                log.warning("container %s has lost its group: %s", record.id, error)
         unit = self._own(record.id, folder, runtime.adopt(process, record), isolated=runtime.isolated)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._settings.adopt_timeout):
@@ -236,12 +247,14 @@ class Manager:
             self._feed(events.Lost(id_, "", str(error)))
             return
         try:
-            handle = self._launch(id_, folder)
+            runtime = self._runtime_for(id_)
+            handle = self._launch(id_, folder, runtime)
         except ContainerError as error:
+            self._tasks.create_task(self._networks.detach(folder.mark), name=f"network of {id_}")
             folder.remove()
             self._feed(events.Lost(id_, "", str(error)))
             return
-        unit = self._own(id_, folder, handle, isolated=self._runtime.isolated)
+        unit = self._own(id_, folder, handle, isolated=runtime.isolated)
         self._starting.add(unit)
         self._tasks.create_task(self._await_start(unit), name=f"start of {id_}")
         self._feed(events.Made(id_, folder.mark, self._address(folder)))
@@ -251,16 +264,43 @@ class Manager:
         self._starting.discard(unit)
         self._start_waiting()
 
-    def _launch(self, id_: str, folder: ContainerFolder) -> Handle:
+    def _runtime_for(self, id_: str) -> Runtime:
+        """The runtime that makes a container: an image needs one that can run images.
+
+        Raises:
+            StartError: None here can.
+        """
+        resources = self._core.resources(id_)
+        runtime = self._runtime
+        if resources.image and runtime.name != PODMAN:
+            if PODMAN not in self._info.runtimes:
+                raise StartError(
+                    f"its image needs the runtime {PODMAN}, which does not work on this machine"
+                )
+            runtime = self._runtimes[PODMAN]
+        if resources.network is Network.GROUP and not runtime.isolated:
+            raise StartError(f"the runtime {runtime.name} has no networks of groups")
+        return runtime
+
+    def _launch(self, id_: str, folder: ContainerFolder, runtime: Runtime) -> Handle:
         settings = self._settings
+        resources = self._core.resources(id_)
+        container = EndpointId.parse(id_)
+        seat = None
+        if resources.network is Network.GROUP:
+            seat = self._networks.enroll(
+                container, resources.group, resources.group_ip, folder.mark, folder.hosts
+            )
+        host_network = resources.network is Network.HOST
         boot = m.Boot(
             id=id_,
             mark=folder.mark,
             machine=settings.machine,
             home="",
             logs="",
-            ros_port=ROS_PORT if self._runtime.isolated else 0,
-            isolated=self._runtime.isolated,
+            ros_port=ROS_PORT if runtime.isolated and not host_network else 0,
+            isolated=runtime.isolated,
+            address=str(seat.address.ip) if seat else LOOPBACK,
             packages=tuple(map(str, settings.packages)),
             grace=settings.grace,
             interrupt_timeout=settings.interrupt_timeout,
@@ -268,12 +308,26 @@ class Manager:
         )
         with folder.listen(folder.control_socket) as control, folder.listen(folder.link_socket) as links:
             order = Order(
-                EndpointId.parse(id_).tag, boot, folder, settings.packages, control.fileno(), links.fileno()
+                container.tag,
+                boot,
+                folder,
+                settings.packages,
+                control.fileno(),
+                links.fileno(),
+                host_network=host_network,
+                switch=seat.path if seat else "",
+                image=resources.image,
             )
-            handle = self._runtime.start(order)
+            handle = runtime.start(order)
         process = handle.process
         record = Record(
-            id=id_, mark=folder.mark, runtime=self._runtime.name, pid=process.pid, start=process.start
+            id=id_,
+            mark=folder.mark,
+            runtime=runtime.name,
+            pid=process.pid,
+            start=process.start,
+            group=resources.group if seat else "",
+            address=str(seat.address) if seat else "",
         )
         try:
             folder.write_record(record)

@@ -20,9 +20,10 @@ from rce_container.environment import messages as m
 from rce_container.environment import proc
 from rce_container.environment.channel import Channel, connect
 from rce_container.environment.exceptions import ChannelError
-from rce_container.exceptions import KillError, StartError, StateError
+from rce_container.exceptions import KillError, NetworkError, StartError, StateError
 from rce_container.folder import ContainerFolder
 from rce_container.logs import read_log
+from rce_container.network import Networks
 from rce_container.runtimes.base import Handle
 from rce_container.settings import ContainerSettings
 
@@ -42,6 +43,7 @@ class Office:
     settings: ContainerSettings
     doorman: Doorman
     feed: Callable[[events.Event], None]
+    networks: Networks
 
 
 class Unit:
@@ -146,7 +148,7 @@ class Unit:
             return (
                 "its environment did not end in time" if self._stopping else "its environment does not answer"
             )
-        except (StartError, StateError) as error:
+        except (StartError, StateError, NetworkError) as error:
             return str(error)
         except (OSError, ChannelError, msgspec.DecodeError) as error:
             return f"its environment cannot be talked to: {error}"
@@ -163,7 +165,7 @@ class Unit:
         """
         handle = self.handle
         before = handle.environment
-        await handle.launch()
+        await handle.launch(self._prepare)
         record = self.folder.read_record()
         if handle.environment is before or handle.environment is None or record is None:
             return
@@ -175,6 +177,9 @@ class Unit:
                 environment_start=handle.environment.start,
             )
         )
+
+    async def _prepare(self, pid: int) -> None:
+        await self._office.networks.attach(self.mark, pid)
 
     async def _hang_up(self) -> None:
         self._deadline = None
@@ -268,4 +273,5 @@ class Unit:
             await self.handle.kill()
         except KillError as error:
             log.error("container %s: %s", self.id, error)  # noqa: TRY400 - its text says it all
+        await self._office.networks.detach(self.mark)
         await asyncio.to_thread(self.folder.remove)

@@ -20,6 +20,7 @@ from rce.ros.core import Core
 from rce.ros.core.events import Change
 from rce.ros.errors import RosError
 from rce.ros.node import Node
+from rce.ros.node.settings import is_loopback
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce.ros.xmlrpc import RpcClient
@@ -78,10 +79,10 @@ class Environment:
         """Live; returns when every process, socket and task of the container has ended."""
         async with contextlib.AsyncExitStack() as stack:
             reaper = stack.enter_context(Reaper())
-            self._core = await stack.enter_async_context(Core("127.0.0.1", self._boot.ros_port, rosout=True))
+            self._core = await stack.enter_async_context(self._make_core())
             types = TypeRegistry(self._packages)
             node = await stack.enter_async_context(
-                Node(OWN_NODE, argv=[], master_uri=self._core.uri, types=types)
+                Node(OWN_NODE, argv=[f"__ip:={self._boot.address}"], master_uri=self._core.uri, types=types)
             )
             dial = self._operator.connect if self._boot.isolated else None
             hub = LinkHub(self._boot.machine, dial=dial)
@@ -108,6 +109,12 @@ class Environment:
                 await self._close()
                 serving.cancel()
                 watching.cancel()
+
+    def _make_core(self) -> Core:
+        """The container's core, at its loopback and, if it has one, at its address in its group."""
+        address = self._boot.address
+        host = address if is_loopback(address) else "0.0.0.0"  # noqa: S104 - of the container's own network
+        return Core(host, self._boot.ros_port, advertised=address, rosout=True)
 
     def end(self, reason: str) -> None:
         """Begin to end the container, whole."""
@@ -148,7 +155,7 @@ class Environment:
         return {
             **os.environ,
             "ROS_MASTER_URI": self._core.uri,
-            "ROS_IP": "127.0.0.1",
+            "ROS_IP": self._boot.address,
             "PYTHONUNBUFFERED": "1",
             "RCE_PACKAGE_PATH": packages,
             "ROS_PACKAGE_PATH": packages,

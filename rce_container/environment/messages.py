@@ -30,6 +30,8 @@ class Boot(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Port of the container's ROS core on 127.0.0.1; 0 takes a free one."""
     isolated: bool
     """Whether the environment is process 1 of its own pid namespace."""
+    address: str = "127.0.0.1"
+    """Where the container's nodes are reached by others of its group; loopback if it has none."""
     packages: tuple[str, ...] = ()
     grace: float = 30.0
     """Seconds without a manager after which the environment ends itself."""

@@ -30,14 +30,15 @@ SHELL = "/bin/sh"
 
 _SHIM = """
 trap : HUP INT TERM
-folder=$1 run=$2 linger=$3 python=$4 sweeper=$5 mark=$6 joined=1
-shift 6
+folder=$1 run=$2 linger=$3 python=$4 sweeper=$5 mark=$6 switch=$7 joined=1
+shift 7
+[ -z "$switch" ] || exec 9<"$switch"
 while [ "$1" != -- ]; do
     echo $$ >"$1" || joined=
     shift
 done
 shift
-[ "$joined" ] && "$@" && linger=0
+[ "$joined" ] && "$@" 9<&- && linger=0
 exec 0</dev/null 1>&2
 [ "$linger" = 0 ] || sleep "$linger"
 [ -z "$sweeper" ] || "$python" -SE "$sweeper" "$mark"
@@ -65,6 +66,10 @@ class Order(NamedTuple):
     """Limits of each node's process by the numbers of :mod:`resource`, soft and hard alike."""
     host_network: bool = False
     """Whether the container sees the machine's own network."""
+    image: str = ""
+    """See :attr:`rce.control.model.Resources.image`."""
+    switch: str = ""
+    """A file of the network namespace that joins its group; it stays as long as the container."""
 
 
 Prepare = Callable[[int], Awaitable[None]]
@@ -197,7 +202,8 @@ class Runtime(ABC):
         folder = order.folder
         sweeper = "" if self.isolated else proc.__file__
         shim = [SHELL, "-c", _SHIM, "rce-container-shim", str(folder.path), str(folder.run)]
-        shim += [f"{order.boot.grace:g}", sys.executable, sweeper, folder.mark, *order.join, "--", *argv]
+        shim += [f"{order.boot.grace:g}", sys.executable, sweeper, folder.mark, order.switch]
+        shim += [*order.join, "--", *argv]
         try:
             with segment_path(folder.logs, ENVIRONMENT_LOG, 0).open("ab") as log:
                 popen = subprocess.Popen(  # noqa: S603

@@ -1,0 +1,24 @@
+"""The file ``/etc/hosts`` of a container. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+MAX_HOSTNAME = 63
+
+
+def hostname(tag: str) -> str:
+    """The host name of the container with this tag."""
+    return tag[:MAX_HOSTNAME]
+
+
+def hosts_text(tag: str, members: Iterable[tuple[str, str]] = ()) -> str:
+    """Write it.
+
+    Args:
+        tag: The container's.
+        members: Tag and address of each container of its group, itself included; empty if it has none.
+    """
+    lines = [f"{address} {hostname(name)}" for name, address in sorted(members)]
+    own = "" if lines else f" {hostname(tag)}"
+    return "\n".join([f"127.0.0.1 localhost{own}", *lines, ""])
