@@ -12,6 +12,9 @@ import uvloop
 from rce.ros.core import Core
 from rce.ros.core.server import DEFAULT_PORT
 
+GOODBYE_S = 0.1
+"""How long a core that was told to end goes on, so that whoever told it gets an answer."""
+
 
 def core(
     port: Annotated[int, typer.Option(help="Port to listen on; 0 takes a free one.")] = DEFAULT_PORT,
@@ -32,6 +35,11 @@ async def _serve(bind: str, port: int, advertised: str | None) -> None:
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stop.set)
-    async with Core(bind, port, advertised=advertised, rosout=True) as running:
+
+    def told(reason: str) -> None:
+        typer.echo(f"rce core ends: {reason}")
+        loop.call_later(GOODBYE_S, stop.set)
+
+    async with Core(bind, port, advertised=advertised, rosout=True, on_shutdown=told) as running:
         typer.echo(f"rce core ready: ROS_MASTER_URI={running.uri}")
         await stop.wait()

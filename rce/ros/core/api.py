@@ -13,31 +13,54 @@ from rce.ros import names
 from rce.ros.core.events import Outcome
 from rce.ros.core.graph import ANY_TYPE, Graph
 from rce.ros.core.registrations import Kind
-from rce.ros.xmlrpc.dispatch import ERROR, SUCCESS, BadArgument, Method
+from rce.ros.xmlrpc.dispatch import ERROR, FAILURE, SUCCESS, BadArgument, Method
 
 Answer = tuple[int, str, Any]
 
+NOTHING: dict[str, Any] = {
+    "getUri": "",
+    "getPid": -1,
+    "registerPublisher": [],
+    "registerSubscriber": [],
+    "lookupNode": "",
+    "lookupService": "",
+    "getTopicTypes": [],
+    "getSystemState": [[], [], []],
+    "hasParam": False,
+    "getParamNames": [],
+}
+"""What these methods' failures carry as value: as rosmaster's, of the type that is expected."""
+
 
 class MasterApi:
-    """The methods of a core. Their parameters and answers are those of the ROS specification."""
+    """The methods of a core. Parameters, answers and their wording are those of rosmaster."""
 
-    def __init__(self, graph: Graph, uri: Callable[[], str], perform: Callable[[Outcome], None]) -> None:
+    def __init__(
+        self,
+        graph: Graph,
+        uri: Callable[[], str],
+        perform: Callable[[Outcome], None],
+        on_shutdown: Callable[[str], None] | None = None,
+    ) -> None:
         """Wire the API.
 
         Args:
             graph: The state.
             uri: Tells the core's own URI.
             perform: Takes what follows from an operation.
+            on_shutdown: Takes the reason when the core is told to end; without it, that is refused.
         """
         self._graph = graph
         self._uri = uri
         self._perform = perform
+        self._on_shutdown = on_shutdown
 
     def methods(self) -> dict[str, Method]:
         """Return the method table."""
         return {
             "getUri": self._get_uri,
             "getPid": self._get_pid,
+            "shutdown": self._shutdown,
             "registerPublisher": self._register_publisher,
             "unregisterPublisher": self._unregister_publisher,
             "registerSubscriber": self._register_subscriber,
@@ -67,48 +90,55 @@ class MasterApi:
     def _get_pid(self, _caller: str) -> Answer:
         return SUCCESS, "", os.getpid()
 
+    def _shutdown(self, caller: str, reason: Any) -> Answer:
+        if self._on_shutdown is None:
+            return ERROR, "this core ends with the program that runs it", 0
+        self._on_shutdown(f"{caller} asked for it: {reason}")
+        return SUCCESS, "shutdown", 0
+
     # ------------------------------------------------------------------ registrations
 
     def _register_publisher(self, caller: str, topic: Any, topic_type: Any, uri: Any) -> Answer:
         topic = _name("topic", topic, caller)
-        self._perform(
-            self._graph.register_publisher(topic, _type(topic_type), caller, _slave("caller_api", uri))
-        )
-        return SUCCESS, f"{caller} publishes {topic}", list(self._graph.subscribers(topic).values())
+        kind, uri = _type(topic_type), _uri("caller_api", uri)
+        self._perform(self._graph.register_publisher(topic, kind, caller, uri))
+        subscribers = list(self._graph.subscribers(topic).values())
+        return SUCCESS, f"Registered [{caller}] as publisher of [{topic}]", subscribers
 
     def _register_subscriber(self, caller: str, topic: Any, topic_type: Any, uri: Any) -> Answer:
         topic = _name("topic", topic, caller)
-        self._perform(
-            self._graph.register_subscriber(topic, _type(topic_type), caller, _slave("caller_api", uri))
-        )
-        return SUCCESS, f"{caller} subscribes to {topic}", list(self._graph.publishers(topic).values())
+        kind, uri = _type(topic_type), _uri("caller_api", uri)
+        self._perform(self._graph.register_subscriber(topic, kind, caller, uri))
+        return SUCCESS, f"Subscribed to [{topic}]", list(self._graph.publishers(topic).values())
 
     def _register_service(self, caller: str, service: Any, service_uri: Any, uri: Any) -> Answer:
         service = _name("service", service, caller)
         service_uri = _uri("service_api", service_uri)
-        self._perform(self._graph.register_service(service, service_uri, caller, _slave("caller_api", uri)))
-        return SUCCESS, f"{caller} provides {service}", 1
+        self._perform(self._graph.register_service(service, service_uri, caller, _uri("caller_api", uri)))
+        return SUCCESS, f"Registered [{caller}] as provider of [{service}]", 1
 
     def _unregister_publisher(self, caller: str, topic: Any, uri: Any) -> Answer:
-        return self._unregister(
-            Kind.PUBLISHER, _name("topic", topic, caller), caller, _slave("caller_api", uri)
-        )
+        topic = _name("topic", topic, caller)
+        return self._unregister(Kind.PUBLISHER, topic, caller, _uri("caller_api", uri))
 
     def _unregister_subscriber(self, caller: str, topic: Any, uri: Any) -> Answer:
-        return self._unregister(
-            Kind.SUBSCRIBER, _name("topic", topic, caller), caller, _slave("caller_api", uri)
-        )
+        topic = _name("topic", topic, caller)
+        return self._unregister(Kind.SUBSCRIBER, topic, caller, _uri("caller_api", uri))
 
     def _unregister_service(self, caller: str, service: Any, service_uri: Any) -> Answer:
         service = _name("service", service, caller)
         return self._unregister(Kind.SERVICE, service, caller, _uri("service_api", service_uri))
 
     def _unregister(self, kind: Kind, name: str, caller: str, uri: str) -> Answer:
+        if caller not in self._graph.nodes:
+            return SUCCESS, f"[{caller}] is not a registered node", 0
         was_there, outcome = self._graph.unregister(kind, name, caller, uri)
         self._perform(outcome)
         if was_there:
-            return SUCCESS, f"{caller} is no longer a {kind.value} of {name}", 1
-        return SUCCESS, f"{caller} at {uri} is not a {kind.value} of {name}", 0
+            return SUCCESS, f"Unregistered [{caller}] as provider of [{name}]", 1
+        if kind is Kind.SERVICE:
+            return SUCCESS, f"[{uri}] is no longer the current service api handle for [{name}]", 0
+        return SUCCESS, f"[{caller}] is not a known provider of [{name}]", 0
 
     # ------------------------------------------------------------------ questions
 
@@ -130,7 +160,7 @@ class MasterApi:
         return SUCCESS, "current topics", self._graph.published(below)
 
     def _get_topic_types(self, _caller: str) -> Answer:
-        return SUCCESS, "current topic types", [list(pair) for pair in self._graph.topic_types.items()]
+        return SUCCESS, "current system state", [list(pair) for pair in self._graph.topic_types.items()]
 
     def _get_system_state(self, _caller: str) -> Answer:
         return SUCCESS, "current system state", self._graph.system_state()
@@ -139,6 +169,8 @@ class MasterApi:
 
     def _set_param(self, caller: str, key: Any, value: Any) -> Answer:
         name = _key(key, caller)
+        if _holds_none(value):
+            raise BadArgument("parameter [value] must be specified, and hold no nil")
         self._perform(self._graph.set_parameter(name, value, by=caller))
         return SUCCESS, f"parameter {name} set", 0
 
@@ -163,8 +195,8 @@ class MasterApi:
 
     def _search_param(self, caller: str, key: Any) -> Answer:
         _key(key, caller)
-        if names.is_private(key):
-            raise BadArgument("a private name cannot be searched")
+        if names.is_private(key) or not names.is_global(caller):
+            return FAILURE, "relative names are searched, from a node's global name upwards", 0
         found = self._graph.parameters.search(names.canonical(caller), key)
         if found is None:
             return ERROR, f"Cannot find parameter [{key}] in an upwards search", ""
@@ -172,15 +204,15 @@ class MasterApi:
 
     def _subscribe_param(self, caller: str, uri: Any, key: Any) -> Answer:
         name = _key(key, caller)
-        value, outcome = self._graph.subscribe_parameter(name, caller, _slave("caller_api", uri))
+        value, outcome = self._graph.subscribe_parameter(name, caller, _uri("caller_api", uri))
         self._perform(outcome)
         return SUCCESS, f"Subscribed to parameter [{name}]", value
 
     def _unsubscribe_param(self, caller: str, uri: Any, key: Any) -> Answer:
         name = _key(key, caller)
-        was_there, outcome = self._graph.unregister(Kind.PARAMETER, name, caller, _slave("caller_api", uri))
+        _, outcome = self._graph.unregister(Kind.PARAMETER, name, caller, _uri("caller_api", uri))
         self._perform(outcome)
-        return SUCCESS, f"Unsubscribe to parameter [{name}]", int(was_there)
+        return SUCCESS, f"Unsubscribe to parameter [{name}]", 1
 
     def _get_param_names(self, _caller: str) -> Answer:
         return SUCCESS, "Parameter names", self._graph.parameters.all_names()
@@ -216,12 +248,15 @@ def _type(value: Any) -> str:
 
 
 def _uri(role: str, value: Any) -> str:
-    if not isinstance(value, str) or "://" not in value:
-        raise BadArgument(f"parameter [{role}] is not a URI of the form scheme://host:port")
+    if not isinstance(value, str) or not value.startswith(("http://", "rosrpc://")):
+        raise BadArgument(
+            f"parameter [{role}] is not a URI of the form http://host:port or rosrpc://host:port"
+        )
     return value
 
 
-def _slave(role: str, value: Any) -> str:
-    if not _uri(role, value).startswith("http://"):
-        raise BadArgument(f"parameter [{role}] is not a URI of the form http://host:port")
-    return str(value)
+def _holds_none(value: Any) -> bool:
+    """Tell whether a value is or holds XML-RPC's extension ``nil``, which not all clients can read."""
+    if isinstance(value, dict):
+        return any(map(_holds_none, value.values()))
+    return any(map(_holds_none, value)) if isinstance(value, list) else value is None

@@ -11,6 +11,7 @@ from typing import Any
 from rce.ros.core.events import Call, Change, GraphEvent, Outcome
 from rce.ros.core.parameters import UNSET, ParameterTree, affected
 from rce.ros.core.registrations import Kind, Registrations
+from rce.ros.names import SEPARATOR, canonical
 
 ANY_TYPE = "*"
 
@@ -43,7 +44,7 @@ class Graph:
 
     @property
     def topic_types(self) -> dict[str, str]:
-        """Topics that somebody publishes or subscribes to, and their types (``*`` while nobody said)."""
+        """Topics in use whose types somebody said, and ``*`` for those whose publishers did not."""
         return dict(self._types)
 
     def publishers(self, topic: str) -> dict[str, str]:
@@ -86,7 +87,7 @@ class Graph:
     def register_subscriber(self, topic: str, topic_type: str, node: str, uri: str) -> Outcome:
         """Note that a node subscribes; it learns the publishers from the answer, not by a call."""
         outcome = self._displace(node, uri)
-        if self._types.get(topic, ANY_TYPE) == ANY_TYPE:
+        if topic_type != ANY_TYPE and self._types.get(topic, ANY_TYPE) == ANY_TYPE:
             self._types[topic] = topic_type
         self._add(Kind.SUBSCRIBER, topic, node, uri, None, outcome)
         return outcome
@@ -138,6 +139,15 @@ class Graph:
         outcome = self._displace(node, uri)
         self._add(Kind.PARAMETER, name, node, uri, None, outcome)
         return self._value(name), outcome
+
+    def drop_parameter_subscription(self, uri: str, name: str) -> Outcome:
+        """Note that the node at ``uri`` does not know of its subscription to exactly ``name``."""
+        outcome = Outcome.empty()
+        name = canonical(name)
+        for node, known in list(self._registrations.of(Kind.PARAMETER, name).items()):
+            if known == uri:
+                self._remove(Kind.PARAMETER, name, node, outcome)
+        return outcome
 
     def validate(self) -> None:
         """Check the invariants; for tests."""
@@ -195,9 +205,11 @@ class Graph:
         outcome = Outcome.empty()
         for subscription, reported in affected(self._registrations.names(Kind.PARAMETER), name):
             value = self._value(reported)
+            knows = besides if reported == name else ""  # who sets a tree is told what it means for its parts
+            arguments = (reported.rstrip(SEPARATOR) + SEPARATOR, value)  # as all masters write it
             for node, uri in self._registrations.of(Kind.PARAMETER, subscription).items():
-                if node != besides:
-                    outcome.calls.append(Call(uri, "paramUpdate", (reported, value)))
+                if node != knows:
+                    outcome.calls.append(Call(uri, "paramUpdate", arguments))
         return outcome
 
     def _value(self, name: str) -> Any:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
+from typing import Any
 
 from rce.ros.core.events import Call
 from rce.ros.errors import RpcUnreachable, XmlRpcError
 from rce.ros.tasks import TaskScope
 from rce.ros.xmlrpc import RpcClient
+from rce.ros.xmlrpc.dispatch import ERROR
 
 _log = logging.getLogger(__name__)
 
@@ -25,14 +28,18 @@ class Notifier:
     number of topics and parameters of its node, however slow the node is.
     """
 
-    def __init__(self, client: RpcClient, tasks: TaskScope) -> None:
+    def __init__(
+        self, client: RpcClient, tasks: TaskScope, on_unwanted: Callable[[Call], None] = lambda _: None
+    ) -> None:
         """Make a notifier.
 
         Args:
             client: Makes the calls.
             tasks: Owns a task for each node while it is owed something.
+            on_unwanted: Takes a call that a node answered with -1: it does not know what this is about.
         """
         self._client = client
+        self._on_unwanted = on_unwanted
         self._tasks = tasks
         self._waiting: dict[str, dict[object, Call]] = {}
 
@@ -55,9 +62,17 @@ class Notifier:
 
     async def _call(self, call: Call, queue: dict[object, Call]) -> None:
         try:
-            await self._client.call(call.uri, call.method, (CALLER, *call.arguments), timeout=CALL_TIMEOUT)
+            arguments = (CALLER, *call.arguments)
+            answer = await self._client.call(call.uri, call.method, arguments, timeout=CALL_TIMEOUT)
         except RpcUnreachable as error:
             _log.info("%s is not delivered: %s", call.method, error)
             queue.clear()  # nobody is there; who takes the address over registers and learns the state anew
         except XmlRpcError as error:
             _log.warning("%s to %s: %s", call.method, call.uri, error)
+        else:
+            if _is_error(answer):
+                self._on_unwanted(call)
+
+
+def _is_error(answer: Any) -> bool:
+    return isinstance(answer, (list, tuple)) and list(answer[:1]) == [ERROR]

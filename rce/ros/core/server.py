@@ -11,8 +11,8 @@ from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from types import TracebackType
 from typing import Any, Self
 
-from rce.ros.core.api import MasterApi
-from rce.ros.core.events import GraphEvent, Outcome
+from rce.ros.core.api import NOTHING, MasterApi
+from rce.ros.core.events import Call, GraphEvent, Outcome
 from rce.ros.core.graph import Graph
 from rce.ros.core.notifier import Notifier
 from rce.ros.core.roslaunch import roslaunch_methods
@@ -73,6 +73,7 @@ class Core:
         *,
         advertised: str | None = None,
         rosout: bool = False,
+        on_shutdown: Callable[[str], None] | None = None,
     ) -> None:
         """Prepare a core.
 
@@ -81,13 +82,15 @@ class Core:
             port: 0 takes a free one.
             advertised: Host or address in :attr:`uri`; by default ``host``, or loopback if that is "all".
             rosout: Run the node ``/rosout``, which gathers all nodes' log records on ``/rosout_agg``.
+            on_shutdown: Takes the reason when somebody tells the core to end; without it, nobody may.
         """
         self.graph = Graph()
         self._local = "127.0.0.1" if host == "0.0.0.0" else host  # noqa: S104
         self._advertised = advertised or self._local
         self._rosout = rosout
-        self._api = MasterApi(self.graph, lambda: self.uri, self._perform)
-        self._server = RpcServer(Dispatcher(self._api.methods() | roslaunch_methods()), host, port)
+        self._api = MasterApi(self.graph, lambda: self.uri, self._perform, on_shutdown)
+        methods = self._api.methods() | roslaunch_methods()
+        self._server = RpcServer(Dispatcher(methods, NOTHING), host, port)
         self._notifier: Notifier | None = None
         self._watches: set[GraphWatch] = set()
         self._changed = asyncio.Event()
@@ -102,7 +105,7 @@ class Core:
         async with AsyncExitStack() as stack:
             client = await stack.enter_async_context(RpcClient())
             tasks = await stack.enter_async_context(TaskScope())
-            self._notifier = Notifier(client, tasks)
+            self._notifier = Notifier(client, tasks, self._unwanted)
             await stack.enter_async_context(self._server)
             self._set_well_known_parameters()
             if self._rosout:
@@ -197,6 +200,10 @@ class Core:
             for watch in self._watches:
                 watch.put(event)
         self._changed.set()
+
+    def _unwanted(self, call: Call) -> None:
+        if call.method == "paramUpdate":
+            self._perform(self.graph.drop_parameter_subscription(call.uri, call.arguments[0]))
 
     def _set_well_known_parameters(self) -> None:
         self.set_param("/run_id", str(uuid.uuid1()))

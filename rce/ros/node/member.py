@@ -20,7 +20,7 @@ from rce.ros.node.runtime import Runtime, Types
 from rce.ros.node.service import SerializedHandler, Service
 from rce.ros.node.service_client import ServiceClient
 from rce.ros.node.settings import NodeSettings
-from rce.ros.node.slave import SlaveApi
+from rce.ros.node.slave import NOTHING, SlaveApi
 from rce.ros.node.subscriber import CallbackSink
 from rce.ros.node.topics import Topics
 from rce.ros.tasks import TaskScope
@@ -151,13 +151,16 @@ class GraphMember:
             )
             tasks = await stack.enter_async_context(TaskScope())
             slave = SlaveApi(
+                self.name,
+                lambda: slave_uri,
                 self._topics,
                 settings.master_uri,
                 lambda: (settings.host, self._listener.port),
                 self.shutdown,
                 self._parameter_changed,
             )
-            server = await stack.enter_async_context(RpcServer(Dispatcher(slave.methods()), settings.bind))
+            dispatcher = Dispatcher(slave.methods(), NOTHING)
+            server = await stack.enter_async_context(RpcServer(dispatcher, settings.bind))
             slave_uri = f"http://{settings.host}:{server.port}/"
             master = MasterClient(settings.master_uri, self.name, slave_uri, rpc)
             self._runtime = Runtime(

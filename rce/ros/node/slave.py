@@ -15,11 +15,30 @@ from rce.ros.xmlrpc.dispatch import ERROR, FAILURE, SUCCESS, BadArgument, Method
 
 Answer = tuple[int, str, Any]
 
+NOTHING: dict[str, Any] = {
+    "getBusStats": [],
+    "getBusInfo": [],
+    "getName": "",
+    "getUri": "",
+    "getMasterUri": "",
+    "getPid": -1,
+    "getSubscriptions": [],
+    "getPublications": [],
+    "requestTopic": [],
+    "publisherUpdate": -1,
+    "paramUpdate": -1,
+}
+"""What these methods' failures carry as value: as rospy's, of the type that is expected."""
+
 
 @dataclass(slots=True)
 class SlaveApi:
     """Answers for one node."""
 
+    name: str
+    """The node's global name."""
+    uri: Callable[[], str]
+    """This API's own URI."""
     topics: Topics
     master_uri: str
     tcpros_address: Callable[[], tuple[str, int]]
@@ -30,8 +49,10 @@ class SlaveApi:
     """Takes a parameter's name and new value; tells whether the node subscribed to it."""
 
     def methods(self) -> dict[str, Method]:
-        """Return the method table."""
+        """Return the method table: the specification's, and the two that rospy's nodes have beside."""
         return {
+            "getName": lambda _caller: (SUCCESS, "", self.name),
+            "getUri": lambda _caller: (SUCCESS, "", self.uri()),
             "getBusStats": self._get_bus_stats,
             "getBusInfo": self._get_bus_info,
             "getMasterUri": self._get_master_uri,
@@ -48,7 +69,7 @@ class SlaveApi:
         if not isinstance(topic, str) or not isinstance(protocols, list):
             raise BadArgument("a topic's name and a list of protocols are needed")
         if topic not in self.topics.outputs:
-            return ERROR, f"{topic} is not published here", 0
+            return ERROR, f"Not a publisher of [{topic}]", []
         if any(isinstance(protocol, list) and protocol[:1] == ["TCPROS"] for protocol in protocols):
             host, port = self.tcpros_address()
             return SUCCESS, f"ready on {host}:{port}", ["TCPROS", host, port]

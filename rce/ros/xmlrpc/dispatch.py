@@ -2,7 +2,8 @@
 
 Every ROS method answers ``[status, message, value]`` with status 1 for success, 0 for a failure and -1 for a
 mistake of the caller. Real clients do not expect faults, so a wrong number or kind of arguments is answered
-``[-1, message, 0]``; a fault says only that there is no such method or that the document is no call.
+``[-1, message, 0]`` (or another value that says nothing: of the type that the method's answers have); a fault
+says only that there is no such method or that the document is no call.
 """
 
 from __future__ import annotations
@@ -32,14 +33,21 @@ _FAULT_NO_CALL = -32600
 
 
 class BadArgument(ValueError):  # noqa: N818
-    """Raised by a method for a caller's mistake; answered ``[-1, message, 0]``."""
+    """Raised by a method for a caller's mistake; answered ``[-1, message, nothing]``."""
 
 
 class Dispatcher:
     """The methods of one server, with ``system.listMethods`` and ``system.multicall`` added."""
 
-    def __init__(self, methods: Mapping[str, Method]) -> None:
+    def __init__(self, methods: Mapping[str, Method], nothing: Mapping[str, Any] | None = None) -> None:
+        """Prepare the answers.
+
+        Args:
+            methods: By their names.
+            nothing: What a method's failures carry as value; 0 if it is not in here.
+        """
         self._methods = dict(methods)
+        self._nothing = dict(nothing or {})
         self._arity = {name: _arity(method) for name, method in methods.items()}
 
     def respond(self, document: bytes) -> bytes:
@@ -70,10 +78,10 @@ class Dispatcher:
             self._check(method, arguments)
             return handler(*arguments)
         except BadArgument as error:
-            return ERROR, f"{method}: {error}", 0
+            return ERROR, f"{method}: {error}", self._nothing.get(method, 0)
         except Exception as error:  # noqa: BLE001 - a caller is answered, whatever happens
             _log.exception("%s failed for %s", method, arguments[0] if arguments else "?")
-            return FAILURE, f"internal failure: {error}", 0
+            return FAILURE, f"internal failure: {error}", self._nothing.get(method, 0)
 
     def _check(self, method: str, arguments: Sequence[Any]) -> None:
         at_least, at_most = self._arity[method]
