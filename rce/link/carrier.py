@@ -11,6 +11,7 @@ from rce.link.exceptions import LinkLost, ProtocolError
 
 if TYPE_CHECKING:
     from rce.link.frames import Frame
+    from rce.link.pacing import Pacer
     from rce.link.queues import OutgoingQueue
 
 
@@ -41,6 +42,15 @@ class Carrier(ABC):
     @abstractmethod
     def start(self, handler: CarrierHandler) -> None:
         """Begin to hand frames over. Nothing is handed over before, and nothing is lost."""
+
+    @abstractmethod
+    def pace(self, pacer: Pacer | None) -> None:
+        """Limit what passes; none for no limit. A link within a process is no traffic and has no limit."""
+
+    @property
+    @abstractmethod
+    def traffic(self) -> tuple[int, int]:
+        """Bytes that came in and that went out, with headers."""
 
     @abstractmethod
     def control(self, frame: Frame) -> None:
@@ -100,6 +110,14 @@ class LocalCarrier(Carrier):
         """Begin to hand frames over."""
         self._handler = handler
         self._schedule()
+
+    def pace(self, pacer: Pacer | None) -> None:
+        """Do nothing: this is no traffic."""
+
+    @property
+    def traffic(self) -> tuple[int, int]:
+        """Nothing."""
+        return 0, 0
 
     def control(self, frame: Frame) -> None:
         """Send a frame."""

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from rce.link.channel import Channel
 from rce.link.dialer import keep_dialed
-from rce.link.link import Link
+from rce.link.link import Link, add_traffic
+from rce.link.pacing import Pacer
 from rce.link.slot import InterfaceSlot
 from rce.link.tasks import TaskScope
 
@@ -53,6 +54,8 @@ class Endpoint:
         self._slots: dict[str, InterfaceSlot] = {}
         self._links: dict[str, Link] = {}
         self._channels: dict[int, Channel] = {}
+        self._pacer: Pacer | None = None
+        self._former_traffic = (0, 0)
         self._refused: set[InterfaceSpec | ConnectionSpec] = set()
         self._starts: dict[InterfaceSlot, asyncio.Task[None]] = {}
         self._dials: dict[Link, asyncio.Task[None]] = {}
@@ -75,6 +78,14 @@ class Endpoint:
         """Return the counters of every interface by tag, since it was made."""
         return {tag: slot.counters.usage() for tag, slot in self._slots.items()}
 
+    @property
+    def traffic(self) -> tuple[int, int]:
+        """Bytes that came in and that went out on all sockets of its links, with headers."""
+        total = self._former_traffic
+        for link in self._links.values():
+            total = add_traffic(total, link.traffic)
+        return total
+
     async def apply(self, spec: EndpointSpec) -> None:
         """Make up the difference between ``spec`` and what is there.
 
@@ -89,6 +100,7 @@ class Endpoint:
         async with self._lock:
             if self._closed:
                 raise RuntimeError(f"endpoint {self.id} is closed")
+            self._limit(spec.resources.bandwidth)
             await self._remove(spec)
             self._add(spec)
 
@@ -102,8 +114,22 @@ class Endpoint:
             await self._tasks.close()
             for carrier in carriers:
                 await carrier.wait_closed()
+            self._limit(0)
             if self._notice is not None:
                 self._notice.cancel()
+
+    # The limit
+
+    def _limit(self, rate: int) -> None:
+        """Let ``rate`` bytes per second pass on all links together; 0 for any number."""
+        if rate and self._pacer is not None:
+            self._pacer.change(rate)
+        elif rate or self._pacer is not None:
+            former, self._pacer = self._pacer, Pacer(rate) if rate else None
+            for link in self._links.values():
+                link.pace(self._pacer)
+            if former is not None:
+                former.close()
 
     # Taking away
 
@@ -138,7 +164,10 @@ class Endpoint:
             self._hub.unregister(link)
             self._stop_dialing(link)
             del self._links[link.spec.id]
-        return [carrier for link in links if (carrier := link.detach()) is not None]
+        carriers = [carrier for link in links if (carrier := link.detach()) is not None]
+        for link in links:
+            self._former_traffic = add_traffic(self._former_traffic, link.traffic)
+        return carriers
 
     async def _close_slots(self, slots: list[InterfaceSlot]) -> None:
         """Close interfaces, all at the same time; they are closed also if nobody waits for it any more."""
@@ -179,6 +208,7 @@ class Endpoint:
         link = self._links.get(spec.id)
         if link is None:
             link = self._links[spec.id] = Link(spec, self._hub.limits)
+            link.pace(self._pacer)
             if spec.dial:
                 self._dial(link)
             else:

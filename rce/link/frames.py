@@ -64,6 +64,8 @@ class FrameType(IntEnum):
     """Accepting end's answer: a text why not; it hangs up."""
     PING = 4
     PONG = 5
+    GRANT = 6
+    """How far the peer may send bulk: an offset of 8 bytes in the stream; see :mod:`rce.link.valve`."""
     OPEN = 8
     """The sender's interface is ready on this channel."""
     CLOSE = 9

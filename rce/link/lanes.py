@@ -49,6 +49,16 @@ class Lanes:
     def __bool__(self) -> bool:
         return bool(self._control or self._urgent or self._bulk)
 
+    @property
+    def control(self) -> bool:
+        """Whether frames of the link itself wait."""
+        return bool(self._control)
+
+    @property
+    def urgent(self) -> bool:
+        """Whether small messages wait."""
+        return bool(self._urgent)
+
     def add_control(self, frame: Frame) -> None:
         """Append a frame of the link itself.
 
@@ -80,8 +90,12 @@ class Lanes:
             self._begun_bytes -= begun
             self._control.append(encode(Frame(FrameType.ABORT, queue.channel)))
 
-    def next(self) -> Chunk | None:
-        """Return the next frame to write; none if nothing waits."""
+    def next(self, limit: int = FRAGMENT_SIZE) -> Chunk | None:
+        """Return the next frame to write; none if nothing waits.
+
+        Args:
+            limit: Most bytes of payload in a frame of the data lane.
+        """
         if self._control:
             return (self._control.popleft(),)
         while self._urgent and not (self._bulk and self._burst >= URGENT_BURST):
@@ -97,8 +111,8 @@ class Lanes:
                 self._enlist(queue)
                 continue
             self._burst = 0
-            return self._part(queue)
-        return self.next() if self._urgent else None
+            return self._part(queue, limit)
+        return self.next(limit) if self._urgent else None
 
     def _may_begin(self, queue: OutgoingQueue) -> bool:
         """Whether the peer accepts the next part of the queue; true for one queue of the lane at least."""
@@ -114,8 +128,8 @@ class Lanes:
         self._enlist(queue)
         return frame_chunk(frame)
 
-    def _part(self, queue: OutgoingQueue) -> Chunk:
-        frame, start, end = queue.take()
+    def _part(self, queue: OutgoingQueue, limit: int) -> Chunk:
+        frame, start, end = queue.take(limit)
         total = len(frame.payload)
         if start == 0 and end == total:
             chunk = frame_chunk(frame)

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rce.link.carrier import Carrier
     from rce.link.channel import Channel
     from rce.link.frames import Frame
+    from rce.link.pacing import Pacer
     from rce.link.settings import LinkLimits
 
 log = logging.getLogger(__name__)
@@ -34,6 +35,20 @@ class Link:
         self.carrier: Carrier | None = None
         self.peer_open: set[int] = set()
         self._channels: dict[int, Channel] = {}
+        self._pacer: Pacer | None = None
+        self._traffic = (0, 0)
+        """Of former carriers."""
+
+    @property
+    def traffic(self) -> tuple[int, int]:
+        """Bytes that came in and that went out, with headers."""
+        return self._traffic if self.carrier is None else add_traffic(self._traffic, self.carrier.traffic)
+
+    def pace(self, pacer: Pacer | None) -> None:
+        """Limit what passes; none for no limit."""
+        self._pacer = pacer
+        if self.carrier is not None:
+            self.carrier.pace(pacer)
 
     def add(self, channel: Channel) -> None:
         """Add a channel and open it if its interface has started."""
@@ -50,6 +65,7 @@ class Link:
         self.detach()
         log.debug("link %s to %s is up (%s)", self.spec.id, self.spec.peer, carrier.kind)
         self.carrier = carrier
+        carrier.pace(self._pacer)
         for channel in list(self._channels.values()):
             channel.open()
         carrier.start(self)
@@ -92,7 +108,13 @@ class Link:
             self._lose()
 
     def _lose(self) -> None:
+        self._traffic = self.traffic
         self.carrier = None
         self.peer_open.clear()
         for channel in list(self._channels.values()):
             channel.peer_closed()
+
+
+def add_traffic(one: tuple[int, int], other: tuple[int, int]) -> tuple[int, int]:
+    """Add bytes in and bytes out."""
+    return one[0] + other[0], one[1] + other[1]

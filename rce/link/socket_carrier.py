@@ -9,14 +9,24 @@ from typing import TYPE_CHECKING, TypeVar, cast
 
 from rce.link.carrier import Carrier, CarrierHandler
 from rce.link.exceptions import LinkLost, ProtocolError
-from rce.link.frames import FRAGMENT_SIZE, HANDSHAKE_SIZE, Frame, FrameReader, FrameType, encode
+from rce.link.frames import (
+    FRAGMENT_SIZE,
+    HANDSHAKE_SIZE,
+    HEADER_SIZE,
+    Frame,
+    FrameReader,
+    FrameType,
+    encode,
+)
 from rce.link.lanes import Lanes, frame_chunk
 from rce.link.settings import KIB, MIB
+from rce.link.valve import Valve
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rce.link.lanes import Chunk
+    from rce.link.pacing import Pacer
     from rce.link.queues import OutgoingQueue
     from rce.link.settings import LinkLimits, LinkTimeouts
 
@@ -37,6 +47,10 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
 
     Until :meth:`start` only small frames are accepted, and kept; :meth:`handshake_frame` returns the first of
     them.
+
+    Attributes:
+        sent: Bytes that went out, with headers and the handshake.
+        received: Bytes that came in, likewise.
     """
 
     def __init__(
@@ -57,6 +71,11 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         self._transport: asyncio.Transport | None = None
         self._kind = ""
         self._writable = False
+        self._straight = False
+        """Writable, and without a limit: what finds nothing waiting needs not to ask anybody."""
+        self._valve: Valve | None = None
+        self.sent = 0
+        self.received = 0
         self._handler: CarrierHandler | None = None
         self._early: list[Frame] = []
         self._first: asyncio.Future[None] = self._loop.create_future()
@@ -85,7 +104,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
     def greet(self, frame: bytes) -> None:
         """Send an encoded frame of the handshake."""
         if self._transport is not None and not self._ending:
-            self._transport.write(frame)
+            self._write((frame,))
 
     # Carrier
 
@@ -107,19 +126,30 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         else:
             self._dispatch(early)
 
+    def pace(self, pacer: Pacer | None) -> None:
+        """Limit what passes."""
+        if not self._ending and (pacer is not None or self._valve is not None):
+            self._use_valve().pace(pacer)
+            self._look_at_valve()
+
+    @property
+    def traffic(self) -> tuple[int, int]:
+        """Bytes that came in and that went out."""
+        return self.received, self.sent
+
     def control(self, frame: Frame) -> None:
         """Send a small frame of the link itself."""
         if self._ending or self._transport is None:
             return
-        if self._writable and not self._lanes:
-            self._transport.write(encode(frame))
+        if self._straight and not self._lanes:
+            self._write((encode(frame),))
             return
         try:
             self._lanes.add_control(frame)
         except ProtocolError as error:
             self.abort(error)
         else:
-            self._go_on()
+            self.go_on()
 
     def send(self, queue: OutgoingQueue, frame: Frame) -> None:
         """Send a message: at once where nothing waits, else in its lane."""
@@ -127,13 +157,14 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         if self._ending or transport is None:
             return
         size = len(frame.payload)
-        if self._writable and size <= FRAGMENT_SIZE and not self._lanes:
+        if self._straight and size <= FRAGMENT_SIZE and not self._lanes:
             queue.counters.count_out(size)
+            self.sent += HEADER_SIZE + size
             for buffer in frame_chunk(frame):
                 transport.write(buffer)
             return
         self._lanes.add(queue, frame)
-        self._go_on()
+        self.go_on()
 
     def withdraw(self, queue: OutgoingQueue, call_id: int) -> bool:
         """Take a call back that has not begun to be sent."""
@@ -142,7 +173,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
     def clear(self, queue: OutgoingQueue) -> None:
         """Throw away what waits on a channel."""
         self._lanes.clear(queue)
-        self._go_on()
+        self.go_on()
 
     def close(self) -> None:
         """Hang up after what lies in the socket's buffer was sent, or after the flush time."""
@@ -174,27 +205,33 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             if hasattr(socket, "TCP_NOTSENT_LOWAT"):
                 sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _NOT_SENT)
-        self._writable = True
+        self._writable = self._straight = True
         received, self._received = self._received, b""
         if received:
+            self.received = len(received)
             self._take(self._reader.feed, received)
 
     def get_buffer(self, sizehint: int) -> memoryview:  # noqa: ARG002 - the reader knows better
         """Return where the socket's next bytes go."""
-        return self._reader.get_buffer()
+        buffer = self._reader.get_buffer()
+        return buffer if self._valve is None else buffer[: self._valve.read_size]
 
     def buffer_updated(self, nbytes: int) -> None:
         """Take bytes of the socket."""
+        self.received += nbytes
         self._take(self._reader.advance, nbytes)
+        if self._valve is not None and not self._ending:
+            self._valve.count_received()
 
     def pause_writing(self) -> None:
         """Stop handing bytes to the transport."""
-        self._writable = False
+        self._writable = self._straight = False
 
     def resume_writing(self) -> None:
         """Go on handing bytes to the transport."""
         self._writable = True
-        self._go_on()
+        self._straight = self._valve is None
+        self.go_on()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Give everything up."""
@@ -205,7 +242,36 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         self._closed.set_result(None)
         self._on_closed(self)
 
+    # rce.link.valve.Stream
+
+    def go_on(self) -> None:
+        """Send what waits, as far as the socket takes it and the limits let it pass."""
+        if self._writable and self._turn is None:
+            self._pump()
+
+    def pause_reading(self) -> None:
+        """Leave what comes in the kernel's buffers."""
+        if self._transport is not None and not self._transport.is_closing():
+            self._transport.pause_reading()
+
+    def resume_reading(self) -> None:
+        """Read again."""
+        if self._transport is not None and not self._transport.is_closing():
+            self._transport.resume_reading()
+
     # Inside
+
+    def _use_valve(self) -> Valve:
+        if self._valve is None:
+            self._valve = Valve(self)
+            self._straight = False
+        return self._valve
+
+    def _look_at_valve(self) -> None:
+        """Do without the valve once nobody has a limit any more."""
+        if self._valve is not None and self._valve.open:
+            self._valve = None
+            self._straight = self._writable
 
     def _take(self, read: Callable[[T], list[Frame]], argument: T) -> None:
         self._heard = self._loop.time()
@@ -225,11 +291,21 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
                 self._keep(frame)
             elif frame.type is FrameType.PING:
                 self.control(Frame(FrameType.PONG))
+            elif frame.type is FrameType.GRANT:
+                self._take_grant(frame)
             elif frame.type is not FrameType.PONG:
                 try:
                     self._handler.frame_received(frame)
                 except ProtocolError as error:
                     self.abort(error)
+
+    def _take_grant(self, frame: Frame) -> None:
+        try:
+            self._use_valve().allow(frame.payload)
+        except ProtocolError as error:
+            self.abort(error)
+        else:
+            self._look_at_valve()
 
     def _keep(self, frame: Frame) -> None:
         if len(self._early) > self._limits.max_channels:
@@ -239,17 +315,12 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         if not self._first.done():
             self._first.set_result(None)
 
-    def _go_on(self) -> None:
-        if self._writable and self._turn is None:
-            self._pump()
-
     def _pump(self) -> None:
-        """Hand frames to the transport until its buffer is full enough."""
+        """Hand frames to the transport until its buffer is full enough, or a limit is reached."""
         self._turn = None
-        assert self._transport is not None
         budget = _TURN
-        while self._writable and not self._ending:
-            chunk = self._lanes.next()
+        while self._lanes and self._writable and not self._ending:
+            chunk = self._lanes.next() if self._valve is None else self._next_through(self._valve)
             if chunk is None:
                 return
             budget -= self._write(chunk)
@@ -257,25 +328,37 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
                 self._turn = self._loop.call_soon(self._pump)
                 return
 
+    def _next_through(self, valve: Valve) -> Chunk | None:
+        """Return what may be sent next, paid for. Frames of the link itself, which keep it alive, never wait."""
+        urgent = self._lanes.control or self._lanes.urgent
+        limit = FRAGMENT_SIZE if self._lanes.control else valve.room(urgent=urgent)
+        chunk = self._lanes.next(limit) if limit else None
+        if chunk is not None:
+            valve.count_sent(sum(map(len, chunk)), urgent=urgent)
+        return chunk
+
     def _write(self, chunk: Chunk) -> int:
         assert self._transport is not None
         size = 0
         for buffer in chunk:
             size += len(buffer)
             self._transport.write(buffer)
+        self.sent += size
         return size
 
     def _heartbeat(self) -> None:
         """Ask a silent peer whether it lives; give a peer up that was silent for too long."""
         now = self._loop.time()
-        if now - self._beat > 2 * self._timeouts.heartbeat:
-            self._heard = now  # the first beat, or this process stood still: that is not the peer's silence
+        stood_still = now - self._beat > 2 * self._timeouts.heartbeat  # or this is the first beat
+        paused = self._valve is not None and self._valve.paused
+        if stood_still or paused:
+            self._heard = now  # nothing was read: that is not the peer's silence
         self._beat = now
         silent = now - self._heard
         if silent >= self._timeouts.silence:
             self.abort(LinkLost(f"the peer was silent for {silent:.1f} s"))
             return
-        if silent >= self._timeouts.heartbeat / 2:
+        if silent >= self._timeouts.heartbeat / 2 or paused:
             self.control(Frame(FrameType.PING))
         self._timer = self._loop.call_later(self._timeouts.heartbeat, self._heartbeat)
 
@@ -283,7 +366,9 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         """Stop using the socket; the first reason counts."""
         if not self._ending:
             self._ending = True
-            self._writable = False
+            self._writable = self._straight = False
+            if self._valve is not None:
+                self._valve.close()
             self._reason = reason
             if self._turn is not None:
                 self._turn.cancel()

@@ -132,6 +132,7 @@ class Party:
             ),
             links=old.links if links is None else tuple(links),
             connections=old.connections if connections is None else tuple(connections),
+            resources=old.resources,
         )
         await self.endpoint.apply(self.spec)
 
