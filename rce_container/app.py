@@ -7,6 +7,7 @@ import compileall
 import contextlib
 import errno
 import logging
+import math
 import os
 import signal
 from collections.abc import Callable, Sequence
@@ -20,12 +21,14 @@ from rce.config.folders import default_state_dir, run_dir
 from rce.config.resources import examples_dir
 from rce.config.secret import Secret
 from rce.control.channel import TaskSetChannel
+from rce.control.limits import MEMORY_PER_SLOT
 from rce.control.messages import MachineInfo
 from rce.link.address import in_url, is_any, own_address
 from rce.link.handover import Doorman
 from rce.ros.packages import PackageIndex, installed_shares
 from rce_container.exceptions import RuntimeUnavailableError
 from rce_container.folder import StateFolder
+from rce_container.limits import Limiter, choose_limiter
 from rce_container.manager import Manager
 from rce_container.runtimes.base import Runtime, source_root
 from rce_container.runtimes.namespace import NamespaceRuntime
@@ -78,16 +81,19 @@ class App:
             async with contextlib.AsyncExitStack() as stack:
                 stack.push_async_callback(doorman.close)
                 port = await _listen(doorman, self.host, self.link_port)
+                limiter = await asyncio.to_thread(choose_limiter, state.token, state.cgroups)
+                stack.callback(limiter.close)
                 reach = own_address(self.master, self.control_port) if is_any(self.host) else self.host
                 manager = Manager(
                     name=name,
-                    info=_machine(self.settings, runtime.name, detail),
+                    info=_machine(self.settings, runtime.name, limiter, detail),
                     settings=self.settings,
                     runtimes=runtimes,
                     runtime=runtime,
                     state=state,
                     doorman=doorman,
                     links=(reach, port),
+                    limiter=limiter,
                 )
                 await self._manage(manager, lambda: ready(name, runtime.name))
 
@@ -174,14 +180,23 @@ def _quit_by_signal(manager: Manager) -> asyncio.Event:
     return quit_
 
 
-def _machine(settings: ContainerSettings, runtime: str, detail: str) -> MachineInfo:
+def _machine(settings: ContainerSettings, runtime: str, limiter: Limiter, detail: str) -> MachineInfo:
+    memory = psutil.virtual_memory().total
+    cores = os.cpu_count() or 0
+    ceiling = limiter.ceiling()
+    if ceiling.memory:
+        memory = min(memory, ceiling.memory)
+    if ceiling.cpu:
+        cores = min(cores, math.ceil(ceiling.cpu))
     return MachineInfo(
         name=settings.machine,
-        cores=os.cpu_count() or 0,
-        memory=psutil.virtual_memory().total,
+        cores=cores,
+        memory=memory,
         runtime=runtime,
         labels=settings.labels,
-        detail=detail,
+        slots=settings.slots or memory // MEMORY_PER_SLOT,
+        limits=limiter.name,
+        detail="; ".join(filter(None, (detail, limiter.detail))),
     )
 
 

@@ -36,15 +36,18 @@ from rce_container.environment.process import strike_all
 from rce_container.exceptions import ContainerError, NetworkError, StartError, StateError
 from rce_container.folder import ContainerFolder, Record
 from rce_container.life import Phase
+from rce_container.limits import Cell, limits_of
+from rce_container.limits.warden import Warden
 from rce_container.logs import read_log
 from rce_container.network import Networks
 from rce_container.runtimes.base import Handle, Order
 from rce_container.unit import Office, Unit
-from rce_container.usage import UsageMeter
+from rce_container.usage import Subject, UsageMeter
 
 if TYPE_CHECKING:
     from rce.link.handover import Doorman
     from rce_container.folder import StateFolder
+    from rce_container.limits import Limiter
     from rce_container.runtimes.base import Runtime
     from rce_container.settings import ContainerSettings
 
@@ -68,6 +71,7 @@ class Manager:
         state: Where everything is kept.
         doorman: Accepts links by TCP.
         links: Host and port where it does.
+        limiter: Enforces the containers' limits.
 
     Attributes:
         send: Sends a message to the master, or drops it while there is none.
@@ -84,6 +88,7 @@ class Manager:
         state: StateFolder,
         doorman: Doorman,
         links: tuple[str, int],
+        limiter: Limiter,
     ) -> None:
         self._name = name
         self._info = info
@@ -92,6 +97,7 @@ class Manager:
         self._runtime = runtime
         self._state = state
         self._links = links
+        self._limiter = limiter
         self.send: Callable[[ToMaster], None] = lambda _: None
         self._core = core.ManagerCore()
         self._networks = Networks()
@@ -166,8 +172,10 @@ class Manager:
             unit.kill()
 
     async def _deal_with_the_past(self) -> None:
+        folders = list(self._state.existing())
+        await self._sweep_cells({folder.mark for folder in folders})
         async with asyncio.TaskGroup() as tasks:
-            for folder in self._state.existing():
+            for folder in folders:
                 tasks.create_task(self._adopt_or_prune(folder))
 
     async def _adopt_or_prune(self, folder: ContainerFolder) -> None:
@@ -182,7 +190,9 @@ class Manager:
                 self._networks.adopt(EndpointId.parse(record.id), record, folder.hosts)
             except NetworkError as error:
                 log.warning("container %s has lost its group: %s", record.id, error)
-        unit = self._own(record.id, folder, runtime.adopt(process, record), isolated=runtime.isolated)
+        handle = runtime.adopt(process, record)
+        cell = self._limiter.adopt(folder.mark)
+        unit = self._own(record.id, folder, handle, cell, isolated=runtime.isolated)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._settings.adopt_timeout):
                 await unit.reported.wait()
@@ -206,7 +216,24 @@ class Manager:
             finally:
                 channel.close()
         await strike_all(folder.mark)
+        await self._remove_cell(folder.mark)
         await asyncio.to_thread(folder.remove)
+
+    async def _sweep_cells(self, keep: set[str]) -> None:
+        """Remove the cells of containers of which nothing else is left."""
+        try:
+            await asyncio.to_thread(self._limiter.sweep, keep)
+        except (ContainerError, OSError) as error:
+            log.error("what earlier containers left cannot be removed: %s", error)  # noqa: TRY400
+
+    async def _remove_cell(self, mark: str) -> None:
+        """Remove a cell with all that is in it."""
+        cell = self._limiter.adopt(mark)
+        try:
+            await asyncio.to_thread(cell.kill)
+            await asyncio.to_thread(cell.remove)
+        except ContainerError as error:
+            log.error("a container that did not start: %s", error)  # noqa: TRY400 - its text says it all
 
     # What the core decides
 
@@ -248,13 +275,16 @@ class Manager:
             return
         try:
             runtime = self._runtime_for(id_)
-            handle = self._launch(id_, folder, runtime)
+            limits = limits_of(self._core.resources(id_), self._settings)
+            cell = self._limiter.create(folder.mark, limits)
+            handle = self._launch(id_, folder, runtime, cell)
         except ContainerError as error:
+            self._tasks.create_task(self._remove_cell(folder.mark), name=f"cell of {id_}")
             self._tasks.create_task(self._networks.detach(folder.mark), name=f"network of {id_}")
             folder.remove()
             self._feed(events.Lost(id_, "", str(error)))
             return
-        unit = self._own(id_, folder, handle, isolated=runtime.isolated)
+        unit = self._own(id_, folder, handle, cell, isolated=runtime.isolated)
         self._starting.add(unit)
         self._tasks.create_task(self._await_start(unit), name=f"start of {id_}")
         self._feed(events.Made(id_, folder.mark, self._address(folder)))
@@ -282,7 +312,7 @@ class Manager:
             raise StartError(f"the runtime {runtime.name} has no networks of groups")
         return runtime
 
-    def _launch(self, id_: str, folder: ContainerFolder, runtime: Runtime) -> Handle:
+    def _launch(self, id_: str, folder: ContainerFolder, runtime: Runtime, cell: Cell) -> Handle:
         settings = self._settings
         resources = self._core.resources(id_)
         container = EndpointId.parse(id_)
@@ -314,6 +344,7 @@ class Manager:
                 settings.packages,
                 control.fileno(),
                 links.fileno(),
+                join=cell.join,
                 host_network=host_network,
                 switch=seat.path if seat else "",
                 image=resources.image,
@@ -336,8 +367,9 @@ class Manager:
             raise
         return handle
 
-    def _own(self, id_: str, folder: ContainerFolder, handle: Handle, *, isolated: bool) -> Unit:
-        unit = Unit(id_, folder, handle, self._office, isolated=isolated)
+    def _own(self, id_: str, folder: ContainerFolder, handle: Handle, cell: Cell, *, isolated: bool) -> Unit:
+        warden = Warden(EndpointId.parse(id_).tag, cell, self._settings)
+        unit = Unit(id_, folder, handle, warden, self._office, isolated=isolated)
         self._units[unit.mark] = unit
         self._tasks.create_task(self._run_unit(unit), name=f"container {id_}")
         return unit
@@ -373,7 +405,10 @@ class Manager:
             await asyncio.sleep(self._settings.usage_interval)
             for unit in self._units.values():
                 unit.poll()
-            wanted = {u.id: (u.handle, u.counters) for u in self._units.values()}
+            wanted = {
+                unit.id: Subject(unit.handle, unit.warden.cell, unit.node_pids, unit.counters)
+                for unit in self._units.values()
+            }
             usage = await asyncio.to_thread(self._meter.measure, wanted)
             times = self._process.cpu_times()
             memory = self._process.memory_info().rss

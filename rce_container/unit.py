@@ -20,8 +20,9 @@ from rce_container.environment import messages as m
 from rce_container.environment import proc
 from rce_container.environment.channel import Channel, connect
 from rce_container.environment.exceptions import ChannelError
-from rce_container.exceptions import KillError, NetworkError, StartError, StateError
+from rce_container.exceptions import KillError, LimitError, NetworkError, StartError, StateError
 from rce_container.folder import ContainerFolder
+from rce_container.limits.warden import Warden
 from rce_container.logs import read_log
 from rce_container.network import Networks
 from rce_container.runtimes.base import Handle
@@ -53,6 +54,7 @@ class Unit:
         id: The container.
         folder: Belongs to this life.
         handle: Its outermost process.
+        warden: Looks after its cell.
         office: What all lives share.
         isolated: Whether pids that the environment reports are those of a namespace of its own.
     """
@@ -62,6 +64,7 @@ class Unit:
         id: str,  # noqa: A002 - what it is
         folder: ContainerFolder,
         handle: Handle,
+        warden: Warden,
         office: Office,
         *,
         isolated: bool,
@@ -69,6 +72,7 @@ class Unit:
         self.id = id
         self.folder = folder
         self.handle = handle
+        self.warden = warden
         self.counters: dict[str, InterfaceUsage] = {}
         """The interfaces' counters, as the environment said last."""
         self.status: EndpointStatus | None = None
@@ -91,6 +95,11 @@ class Unit:
         """Names this life."""
         return self.folder.mark
 
+    @property
+    def node_pids(self) -> dict[str, int]:
+        """The pids of the nodes' first processes, as the machine sees them, by tag."""
+        return {node.tag: node.pid for node in self.status.nodes} if self.status is not None else {}
+
     def apply(self, spec: EndpointSpec) -> None:
         """Give the environment what is desired."""
         self._spec = spec
@@ -98,11 +107,15 @@ class Unit:
             self._channel.send(m.encode(m.Apply(spec=spec)))
         if self._sender is not None:
             self._errands.spawn(self._route(self._sender, spec), f"links of {self.id}")
+            self._errands.spawn(self._resize(spec), f"limits of {self.id}")
 
     def poll(self) -> None:
-        """Ask for new :attr:`counters`."""
-        if self._channel is not None:
-            self._channel.send(m.encode(m.Poll()))
+        """Ask for new :attr:`counters`, and tell of limits that struck."""
+        if self._channel is None or self._stopping:
+            return
+        self._channel.send(m.encode(m.Poll()))
+        for text in self.warden.review():
+            self._office.feed(events.Faulted(self.id, self.mark, text))
 
     def stop(self) -> None:
         """Tell the environment to end; if it does not, it is killed."""
@@ -121,6 +134,7 @@ class Unit:
         try:
             reason = await self._live()
             if not self._stopping:
+                reason = self.warden.claim_all() or reason
                 reason += await asyncio.to_thread(self._last_words)
                 log.warning("container %s: %s", self.id, reason)
             self._office.feed(events.Lost(self.id, self.mark, reason))
@@ -201,6 +215,8 @@ class Unit:
                     self._office.feed(events.Faulted(self.id, self.mark, text))
                 case m.Counters(interfaces=interfaces):
                     self.counters = interfaces
+                case m.Killed(request=number):
+                    channel.send(m.encode(m.Cause(request=number, text=self.warden.claim())))
                 case m.Dial() as request:
                     self._errands.spawn(self._dial(channel, request), f"dial for {self.id}")
 
@@ -227,6 +243,10 @@ class Unit:
         if self._deadline is not None:
             loop = asyncio.get_running_loop()
             self._deadline.reschedule(None if seconds is None else loop.time() + seconds)
+
+    async def _resize(self, spec: EndpointSpec) -> None:
+        if text := await self.warden.apply(spec.resources):
+            self._office.feed(events.Faulted(self.id, self.mark, text))
 
     # Links
 
@@ -270,8 +290,13 @@ class Unit:
             async with asyncio.timeout(patience):
                 await self.handle.wait()
         try:
+            await self.warden.end()
             await self.handle.kill()
         except KillError as error:
             log.error("container %s: %s", self.id, error)  # noqa: TRY400 - its text says it all
         await self._office.networks.detach(self.mark)
         await asyncio.to_thread(self.folder.remove)
+        try:
+            await self.warden.remove()
+        except LimitError as error:
+            log.error("container %s: %s", self.id, error)  # noqa: TRY400 - its text says it all

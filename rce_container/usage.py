@@ -1,56 +1,136 @@
-"""What containers consume, read from ``/proc``."""
+"""What containers and their nodes consume: from their cells' counters, else from ``/proc``."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
 
-from rce.control.model import EndpointUsage, InterfaceUsage
+from rce.control.model import EndpointUsage, InterfaceUsage, NodeUsage
 from rce_container.environment import proc
+from rce_container.limits import Cell
 from rce_container.runtimes.base import Handle
 
 _PSS_EVERY = 5
 """A process's share of memory costs time to read, so it is read anew in every fifth measurement only."""
 
 
+class Subject(NamedTuple):
+    """A container that is to be measured."""
+
+    handle: Handle
+    cell: Cell
+    nodes: Mapping[str, int]
+    """The pid of each node's first process, as the machine sees it, by tag."""
+    interfaces: Mapping[str, InterfaceUsage]
+
+
 class UsageMeter:
-    """Measures containers, each by its processes."""
+    """Measures containers. The machine's processes are listed only if some container has no counting cell."""
 
     def __init__(self) -> None:
         self._shares: dict[tuple[int, int], int] = {}
+        self._fresh: dict[tuple[int, int], int] = {}
+        self._table: dict[int, proc.Process] | None = None
         self._round = 0
 
-    def measure(
-        self, containers: Mapping[str, tuple[Handle, Mapping[str, InterfaceUsage]]]
-    ) -> dict[str, EndpointUsage]:
-        """Measure all containers.
+    def measure(self, containers: Mapping[str, Subject]) -> dict[str, EndpointUsage]:
+        """Measure all containers. Blocks.
 
         Args:
-            containers: Processes and counters of the interfaces, by id.
+            containers: By id.
 
         Returns:
-            The usage by id. Memory is the proportional share (PSS), or the resident size where that may not
-            be read.
+            The usage by id. A node's memory is its proportional share (PSS), or the resident size where that
+            may not be read; so is the container's, if its cell does not count.
         """
         self._round += 1
-        processes = proc.table()
-        shares: dict[tuple[int, int], int] = {}
-        usage = {}
-        for id_, (handle, counters) in containers.items():
-            own = handle.members(processes)
-            for process in own:
-                shares[process.pid, process.start] = self._share(process)
-            usage[id_] = EndpointUsage(
-                interfaces=dict(counters),
-                cpu_s=round(sum(process.cpu_s for process in own), 3),
-                memory=sum(shares[process.pid, process.start] for process in own),
-                processes=len(own),
-            )
-        self._shares = shares
+        self._table, self._fresh = None, {}
+        usage = {id_: self._measure(subject) for id_, subject in containers.items()}
+        self._table, self._shares = None, self._fresh
         return usage
 
+    def _measure(self, subject: Subject) -> EndpointUsage:
+        cell = subject.cell
+        own = self._processes(subject)
+        counted = cell.usage()
+        cpu_s, memory = counted.cpu_s, counted.memory
+        if cpu_s is None:
+            cpu_s = sum(process.cpu_s for process in own)
+        if memory is None:
+            memory = sum(map(self._share, own))
+        return EndpointUsage(
+            interfaces=dict(subject.interfaces),
+            nodes=self._measure_nodes(subject.nodes, own),
+            cpu_s=round(cpu_s, 3),
+            throttled_s=round(counted.throttled_s, 3),
+            memory=memory,
+            memory_peak=counted.memory_peak,
+            memory_limit=0 if counted.memory is None else cell.limits.memory,
+            cpu_limit=cell.limits.cpu,
+            oom_kills=cell.troubles().oom_kills,
+            io_read=counted.io_read,
+            io_written=counted.io_written,
+            link_in=sum(one.bytes_in for one in subject.interfaces.values()),
+            link_out=sum(one.bytes_out for one in subject.interfaces.values()),
+            processes=len(own),
+        )
+
+    def _processes(self, subject: Subject) -> list[proc.Process]:
+        if pids := subject.cell.pids():
+            return [process for pid in pids if (process := proc.read(pid)) is not None]
+        if self._table is None:
+            self._table = proc.table()
+        return subject.handle.members(self._table)
+
+    def _measure_nodes(self, nodes: Mapping[str, int], own: Iterable[proc.Process]) -> dict[str, NodeUsage]:
+        own = list(own)
+        owners = sort_out(nodes, own)
+        found: dict[str, list[proc.Process]] = {tag: [] for tag in nodes}
+        for process in own:
+            if (tag := owners.get(process.pid)) is not None:
+                found[tag].append(process)
+        return {
+            tag: NodeUsage(
+                cpu_s=round(sum(process.cpu_s for process in processes), 3),
+                memory=sum(map(self._share, processes)),
+                processes=len(processes),
+            )
+            for tag, processes in found.items()
+        }
+
     def _share(self, process: proc.Process) -> int:
-        known = self._shares.get((process.pid, process.start))
-        if known is not None and (process.pid + self._round) % _PSS_EVERY:
-            return known
-        share = proc.proportional(process.pid)
-        return process.resident if share is None else share
+        """A process's proportional share of memory, not always of this round."""
+        key = process.pid, process.start
+        if key not in self._fresh:
+            share = self._shares.get(key)
+            if share is None or not (process.pid + self._round) % _PSS_EVERY:
+                share = proc.proportional(process.pid)
+            self._fresh[key] = process.resident if share is None else share
+        return self._fresh[key]
+
+
+def sort_out(nodes: Mapping[str, int], processes: Iterable[proc.Process]) -> dict[int, str]:
+    """Find out which processes belong to which node.
+
+    A node is a session of its own; what it started belongs to it even if that made another session, as long
+    as a process that belongs to the node is its parent.
+
+    Args:
+        nodes: The pid of each node's first process, by tag.
+        processes: All of the container.
+
+    Returns:
+        Tags by pid; without the processes that belong to no node.
+    """
+    leaders = {pid: tag for tag, pid in nodes.items() if pid}
+    known = {process.pid: process for process in processes}
+    owners = {pid: leaders[process.session] for pid, process in known.items() if process.session in leaders}
+    for process in known.values():
+        way: list[int] = []
+        ancestor: proc.Process | None = process
+        while ancestor is not None and ancestor.pid not in owners and ancestor.pid not in way:
+            way.append(ancestor.pid)
+            ancestor = known.get(ancestor.parent)
+        if ancestor is not None and ancestor.pid in owners:
+            owners.update(dict.fromkeys(way, owners[ancestor.pid]))
+    return owners

@@ -40,6 +40,7 @@ from rce.link.handover import Doorman
 from rce.protocol.names import EndpointId
 from rce_container.environment import proc
 from rce_container.folder import StateFolder
+from rce_container.limits import choose_limiter
 from rce_container.manager import Manager
 from rce_container.runtimes.base import Runtime
 from rce_container.runtimes.namespace import NamespaceRuntime
@@ -134,6 +135,8 @@ class Machine:
         self.manager: Manager
         self.marks: set[str] = set()
         self.pids: dict[int, int] = {}
+        self.cgroups = folder / "none"
+        """The file that says where the cgroups of this machine's containers are."""
 
     @contextlib.asynccontextmanager
     async def managed(self, **options: Any) -> AsyncIterator[Manager]:
@@ -145,7 +148,11 @@ class Machine:
         )
         doorman = Doorman()
         port = await doorman.listen("127.0.0.1", 0)
-        with StateFolder(self.folder / "state", self.folder / "run") as state:
+        with (
+            StateFolder(self.folder / "state", self.folder / "run") as state,
+            contextlib.closing(choose_limiter(state.token, state.cgroups)) as limiter,
+        ):
+            self.cgroups = state.cgroups
             self.manager = Manager(
                 name=state.name(""),
                 info=MachineInfo(name=MACHINE),
@@ -155,6 +162,7 @@ class Machine:
                 state=state,
                 doorman=doorman,
                 links=("127.0.0.1", port),
+                limiter=limiter,
             )
             self.manager.send = self._tell
             ready, self.quit = asyncio.Event(), asyncio.Event()
@@ -280,12 +288,18 @@ class Machine:
         folder = self.folder / "state" / "containers"
         return list(folder.iterdir()) if folder.is_dir() else []
 
+    def cells(self) -> list[Path]:
+        """The cgroups of this machine's containers."""
+        parents = map(Path, self.cgroups.read_text().splitlines()) if self.cgroups.exists() else ()
+        return [cell for parent in parents if parent.is_dir() for cell in parent.iterdir() if cell.is_dir()]
+
     def left(self) -> list[str]:
         """All that containers left on the machine."""
         found = [f"process {pid}" for pid, start in self.pids.items() if proc.alive(pid, start)]
         found += [f"process {one.pid}" for one in self.processes()]
         found += [f"process {one.pid}" for mark in self.marks for one in proc.marked(mark)]
         found += map(str, self.containers)
+        found += map(str, self.cells())
         found += [str(path) for path in (self.folder / "run").rglob("*") if path.is_socket()]
         found += [line for line in Path("/proc/mounts").read_text().splitlines() if str(self.folder) in line]
         return found
