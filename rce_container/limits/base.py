@@ -94,11 +94,6 @@ class Cell(ABC):
 
     @property
     @abstractmethod
-    def leave(self) -> tuple[str, ...]:
-        """Files into which a process of the cell writes its pid to get out again."""
-
-    @property
-    @abstractmethod
     def rlimits(self) -> Mapping[int, int]:
         """What the container's own processes must limit by :func:`resource.setrlimit`, each for itself."""
 

@@ -39,12 +39,10 @@ class CgroupCell(Cell):
 
     Args:
         folders: Those that exist; none for a container without.
-        exits: The cgroups into which a process leaves.
     """
 
-    def __init__(self, folders: Sequence[Path], exits: Sequence[Path] = ()) -> None:
+    def __init__(self, folders: Sequence[Path]) -> None:
         self._folders = tuple(folders)
-        self._exits = tuple(exits)
         self._files: dict[str, Path] = {}
         self.limits = self._read_limits() if folders else Limits()
 
@@ -52,11 +50,6 @@ class CgroupCell(Cell):
     def join(self) -> tuple[str, ...]:
         """One file for each folder."""
         return tuple(str(folder / files.PROCS) for folder in self._folders)
-
-    @property
-    def leave(self) -> tuple[str, ...]:
-        """One file for each folder, in the same order."""
-        return tuple(str(folder / files.PROCS) for folder in self._exits)
 
     @property
     def rlimits(self) -> Mapping[int, int]:
@@ -186,7 +179,6 @@ class CgroupLimiter(Limiter):
         self._bases: tuple[Path, ...] = ()
         """In each hierarchy, the cgroup below which everything is made."""
         self._mounts: tuple[Path, ...] = ()
-        self._exits: tuple[Path, ...] = ()
         self._missing: frozenset[str] = frozenset()
 
     @property
@@ -204,7 +196,7 @@ class CgroupLimiter(Limiter):
                 with contextlib.suppress(OSError):
                     files.drop(folder)
             raise LimitError(f"its cgroup cannot be made: {error}") from error
-        cell = self.cell(folders, self._exits)
+        cell = self.cell(folders)
         try:
             cell.apply(limits)
         except LimitError:
@@ -215,7 +207,7 @@ class CgroupLimiter(Limiter):
     def adopt(self, mark: str) -> Cell:
         """Find its folders, also where an earlier manager made them."""
         folders = [parent / mark for parent in self._all_parents()]
-        return self.cell([folder for folder in folders if folder.is_dir()], self._exits)
+        return self.cell([folder for folder in folders if folder.is_dir()])
 
     def sweep(self, keep: Collection[str]) -> None:
         """Look where this and earlier managers made cells."""

@@ -105,7 +105,7 @@ class Cgroup1(CgroupLimiter):
                 continue
             places[place.folder] = place
             working.add(controller)
-        self._bases = self._exits = tuple(places)
+        self._bases = tuple(places)
         self._mounts = tuple(place.mount for place in places.values())
         self._missing = frozenset(CONTROLLERS[name] for name in CONTROLLERS.keys() - working) - {""}
         if not working & {"memory", "pids", "cpu"}:

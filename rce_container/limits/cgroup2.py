@@ -107,7 +107,6 @@ class Cgroup2(CgroupLimiter):
             (base / self._folder).rmdir()
             raise LimitsUnavailableError(f"no process may be moved within the cgroup {base}; {_HINT}")
         self._bases, self._mounts = (base,), (place.mount,)
-        self._exits = (base / ENGINE if (base / ENGINE).is_dir() else base,)
         self._missing = frozenset(CONTROLLERS[name] for name in CONTROLLERS.keys() - set(wanted))
         if self._missing:
             self.detail = (

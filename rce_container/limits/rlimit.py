@@ -40,11 +40,6 @@ class RlimitCell(Cell):
         return ()
 
     @property
-    def leave(self) -> tuple[str, ...]:
-        """There is nothing to leave."""
-        return ()
-
-    @property
     def rlimits(self) -> Mapping[int, int]:
         """All that there is."""
         return rlimits_of(self.limits)

@@ -28,13 +28,17 @@ from rce_container.folder import ContainerFolder, Record
 
 SHELL = "/bin/sh"
 
+# When all has ended, the shim leaves the container's cgroups BASE/TASK_SET/MARK, each for the one in which the
+# engine is (see rce_container.limits.cgroup2), and removes them: there may be no manager any more to do it.
 _SHIM = """
 trap : HUP INT TERM
-folder=$1 run=$2 linger=$3 python=$4 sweeper=$5 mark=$6 switch=$7 joined=1
+folder=$1 run=$2 linger=$3 python=$4 sweeper=$5 mark=$6 switch=$7 joined=1 cells=
 shift 7
 [ -z "$switch" ] || exec 9<"$switch"
 while [ "$1" != -- ]; do
     echo $$ >"$1" || joined=
+    cells="$cells${1%/*}
+"
     shift
 done
 shift
@@ -43,6 +47,14 @@ exec 0</dev/null 1>&2
 [ "$linger" = 0 ] || sleep "$linger"
 [ -z "$sweeper" ] || "$python" -SE "$sweeper" "$mark"
 rm -rf -- "$run" "$folder" 2>/dev/null || { chmod -R u+rwx -- "$folder"; rm -rf -- "$folder"; }
+set -f
+IFS='
+'
+for cell in $cells; do
+    base=${cell%/*/*}
+    echo $$ >"$base/rce-engine/cgroup.procs" || echo $$ >"$base/cgroup.procs"
+    rmdir "$cell" "${cell%/*}"
+done 2>/dev/null
 """
 _KILL_PAUSE_S = 0.01
 _KILL_TIMEOUT_S = 10.0

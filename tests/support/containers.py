@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import signal
 import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
@@ -279,9 +280,15 @@ class Machine:
         """Kill what a failed test left, and collect the exit codes that a dead manager did not."""
         for process in self.processes():
             proc.kill(process)
+        for cell in self.cells():
+            for pid in (cell / "cgroup.procs").read_text().split():
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(int(pid), signal.SIGKILL)
         for pid in self.pids:
             with contextlib.suppress(ChildProcessError):
                 os.waitpid(pid, 0)
+        for folder in [*self.cells(), *self.cell_parents()]:
+            folder.rmdir()
 
     @property
     def containers(self) -> list[Path]:
@@ -290,8 +297,11 @@ class Machine:
 
     def cells(self) -> list[Path]:
         """The cgroups of this machine's containers."""
-        parents = map(Path, self.cgroups.read_text().splitlines()) if self.cgroups.exists() else ()
-        return [cell for parent in parents if parent.is_dir() for cell in parent.iterdir() if cell.is_dir()]
+        return [cell for parent in self.cell_parents() for cell in parent.iterdir() if cell.is_dir()]
+
+    def cell_parents(self) -> list[Path]:
+        lines = self.cgroups.read_text().splitlines() if self.cgroups.exists() else ()
+        return [parent for parent in map(Path, lines) if parent.is_dir()]
 
     def left(self) -> list[str]:
         """All that containers left on the machine."""
