@@ -12,7 +12,7 @@ from rce.bundles.versions import newest, split_package
 from rce.control.model import BundleSpec
 from rce.protocol.names import is_name, is_version
 from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
-from rce_master.state.records import Bundle, Container, PackageKey, bundle_key, package_key_key
+from rce_master.state.records import Bundle, Container, bundle_key, package_key_key
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -30,10 +30,10 @@ def build_spec(tables: Tables, id_: str) -> EndpointSpec:
         links=tuple(_link_spec(tables, link, id_) for link in links),
         connections=tuple(spec for link in links for spec in _connection_specs(link, id_)),
     )
-    return _with_contents(common, endpoint) if isinstance(endpoint, Container) else common
+    return _with_contents(tables, common, endpoint) if isinstance(endpoint, Container) else common
 
 
-def _with_contents(spec: EndpointSpec, container: Container) -> EndpointSpec:
+def _with_contents(tables: Tables, spec: EndpointSpec, container: Container) -> EndpointSpec:
     return EndpointSpec(
         id=spec.id,
         kind=spec.kind,
