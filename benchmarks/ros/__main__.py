@@ -24,7 +24,7 @@ PORT = 21311
 @contextlib.contextmanager
 def our_master(port: int) -> Iterator[str]:
     """Our core as the program that users run."""
-    argv = [str(Path(sys.executable).parent / "rce"), "core", "--port", str(port)]
+    argv = [str(Path(sys.executable).parent / "rce"), "core", "--port", str(port), "--no-log"]
     process = subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, start_new_session=True)
     assert process.stdout is not None
     try:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import signal
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -11,6 +13,7 @@ import uvloop
 
 from rce.ros.core import Core
 from rce.ros.core.server import DEFAULT_PORT
+from rce.ros.logfiles import log_folder
 
 GOODBYE_S = 0.1
 """How long a core that was told to end goes on, so that whoever told it gets an answer."""
@@ -22,15 +25,24 @@ def core(
     advertised: Annotated[
         str, typer.Option(help="Host name that nodes are told; default: the bound address.")
     ] = "",
+    log_dir: Annotated[
+        Path | None,
+        typer.Option(
+            file_okay=False,
+            help="Where to keep RUN_ID/rosout.log; default: ROS_LOG_DIR, or log in ROS_HOME or ~/.ros.",
+        ),
+    ] = None,
+    log: Annotated[bool, typer.Option(help="Write rosout.log.")] = True,
 ) -> None:
     """Run a ROS core: what roscore is, for nodes of any kind."""
     try:
-        uvloop.run(_serve(bind, port, advertised or None))
+        folder = (log_dir or log_folder(os.environ)) if log else None
+        uvloop.run(_serve(bind, port, advertised or None, folder))
     except OSError as error:
         raise typer.BadParameter(f"cannot listen on {bind}:{port}: {error.strerror or error}") from error
 
 
-async def _serve(bind: str, port: int, advertised: str | None) -> None:
+async def _serve(bind: str, port: int, advertised: str | None, folder: Path | None) -> None:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -40,6 +52,8 @@ async def _serve(bind: str, port: int, advertised: str | None) -> None:
         typer.echo(f"rce core ends: {reason}")
         loop.call_later(GOODBYE_S, stop.set)
 
-    async with Core(bind, port, advertised=advertised, rosout=True, on_shutdown=told) as running:
+    async with Core(
+        bind, port, advertised=advertised, rosout=True, log_folder=folder, on_shutdown=told
+    ) as running:
         typer.echo(f"rce core ready: ROS_MASTER_URI={running.uri}")
         await stop.wait()

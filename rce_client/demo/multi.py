@@ -102,7 +102,7 @@ def _machine_of(site: Site) -> Machine:
 async def _start_cores(network: Network, children: Children) -> None:
     cores: list[Program] = []
     for site in network.sites:
-        argv = [*RCE, "core", "--port", str(site.core_port), "--bind", site.address]
+        argv = [*RCE, "core", "--port", str(site.core_port), "--bind", site.address, "--no-log"]
         cores.append(await _machine_of(site).start(children, f"core-{site.name}", argv, needed=True))
     for core in cores:
         await children.wait_line(core, "rce core ready:", START_TIMEOUT)

@@ -52,14 +52,14 @@ class SingleMaster:
 
     async def _start_core(self, children: Children) -> None:
         play, port = self._play, str(self._play.ports.core)
+        home = play.folder / "ros"
+        env = {"ROS_HOME": str(home), "ROS_LOG_DIR": str(home / "log"), "ROS_IP": LOOPBACK}
         if play.core is CoreKind.RCE:
-            core = await children.start("core", [*RCE, "core", "--port", port], needed=True)
+            core = await children.start("core", [*RCE, "core", "--port", port], env=env, needed=True)
             await children.wait_line(core, "rce core ready:", START_TIMEOUT)
             return
         program = shutil.which("roscore")
         if program is None:
             raise DemoError("there is no program roscore here (Debian: ros-core)")
-        home = play.folder / "ros"
-        env = {"ROS_HOME": str(home), "ROS_LOG_DIR": str(home / "log"), "ROS_IP": LOOPBACK}
         core = await children.start("core", [program, "-p", port], env=env, needed=True)
         await children.wait_line(core, "started core service [/rosout]", START_TIMEOUT)

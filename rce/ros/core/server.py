@@ -8,6 +8,7 @@ import uuid
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -73,6 +74,7 @@ class Core:
         *,
         advertised: str | None = None,
         rosout: bool = False,
+        log_folder: Path | None = None,
         on_shutdown: Callable[[str], None] | None = None,
     ) -> None:
         """Prepare a core.
@@ -82,12 +84,15 @@ class Core:
             port: 0 takes a free one.
             advertised: Host or address in :attr:`uri`; by default ``host``, or loopback if that is "all".
             rosout: Run the node ``/rosout``, which gathers all nodes' log records on ``/rosout_agg``.
+            log_folder: With ``rosout``: where to keep ``RUN_ID/rosout.log``; ``None``: nowhere.
             on_shutdown: Takes the reason when somebody tells the core to end; without it, nobody may.
         """
         self.graph = Graph()
         self._local = "127.0.0.1" if host == "0.0.0.0" else host  # noqa: S104
         self._advertised = advertised or self._local
         self._rosout = rosout
+        self._run_id = str(uuid.uuid1())
+        self._log_folder = log_folder / self._run_id if log_folder is not None else None
         self._api = MasterApi(self.graph, lambda: self.uri, self._perform, on_shutdown)
         methods = self._api.methods() | roslaunch_methods()
         self._server = RpcServer(Dispatcher(methods, NOTHING), host, port)
@@ -188,7 +193,8 @@ class Core:
     async def _gathering_logs(self) -> AsyncIterator[None]:
         from rce.ros.core.rosout import RosoutNode  # a core without it needs no node
 
-        async with RosoutNode(f"http://{self._local}:{self._server.port}/", self._advertised) as node:
+        uri = f"http://{self._local}:{self._server.port}/"
+        async with RosoutNode(uri, self._advertised, self._log_folder) as node:
             await node.gather()
             yield
 
@@ -206,7 +212,7 @@ class Core:
             self._perform(self.graph.drop_parameter_subscription(call.uri, call.arguments[0]))
 
     def _set_well_known_parameters(self) -> None:
-        self.set_param("/run_id", str(uuid.uuid1()))
+        self.set_param("/run_id", self._run_id)
         self.set_param("/rosversion", f"{ROS_VERSION}\n")
         self.set_param("/rosdistro", f"{ROS_DISTRIBUTION}\n")
         host = "".join(character if character.isalnum() else "_" for character in self._advertised)

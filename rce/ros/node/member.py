@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import logging
 from contextlib import AsyncExitStack
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from rce.ros.errors import HandshakeRefused, MasterError, MasterUnreachable, NodeClosed, TypeMismatch
+from rce.ros.logfiles import LogFile
 from rce.ros.node import clock, rosout, signals
 from rce.ros.node.clock import NANOSECONDS, Clock
 from rce.ros.node.local import neighbour
@@ -39,6 +41,11 @@ DEFAULT_QUEUE = 100
 
 GOODBYE_TIMEOUT = 3.0
 """Seconds that the master gets to take a node's registrations back."""
+
+LOG_FORM = "[%(name)s][%(levelname)s] %(asctime)s: %(message)s"
+LOG_BYTES = 50_000_000
+LOG_BACKUPS = 4
+"""Form, length and number of older ones of a node's own log file: as rospy's."""
 
 RETRY = 0.2
 """Seconds between attempts to reach the master."""
@@ -194,6 +201,8 @@ class GraphMember:
             await self._parameters.set(name, value)
         if self._rosout:
             await self._publish_log(stack)
+        if self._settings.log_file is not None:
+            self._keep_log(stack, self._settings.log_file)
         for name, kind, handler in Loggers(self.log).handlers(self._types):
             await self._provide(f"{self.name}/{name}", kind, handler)
 
@@ -201,10 +210,20 @@ class GraphMember:
         publisher = await self._topics.advertise(
             self._running, rosout.TOPIC, rosout.KIND, latch=False, queue_size=DEFAULT_QUEUE
         )
-        handler = rosout.RosoutHandler(publisher, self.name, self._clock)
+        handler = rosout.RosoutHandler(publisher, self.name, self._clock, self._topics.names)
         publisher.on_subscriber = handler.flush
         self.log.addHandler(handler)
         stack.callback(self.log.removeHandler, handler)
+
+    def _keep_log(self, stack: AsyncExitStack, path: Path) -> None:
+        try:
+            file = LogFile(path, LOG_FORM, max_bytes=LOG_BYTES, backups=LOG_BACKUPS)
+        except OSError as error:
+            _log.warning("%s has no log file %s: %s", self.name, path, error.strerror or error)
+            return
+        self.log.addHandler(file)
+        stack.callback(file.close)
+        stack.callback(self.log.removeHandler, file)
 
     async def _provide(self, name: str, kind: str | ServiceType, handler: SerializedHandler) -> Service:
         """Provide a service under a global name."""

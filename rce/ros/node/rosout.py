@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
+from collections.abc import Callable
 
 from rce.ros.errors import NodeClosed
 from rce.ros.node.clock import NANOSECONDS, Clock
@@ -26,11 +27,14 @@ class RosoutHandler(logging.Handler):
     Records that come before anybody listens wait for the first listener; the message type is loaded then.
     """
 
-    def __init__(self, publisher: Publisher, node: str, clock: Clock) -> None:
+    def __init__(
+        self, publisher: Publisher, node: str, clock: Clock, topics: Callable[[], list[str]]
+    ) -> None:
         super().__init__()
         self._clock = clock
         self._publisher = publisher
         self._node = node
+        self._topics = topics
         self._waiting: deque[logging.LogRecord] = deque(maxlen=MAX_WAITING)
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -62,4 +66,5 @@ class RosoutHandler(logging.Handler):
             file=record.pathname,
             function=record.funcName or "",
             line=record.lineno,
+            topics=self._topics(),
         )

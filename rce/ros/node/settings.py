@@ -8,9 +8,11 @@ import socket
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+from rce.ros.logfiles import log_folder
 from rce.ros.names import Resolver, parse_arguments
 
 DEFAULT_MASTER_URI = "http://127.0.0.1:11311/"
@@ -30,6 +32,8 @@ class NodeSettings:
     """Address to listen on."""
     parameters: Mapping[str, Any]
     """Private parameters to set: name without ``~`` to value."""
+    log_file: Path | None = None
+    """Where to write the node's log, if anybody said."""
 
     @classmethod
     def gather(
@@ -48,7 +52,8 @@ class NodeSettings:
             name: The node's name without namespace.
             namespace: Its namespace; if empty, ``ROS_NAMESPACE``.
             argv: The command line, remappings among it.
-            environ: ``ROS_MASTER_URI``, ``ROS_NAMESPACE``, ``ROS_IP`` and ``ROS_HOSTNAME`` are read.
+            environ: ``ROS_MASTER_URI``, ``ROS_NAMESPACE``, ``ROS_IP``, ``ROS_HOSTNAME``
+                and where logs go (``ROS_LOG_DIR``, ``ROS_HOME``, ``HOME``) are read.
             master_uri: The master, in place of ``ROS_MASTER_URI``.
             anonymous: Make the name unique.
 
@@ -74,7 +79,9 @@ class NodeSettings:
         )
         bind = LOOPBACK if is_loopback(host) else EVERYWHERE
         parameters = {key: parse_value(text) for key, text in arguments.parameters.items()}
-        return cls(resolver, master, host, bind, parameters)
+        log = specials.get("__log")
+        log_file = log_folder(environ) / log if log else None  # a full path stays what it is
+        return cls(resolver, master, host, bind, parameters, log_file)
 
 
 def anonymous_name(name: str) -> str:

@@ -117,6 +117,10 @@ class Topics:
 
     # ------------------------------------------------------------------ what the slave API tells
 
+    def names(self) -> list[str]:
+        """Return the topics that are published or subscribed to."""
+        return list(self.outputs.keys() | self.inputs.keys())
+
     def bus_info(self) -> list[list[object]]:
         """Return ``[id, destination, direction, protocol, topic, connected, text]`` of each connection."""
         info: list[list[object]] = []

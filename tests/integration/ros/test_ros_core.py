@@ -14,7 +14,7 @@ import pytest
 from rce.ros.core import Change, Core, GraphEvent
 from rce.ros.errors import MasterRefused, ParameterMissing, RemoteFault
 from rce.ros.node import Node
-from rce.ros.xmlrpc import RpcClient
+from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer
 from rce.ros.xmlrpc.codec import encode_call
 
 MakeNode = Callable[..., Node]
@@ -197,3 +197,64 @@ async def test_unknown_methods_are_faults(core: Core) -> None:
         with pytest.raises(RemoteFault):
             await rpc.call(core.uri, "noSuchThing", ("/x",))
         assert "registerPublisher" in await rpc.call(core.uri, "system.listMethods", ())
+
+
+async def test_a_node_that_knows_nothing_of_a_subscription_is_left_alone(core: Core) -> None:
+    calls: list[str] = []
+    answers = [1, -1]
+
+    def update(_caller: str, key: str, _value: object) -> tuple[int, str, int]:
+        calls.append(key)
+        return answers[len(calls) - 1], "", 0
+
+    async with RpcServer(Dispatcher({"paramUpdate": update}), "127.0.0.1") as slave, RpcClient() as rpc:
+        uri = f"http://127.0.0.1:{slave.port}/"
+        await rpc.call(core.uri, "subscribeParam", ("/n", uri, "/p"))
+        core.set_param("/p", 1)
+        await _until(lambda: len(calls) == 1)
+        assert core.graph.nodes == {"/n": uri}
+        core.set_param("/p", 2)
+        await core.wait_until(lambda graph: not graph.nodes, timeout=10)
+        core.set_param("/p", 3)
+        assert calls == ["/p/", "/p/"]
+
+
+async def test_a_core_is_told_to_end_only_if_its_program_lets_it(core: Core) -> None:
+    told: list[str] = []
+    async with Core(port=0, on_shutdown=told.append) as mortal, RpcClient() as rpc:
+        assert (await rpc.call(core.uri, "shutdown", ("/x", "why")))[0] == -1
+        assert await rpc.call(mortal.uri, "shutdown", ("/x", "why")) == [1, "shutdown", 0]
+    assert told == ["/x asked for it: why"]
+
+
+async def test_a_large_graph(core: Core) -> None:
+    """Hundreds of nodes come at once, with topics that all hear of, and thousands of parameters."""
+    nodes, parameters = 200, 5000
+    async with RpcClient() as rpc:
+
+        async def join(number: int) -> None:
+            caller, uri = f"/n{number}", f"http://127.0.0.1:1/{number}"
+            await rpc.call(core.uri, "registerSubscriber", (caller, "/all", STRING, uri))
+            await rpc.call(core.uri, "registerPublisher", (caller, "/all", STRING, uri))
+            await rpc.call(core.uri, "subscribeParam", (caller, uri, f"/tree/b{number}"))
+            await rpc.call(core.uri, "setParam", (caller, f"/tree/b{number}", {"x": number, "y": [number]}))
+
+        async with asyncio.TaskGroup() as group:
+            for number in range(nodes):
+                group.create_task(join(number))
+        assert len(core.graph.nodes) == len(core.graph.publishers("/all")) == nodes
+        many = {f"p{number}": {"value": number} for number in range(parameters)}
+        await rpc.call(core.uri, "setParam", ("/x", "/many", many), timeout=30)
+        status, _, known = await rpc.call(core.uri, "getParamNames", ("/x",), timeout=30)
+        assert status == 1
+        assert len(known) == 2 * nodes + parameters + 4  # and the core's own
+        assert (await rpc.call(core.uri, "getParam", ("/x", "/many"), timeout=30))[2] == many
+        for number in range(nodes):
+            assert core.forget_uri(f"http://127.0.0.1:1/{number}")
+        assert core.graph.nodes == core.graph.topic_types == {}
+
+
+async def _until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(10):
+        while not condition():
+            await asyncio.sleep(0.01)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import logging
+import re
 from collections.abc import AsyncIterator
+from pathlib import Path
 
 import pytest
 
 from rce.ros.core import Core
 from rce.ros.errors import ServiceFault
+from rce.ros.logfiles import LogFile, log_folder
 from rce.ros.node import Node
 from rce.ros.node.rosout import KIND, MD5SUM
 from rce.ros.types import TypeRegistry
@@ -49,6 +53,76 @@ async def test_records_of_all_nodes_are_gathered(full_core: Core) -> None:
                     break
         expected = {(n, value, f"{level} of {n}") for level, value in levels.items() for n in ("/a", "/b")}
         assert found == expected
+
+
+async def test_records_are_kept_in_a_file(tmp_path: Path) -> None:
+    async with (
+        Core(port=0, rosout=True, log_folder=tmp_path) as core,
+        Node("a", argv=[], master_uri=core.uri) as a,
+    ):
+        await a.advertise("t", "std_msgs/String")
+        file = tmp_path / core.get_param("/run_id") / "rosout.log"
+        a.log.error("kept\nin a file")
+        async with asyncio.timeout(10):
+            while "in a file" not in file.read_text():
+                await asyncio.sleep(0.02)
+        lines = file.read_text().splitlines()
+        assert lines[2].endswith("  Node Startup")
+        assert re.fullmatch(
+            r"\d+\.\d{9} ERROR /a \[.*test_ros_logs.py:\d+\(test_records_are_kept_in_a_file\)\] "
+            r"\[topics: (/rosout, /t|/t, /rosout)\] kept",
+            lines[3],
+        )
+        assert (tmp_path / "latest" / "rosout.log").samefile(file)
+
+
+async def test_a_folder_that_cannot_be_written_costs_only_the_file(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "file").touch()
+    async with (
+        Core(port=0, rosout=True, log_folder=tmp_path / "file") as core,
+        Node("a", argv=["__log:=" + str(tmp_path / "file" / "a.log")], master_uri=core.uri),
+    ):
+        assert {"/rosout", "/a"} <= core.graph.nodes.keys()
+    assert "ROS_LOG_DIR names another folder" in caplog.text
+    assert "/a has no log file" in caplog.text
+
+
+def test_files_are_cut_and_old_ones_dropped(tmp_path: Path) -> None:
+    file = LogFile(tmp_path / "new" / "x.log", "%(message)s", max_bytes=100, backups=2)
+    for number in range(100):
+        file.handle(logging.makeLogRecord({"msg": f"record {number}"}))
+    file.close()
+    assert sorted(path.name for path in file_folder(file).iterdir()) == ["x.log", "x.log.1", "x.log.2"]
+    assert all(path.stat().st_size <= 100 for path in file_folder(file).iterdir())
+    assert "record 99" in Path(file.baseFilename).read_text()
+
+
+def file_folder(file: LogFile) -> Path:
+    return Path(file.baseFilename).parent
+
+
+async def test_a_node_keeps_its_own_log(core: Core, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path))
+    for argument, file in (("mine.log", "mine.log"), (str(tmp_path / "deep" / "a.log"), "deep/a.log")):
+        async with Node("keeper", argv=[f"__log:={argument}"], master_uri=core.uri) as node:
+            node.log.warning("for the file")
+        node.log.warning("not any longer")
+        text = (tmp_path / file).read_text()
+        assert re.fullmatch(r"\[ros\.keeper\]\[WARNING\] [\d :,-]+: for the file\n", text)
+
+
+@pytest.mark.parametrize(
+    ("environ", "folder"),
+    [
+        ({"ROS_LOG_DIR": "/logs", "ROS_HOME": "/ros", "HOME": "/home/x"}, "/logs"),
+        ({"ROS_HOME": "/ros", "HOME": "/home/x"}, "/ros/log"),
+        ({"HOME": "/home/x"}, "/home/x/.ros/log"),
+    ],
+)
+def test_logs_go_where_those_of_ros_go(environ: dict[str, str], folder: str) -> None:
+    assert log_folder(environ) == Path(folder)
 
 
 async def test_levels_are_read_and_set(core: Core) -> None:

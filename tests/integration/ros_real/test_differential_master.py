@@ -83,7 +83,7 @@ def masters(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Side, Si
     home = tmp_path_factory.mktemp("masters")
     real, ours = free_port(), free_port()
     command = ("/usr/bin/rosmaster", "--core", "-p", str(real))
-    own = (str(Path(executable).parent / "rce"), "core", "--port", str(ours))
+    own = (str(Path(executable).parent / "rce"), "core", "--port", str(ours), "--no-log")
     with ExitStack() as stack:
         yield (
             stack.enter_context(master(*command, uri=f"http://127.0.0.1:{real}/", home=home)),
