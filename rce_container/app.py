@@ -34,6 +34,7 @@ from rce_container.runtimes.base import Runtime, source_root
 from rce_container.runtimes.namespace import NamespaceRuntime
 from rce_container.runtimes.process import ProcessRuntime
 from rce_container.settings import ContainerSettings
+from rce_container.uids import UidPool
 
 log = logging.getLogger(__name__)
 
@@ -71,7 +72,9 @@ class App:
             ContainerError: The state directory or the runtime cannot be used.
             OSError: The link port cannot be taken.
         """
-        runtimes: dict[str, Runtime] = {one.name: one for one in (NamespaceRuntime(), ProcessRuntime())}
+        uids = UidPool(self.settings.first_uid, self.settings.uids)
+        namespace = NamespaceRuntime(home_bytes=self.settings.home_bytes, uids=uids)
+        runtimes: dict[str, Runtime] = {one.name: one for one in (namespace, ProcessRuntime())}
         runtime, detail = await asyncio.to_thread(choose_runtime, self.runtime, runtimes)
         await asyncio.to_thread(_compile_engine)
         state_dir = self.state_dir or default_state_dir() / "container"
@@ -83,6 +86,8 @@ class App:
                 port = await _listen(doorman, self.host, self.link_port)
                 limiter = await asyncio.to_thread(choose_limiter, state.token, state.cgroups)
                 stack.callback(limiter.close)
+                for one in runtimes.values():
+                    stack.callback(one.close)
                 reach = own_address(self.master, self.control_port) if is_any(self.host) else self.host
                 manager = Manager(
                     name=name,
@@ -136,7 +141,7 @@ def choose_runtime(wish: str, runtimes: dict[str, Runtime]) -> tuple[Runtime, st
                 raise
             detail = f"{error}; "
         else:
-            return namespace, ""
+            return namespace, namespace.detail
     elif wish not in runtimes:
         raise RuntimeUnavailableError(
             wish, f"there is no such runtime; use one of {', '.join((AUTO, *runtimes))}"

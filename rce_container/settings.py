@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rce.control.limits import MEGABYTE
+from rce_container.uids import FIRST_UID, UIDS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,6 +36,12 @@ class ContainerSettings:
     cleanup_timeout: float = 10.0
     """What a container has on top of its nodes' times to end by itself, before it is killed."""
     usage_interval: float = 2.0
+    home_bytes: int = 256 * MEGABYTE
+    """Size of a container's home, which lives in memory."""
+    first_uid: int = FIRST_UID
+    """As root each container runs as a user of its own, from this one on; nobody else may have them."""
+    uids: int = UIDS
+    """How many such users there are."""
     slots: int = 0
     """What this machine offers in all; 0: as many as its memory says."""
     slot_memory: int = 512 * MEGABYTE

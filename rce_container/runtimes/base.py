@@ -184,7 +184,9 @@ class Runtime(ABC):
 
     name: ClassVar[str]
     isolated: ClassVar[bool]
-    """Whether the environment is process 1 of its own pid namespace."""
+    """Whether the container has a pid namespace of its own, which ends with its environment."""
+    detail: str = ""
+    """What is not as it should be, for the machine's record; known after :meth:`probe`."""
 
     @abstractmethod
     def probe(self) -> None:
@@ -195,38 +197,15 @@ class Runtime(ABC):
         """
 
     @abstractmethod
-    def paths(self, folder: ContainerFolder) -> tuple[str, str]:
-        """Where the container's home and logs are, as seen from inside."""
-
-    @abstractmethod
-    def command(self, order: Order, argv: Sequence[str]) -> tuple[list[str], dict[str, str]]:
-        """The command line, and its environment, by which ``argv`` runs as the container's environment."""
-
     def start(self, order: Order) -> Handle:
-        """Start a container.
+        """Start a container; :meth:`Handle.launch` completes it. Does not block.
 
         Raises:
             StartError: It cannot be started.
         """
-        home, logs = self.paths(order.folder)
-        boot = encode_boot(order.boot, home, logs)
-        argv, env = self.command(order, [sys.executable, "-P", "-m", "rce_container.environment", boot])
-        folder = order.folder
-        sweeper = "" if self.isolated else proc.__file__
-        shim = [SHELL, "-c", _SHIM, "rce-container-shim", str(folder.path), str(folder.run)]
-        shim += [f"{order.boot.grace:g}", sys.executable, sweeper, folder.mark, order.switch]
-        shim += [*order.join, "--", *argv]
-        try:
-            with segment_path(folder.logs, ENVIRONMENT_LOG, 0).open("ab") as log:
-                popen = subprocess.Popen(  # noqa: S603
-                    shim, stdin=order.control, stdout=order.links, stderr=log, env=env, start_new_session=True
-                )
-        except OSError as error:
-            raise StartError(f"cannot start {SHELL}: {error}") from error
-        process = proc.read(popen.pid)
-        if process is None:
-            raise StartError(f"{SHELL} ended at once with code {popen.wait()}")
-        return Handle(process, "" if self.isolated else folder.mark, popen)
+
+    def close(self) -> None:  # noqa: B027 - most keep nothing
+        """End what the runtime keeps running for itself; containers live on."""
 
     def adopt(self, process: proc.Process, record: Record) -> Handle:
         """Take over a container that an earlier manager started.
@@ -241,6 +220,83 @@ class Runtime(ABC):
         if environment is not None and environment.start == record.environment_start:
             handle.environment = environment
         return handle
+
+
+class ExecRuntime(Runtime):
+    """A runtime whose environments are programs that descend from the shim."""
+
+    @abstractmethod
+    def paths(self, folder: ContainerFolder) -> tuple[str, str]:
+        """Where the container's home and logs are, as seen from inside."""
+
+    @abstractmethod
+    def command(self, order: Order, argv: Sequence[str]) -> tuple[list[str], dict[str, str]]:
+        """The command line, and its environment, by which ``argv`` runs as the container's environment."""
+
+    def start(self, order: Order) -> Handle:
+        """Start a container with its environment.
+
+        Raises:
+            StartError: It cannot be started.
+        """
+        home, logs = self.paths(order.folder)
+        boot = encode_boot(order.boot, home, logs)
+        argv, env = self.command(order, [sys.executable, "-P", "-m", "rce_container.environment", boot])
+        mark = "" if self.isolated else order.folder.mark
+        popen, process = spawn_shim(order, argv, env, (order.control, order.links), sweep=not self.isolated)
+        return Handle(process, mark, popen)
+
+
+def spawn_shim(
+    order: Order,
+    argv: Sequence[str],
+    env: Mapping[str, str],
+    streams: tuple[int, int],
+    *,
+    sweep: bool = False,
+    keep: Sequence[int] = (),
+) -> tuple[subprocess.Popen[bytes], proc.Process]:
+    """Start a shim: a command is run in the container's cgroups and waited for, and its folders are removed.
+
+    Args:
+        order: The container.
+        argv: The command. If it ends with another code than 0, the folders stay for the grace time.
+        env: Its environment variables.
+        streams: Its standard input and output; standard error is the environment's log.
+        sweep: Whether processes that carry the container's mark may be left, and are to be killed.
+        keep: Descriptors that it inherits.
+
+    Raises:
+        StartError: It cannot be started.
+    """
+    folder = order.folder
+    shim = [SHELL, "-c", _SHIM, "rce-container-shim", str(folder.path), str(folder.run)]
+    shim += [
+        f"{order.boot.grace:g}",
+        sys.executable,
+        proc.__file__ if sweep else "",
+        folder.mark,
+        order.switch,
+    ]
+    shim += [*order.join, "--", *argv]
+    stdin, stdout = streams
+    try:
+        with segment_path(folder.logs, ENVIRONMENT_LOG, 0).open("ab") as log:
+            popen = subprocess.Popen(  # noqa: S603
+                shim,
+                stdin=stdin,
+                stdout=stdout,
+                stderr=log,
+                env=env,
+                pass_fds=keep,
+                start_new_session=True,
+            )
+    except OSError as error:
+        raise StartError(f"cannot start {SHELL}: {error}") from error
+    process = proc.read(popen.pid)
+    if process is None:
+        raise StartError(f"{SHELL} ended at once with code {popen.wait()}")
+    return popen, process
 
 
 def encode_boot(boot: Boot, home: str, logs: str) -> str:

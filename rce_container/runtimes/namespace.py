@@ -1,31 +1,39 @@
-"""The runtime of Linux namespaces, made by bubblewrap.
+"""The runtime of Linux namespaces: bubblewrap makes them, the nursery's children live in them.
 
 A container has its own user, pid, mount, network, ipc, uts and cgroup namespaces. Its root is read-only and
-holds the
-system's programs, the engine's Python and the packages; its home and /tmp are private. The environment is
-process 1: when it dies, however that happens, the kernel kills every other process of the container. Shim,
-bubblewrap and environment are tied to each other, so that none outlives the one outside of it.
+holds the system's programs, the engine's Python and the packages; its home and /tmp live in memory and are
+limited. Process 1 is the *holder*, a shell that waits for the environment's farewell: when the environment
+dies, however that happens, the holder ends, and the kernel kills every other process of the container. Shim,
+bubblewrap and holder are tied to each other, so that none outlives the one outside of it.
 """
 
 from __future__ import annotations
 
+import asyncio
 import compileall
+import os
 import shutil
-import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Sequence
+import threading
+from collections.abc import Iterable
 from pathlib import Path
 
 from rce_container.environment.messages import Boot
-from rce_container.exceptions import RuntimeUnavailableError
+from rce_container.exceptions import ContainerError, RuntimeUnavailableError
 from rce_container.folder import ContainerFolder
+from rce_container.network.hosts import hostname, hosts_text
+from rce_container.nursery.confine import USER_ID
+from rce_container.nursery.keeper import Nursery
+from rce_container.nursery.messages import Birth
+from rce_container.nursery.mounts import HOME, LOGS, TEMPORARY
 from rce_container.runtimes.base import Order, Runtime, clean_environ, source_root
+from rce_container.runtimes.held import HOLDER, HeldHandle
+from rce_container.seccomp.library import FilterUnavailableError, make_filter
+from rce_container.uids import FIRST_UID, UIDS, UidPool
 
 USER = "rce"
-USER_ID = 1000
-HOME = f"/home/{USER}"
-LOGS = "/var/log/rce"
+HOME_BYTES = 256 << 20
 TMP_BYTES = 256 << 20
 
 _SYSTEM = ("/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32")
@@ -40,75 +48,127 @@ _ETC = (
     "ros",
 )
 _PROBE_TIMEOUT_S = 20.0
-_MAX_HOSTNAME = 63
 
 
 class NamespaceRuntime(Runtime):
-    """Isolation by namespaces, as root and as any user who may make user namespaces."""
+    """Isolation by namespaces, as root and as any user who may make user namespaces.
+
+    As root each container runs as a user of the machine of its own; else all run as the engine's user.
+
+    Args:
+        home_bytes: Size of a container's home.
+        uids: The users for containers, if this is root; None takes the default ones.
+    """
 
     name = "namespace"
     isolated = True
 
-    def __init__(self) -> None:
+    def __init__(self, *, home_bytes: int = HOME_BYTES, uids: UidPool | None = None) -> None:
+        self._home_bytes = home_bytes
+        self._uids = uids or UidPool(FIRST_UID, UIDS)
+        self._root = os.geteuid() == 0
         self._bwrap = shutil.which("bwrap") or ""
-        self._options = ""
+        self._nursery = Nursery(b"", {})
 
     def probe(self) -> None:
-        """Make a namespace like a container's and start the engine's Python in it."""
+        """Make a container and start the engine's Python in it."""
         if not sys.platform.startswith("linux"):
             raise RuntimeUnavailableError(self.name, "it needs Linux")
         if not self._bwrap:
             raise RuntimeUnavailableError(
                 self.name, "bwrap is not installed (Debian, Ubuntu: apt install bubblewrap)"
             )
-        self._options = _run([self._bwrap, "--help"]).stdout
         _compile()
+        self._nursery.close()
+        self._nursery = Nursery(self._filter(), clean_environ(HOME))
+        failures: list[Exception] = []
+        trying = threading.Thread(target=self._try, args=(failures,))  # there may be a loop in this one
+        trying.start()
+        trying.join()
+        if failures:
+            self.close()
+            raise RuntimeUnavailableError(self.name, str(failures[0])) from failures[0]
+
+    def close(self) -> None:
+        """End the nursery; the containers live on."""
+        self._nursery.close()
+
+    def start(self, order: Order) -> HeldHandle:
+        """Make the container's namespaces; the environment comes to life by the handle's ``launch``."""
+        return self._start(order)
+
+    def _start(self, order: Order, check: tuple[str, ...] = ()) -> HeldHandle:
+        _write_etc(order)
+        uid, lock = self._uids.take() if self._root else (0, -1)
+        birth = Birth(
+            boot=order.boot,
+            environ={**clean_environ(HOME), "USER": USER, "LOGNAME": USER},
+            uid=uid,
+            home_bytes=self._home_bytes,
+            tmp_bytes=TMP_BYTES,
+            host_network=order.host_network,
+            join=order.join,
+            check=check,
+        )
+        try:
+            return HeldHandle.start(self._command(order), order, birth, self._nursery, lock)
+        finally:
+            if lock >= 0:
+                os.close(lock)
+
+    def _filter(self) -> bytes:
+        try:
+            return make_filter()
+        except FilterUnavailableError as error:
+            self.detail = f"system calls of containers are not filtered: {error}"
+            return b""
+
+    def _try(self, failures: list[Exception]) -> None:
+        try:
+            asyncio.run(self._try_once())
+        except (ContainerError, OSError, TimeoutError) as error:
+            failures.append(error)
+
+    async def _try_once(self) -> None:
+        """Make a container in which Python looks whether it finds the engine.
+
+        Raises:
+            ContainerError: It did not work; the text says why.
+        """
         with tempfile.TemporaryDirectory() as scratch:
             folder = ContainerFolder(Path(scratch), Path(scratch) / "run", "0" * 12)
             folder.make()
             boot = Boot(
-                id="probe/probe", mark=folder.mark, machine="", home="", logs="", ros_port=0, isolated=True
+                id="probe/probe",
+                mark=folder.mark,
+                machine="",
+                home="",
+                logs="",
+                ros_port=0,
+                isolated=True,
+                grace=0,
             )
-            order = Order("probe", boot, folder, (), 0, 0)
-            argv, env = self.command(order, [sys.executable, "-c", "import rce_container.environment"])
-            found = _run(argv, env)
-        if found.returncode:
-            words = found.stderr.strip().splitlines()
-            raise RuntimeUnavailableError(self.name, words[-1] if words else f"exit code {found.returncode}")
+            with folder.listen(folder.control_socket) as control, folder.listen(folder.link_socket) as links:
+                order = Order("probe", boot, folder, (), control.fileno(), links.fileno())
+                check = (sys.executable, "-c", "import rce_container.environment")
+                handle = self._start(order, check)
+                try:
+                    async with asyncio.timeout(_PROBE_TIMEOUT_S):
+                        await handle.launch()
+                finally:
+                    await handle.kill()
 
-    def paths(self, folder: ContainerFolder) -> tuple[str, str]:  # noqa: ARG002
-        """The same in every container."""
-        return HOME, LOGS
-
-    def command(self, order: Order, argv: Sequence[str]) -> tuple[list[str], dict[str, str]]:
-        """Run it in a sandbox."""
-        folder = order.folder
-        _write_etc(folder.etc, order.tag)
-        environ = clean_environ(HOME)
-        environ["USER"] = environ["LOGNAME"] = USER
+    def _command(self, order: Order) -> list[str]:
         options = [
-            *("--unshare-user", "--unshare-pid", "--unshare-net", "--unshare-ipc", "--unshare-uts"),
-            *("--unshare-cgroup-try", "--as-pid-1", "--die-with-parent", "--new-session"),
-            *("--cap-drop", "ALL", "--uid", str(USER_ID), "--gid", str(USER_ID)),
-            *("--hostname", order.tag[:_MAX_HOSTNAME]),
-            *self._mounts(order),
-            *("--chdir", HOME),
+            *("--unshare-pid", "--unshare-ipc", "--unshare-uts", "--unshare-cgroup-try"),
+            *(() if order.host_network else ("--unshare-net",)),
+            *(() if self._root else ("--unshare-user",)),
+            *("--as-pid-1", "--die-with-parent", "--new-session", "--cap-drop", "ALL"),
+            *("--hostname", hostname(order.tag)),
+            *_mounts(order),
+            *("--chdir", "/"),
         ]
-        return [self._bwrap, *options, "--", *argv], environ
-
-    def _mounts(self, order: Order) -> list[str]:
-        folder = order.folder
-        limit = ("--size", str(TMP_BYTES)) if "--size" in self._options else ()
-        return [
-            *_system(),
-            *("--proc", "/proc", "--dev", "/dev"),
-            *(*limit, "--tmpfs", "/tmp"),  # noqa: S108 - the container's own
-            *("--ro-bind", str(folder.etc), "/etc"),
-            *(word for name in _ETC for word in ("--ro-bind-try", f"/etc/{name}", f"/etc/{name}")),
-            *("--bind", str(folder.home), HOME, "--bind", str(folder.logs), LOGS),
-            *_read_only([*interpreter_paths(), *order.packages]),
-            *("--symlink", "../tmp", "/var/tmp", "--remount-ro", "/"),  # noqa: S108
-        ]
+        return [self._bwrap, *options, "--", *HOLDER]
 
 
 def interpreter_paths() -> list[Path]:
@@ -123,6 +183,23 @@ def _compile() -> None:
     """Have the modules compiled here: inside nothing can be written, and every container would do it anew."""
     for package in ("rce", "rce_container"):
         compileall.compile_dir(source_root() / package, quiet=2)
+
+
+def _mounts(order: Order) -> list[str]:
+    """The container's tree of files; the rest is done from inside (:mod:`rce_container.nursery.mounts`)."""
+    folder = order.folder
+    return [
+        *_system(),
+        *("--proc", "/proc", "--dev", "/dev"),
+        *(word for path in (*TEMPORARY, HOME) for word in ("--tmpfs", path)),
+        *("--remount-ro", "/dev"),
+        *("--ro-bind", str(folder.etc), "/etc"),
+        *(word for name in _ETC for word in ("--ro-bind-try", f"/etc/{name}", f"/etc/{name}")),
+        *("--bind", str(folder.logs), LOGS),
+        *_read_only([*interpreter_paths(), *order.packages]),
+        *("--dir", "/run", "--symlink", "../run", "/var/run"),
+        *("--symlink", "../tmp", "/var/tmp", "--remount-ro", "/"),  # noqa: S108 - the container's own
+    ]
 
 
 def _system() -> list[str]:
@@ -144,38 +221,28 @@ def _read_only(paths: Iterable[Path]) -> list[str]:
         if path == Path("/") or any(path.is_relative_to(outer) for outer in bound) or not path.exists():
             continue
         bound.append(path)
+        for parent in reversed(path.parents[:-1]):
+            options += ["--dir", str(parent)]  # by itself bubblewrap makes them for its own user only
         options += ["--ro-bind", str(path), str(path)]
     return options
 
 
-def _write_etc(etc: Path, tag: str) -> None:
-    host = tag[:_MAX_HOSTNAME]
+def _write_etc(order: Order) -> None:
+    """Write the container's own ``/etc``, for its user to read. Its hosts may be known already."""
+    etc, host = order.folder.etc, hostname(order.tag)
+    etc.chmod(0o755)
     for name, text in (
         ("passwd", f"{USER}:x:{USER_ID}:{USER_ID}::{HOME}:/bin/sh\n"),
         ("group", f"{USER}:x:{USER_ID}:\n"),
-        ("hosts", f"127.0.0.1 localhost {host}\n"),
+        ("hosts", hosts_text(order.tag)),
         ("hostname", f"{host}\n"),
         ("nsswitch.conf", "passwd: files\ngroup: files\nhosts: files\n"),
     ):
         (etc / name).write_text(text)
+        (etc / name).chmod(0o644)
     for name in _ETC:
         source = Path("/etc") / name
         if source.is_dir():
             (etc / name).mkdir(exist_ok=True)
         elif source.exists():
             (etc / name).touch()
-
-
-def _run(argv: Sequence[str], env: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
-    try:
-        return subprocess.run(  # noqa: S603
-            argv,
-            env=env,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=_PROBE_TIMEOUT_S,
-            check=False,
-        )
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise RuntimeUnavailableError(NamespaceRuntime.name, str(error)) from error

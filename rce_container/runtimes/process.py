@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 from rce_container.environment.proc import MARK
 from rce_container.folder import ContainerFolder
-from rce_container.runtimes.base import Order, Runtime, clean_environ
+from rce_container.runtimes.base import ExecRuntime, Order, clean_environ
 
 _ENV = "/usr/bin/env"
 
 
-class ProcessRuntime(Runtime):
+class ProcessRuntime(ExecRuntime):
     """No isolation: nodes see and may do all that the user of the container task set may."""
 
     name = "process"

@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from rce.config.resources import examples_dir
@@ -40,7 +41,7 @@ from rce.link import Buffer, Endpoint, Interface, LinkHub, Port
 from rce.link.handover import Doorman
 from rce.protocol.names import EndpointId
 from rce_container.environment import proc
-from rce_container.folder import StateFolder
+from rce_container.folder import Record, StateFolder
 from rce_container.limits import choose_limiter
 from rce_container.manager import Manager
 from rce_container.runtimes.base import Runtime
@@ -259,9 +260,21 @@ class Machine:
         return [process for process in found if process.parent not in pids]
 
     def processes(self) -> list[proc.Process]:
-        """All processes of this machine's containers that hang together with a shim."""
+        """All processes of this machine's containers that hang together with a shim or an environment."""
         processes = proc.table()
-        return [one for shim in self.shims() for one in proc.descendants(shim.pid, processes)]
+        roots = {shim.pid for shim in self.shims()} | {one.pid for one in self._environments()}
+        return [one for root in roots for one in proc.descendants(root, processes)]
+
+    def _environments(self) -> list[proc.Process]:
+        """The environments that do not descend from a shim."""
+        found = []
+        for path in self.containers:
+            with contextlib.suppress(OSError):
+                record = msgspec.json.decode((path / "record.json").read_bytes(), type=Record)
+                process = proc.read(record.environment) if record.environment else None
+                if process is not None and process.start == record.environment_start:
+                    found.append(process)
+        return found
 
     def environment(self) -> proc.Process:
         """The environment of the only container."""
@@ -278,6 +291,8 @@ class Machine:
 
     def tidy(self) -> None:
         """Kill what a failed test left, and collect the exit codes that a dead manager did not."""
+        for runtime in self.runtimes.values():
+            runtime.close()
         for process in self.processes():
             proc.kill(process)
         for cell in self.cells():

@@ -1,0 +1,133 @@
+"""Turning a child of the nursery into a process of a container that has no rights at all.
+
+Two processes do it. The first one enters the container's namespaces with all the rights it needs there; its
+child, the first of the two to be inside the pid namespace, makes a user namespace below the one that all the
+others belong to. So no capability that a process of the container could ever gain has power over its mounts,
+its network or its pids.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import resource
+import select
+from pathlib import Path
+
+from rce_container.nursery import kernel, mounts
+from rce_container.nursery.kernel import Namespaces
+from rce_container.nursery.messages import Birth, Gifts
+
+USER_ID = 1000
+"""User and group inside."""
+
+_JOINED = Namespaces.MOUNT | Namespaces.PID | Namespaces.IPC | Namespaces.UTS | Namespaces.CGROUP
+_ONE_USER_ONLY = "sys/user/max_user_namespaces"
+_NO_CORE = 1
+"""The one size by which the kernel gives a core neither to a file nor to a program of the machine."""
+
+
+def confine(birth: Birth, gifts: Gifts, program: bytes) -> int:
+    """Enter the container and give up all rights. Returns in a new process: the others are gone.
+
+    Args:
+        birth: What the container is like.
+        gifts: Descriptors; they stay open.
+        program: Filter of system calls; empty for none.
+
+    Returns:
+        A descriptor of the folder for logs.
+
+    Raises:
+        OSError: The kernel refuses; not all rights may be given up.
+    """
+    for file in birth.join:
+        Path(file).write_text(str(os.getpid()))
+    procfs = os.open("/proc", os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    _enter(gifts.holder, procfs, birth)
+    owner = birth.uid or os.geteuid()
+    mounts.limit(mounts.HOME, birth.home_bytes, owner)
+    for path in mounts.TEMPORARY:
+        mounts.limit(path, birth.tmp_bytes, owner)
+    mounts.mask_machine()
+    logs = mounts.take_away_logs(owner)
+    os.fchown(gifts.log, owner, owner)
+    _become_user(procfs, owner)
+    os.close(procfs)
+    _give_up(program)
+    return logs
+
+
+def _enter(holder: int, procfs: int, birth: Birth) -> None:
+    kinds = _JOINED if birth.host_network else _JOINED | Namespaces.NET
+    if birth.uid:
+        os.setgroups(())
+    else:
+        # The namespaces' owner, of whom the holder's own user namespace may be a child.
+        pid = _pid_of(holder)
+        mount_namespace = os.open(f"{pid}/ns/mnt", os.O_RDONLY | os.O_CLOEXEC, dir_fd=procfs)
+        user_namespace = kernel.owner(mount_namespace)
+        _check_alive(holder)
+        kernel.join(user_namespace, Namespaces.USER)
+        os.close(mount_namespace)
+        os.close(user_namespace)
+    kernel.join(holder, kinds)
+
+
+def _pid_of(pidfd: int) -> int:
+    for line in Path(f"/proc/self/fdinfo/{pidfd}").read_text().splitlines():
+        if line.startswith("Pid:"):
+            return int(line.split()[1])
+    raise ProcessLookupError("the holder of the namespaces is gone")
+
+
+def _check_alive(pidfd: int) -> None:
+    """Make sure that what was found by a process's pid was the process's, and not a later one's."""
+    if select.select((pidfd,), (), (), 0)[0]:
+        raise ProcessLookupError("the holder of the namespaces is gone")
+
+
+def _become_user(procfs: int, owner: int) -> None:
+    """Go on as a child that is :data:`USER_ID` in a user namespace of its own, and ``owner`` outside."""
+    made, make = os.pipe()
+    mapped, map_ = os.pipe()
+    child = os.fork()
+    if child:
+        os.close(make)
+        os.close(mapped)
+        if os.read(made, 1):
+            for name in ("uid_map", "gid_map"):
+                _write(procfs, f"{child}/{name}", f"{USER_ID} {owner} 1")
+            os.write(map_, b"m")
+        os._exit(0)
+    os.close(made)
+    os.close(map_)
+    kernel.unshare(Namespaces.USER)
+    os.write(make, b"u")
+    if not os.read(mapped, 1):
+        raise PermissionError("the user namespace was not mapped")
+    os.close(make)
+    os.close(mapped)
+    with contextlib.suppress(FileNotFoundError):  # a kernel without that setting has no such namespaces
+        _write(procfs, _ONE_USER_ONLY, "0")
+    os.setresgid(USER_ID, USER_ID, USER_ID)
+    os.setresuid(USER_ID, USER_ID, USER_ID)
+
+
+def _give_up(program: bytes) -> None:
+    os.setsid()
+    os.umask(0o022)
+    resource.setrlimit(resource.RLIMIT_CORE, (_NO_CORE, _NO_CORE))
+    kernel.give_up_capabilities()
+    kernel.take_in_orphans()
+    kernel.set_dumpable(False)
+    if program:
+        kernel.filter_calls(program)
+
+
+def _write(folder: int, name: str, text: str) -> None:
+    fd = os.open(name, os.O_WRONLY | os.O_CLOEXEC, dir_fd=folder)
+    try:
+        os.write(fd, text.encode())
+    finally:
+        os.close(fd)

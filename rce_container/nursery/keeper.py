@@ -1,0 +1,171 @@
+"""The manager's side of the nursery: starts it, starts it again when it died, and gives it orders."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import socket
+import struct
+import subprocess
+import sys
+from collections.abc import Mapping
+
+import msgspec
+
+from rce_container.exceptions import StartError
+from rce_container.nursery.messages import MAX_PACKET, Answer, Birth, Gifts, decode_answer, encode
+from rce_container.nursery.title import padding
+
+log = logging.getLogger(__name__)
+
+_ATTEMPTS = 3
+_CREDENTIALS = struct.Struct("iII")
+_CLOSE_TIMEOUT_S = 5.0
+
+
+class Nursery:
+    """Gives birth to environments. Used by one event loop; :meth:`close` ends it.
+
+    Args:
+        program: The filter of system calls for all that is born; empty for none.
+        environ: The environment variables of the nursery, which hold no secret.
+    """
+
+    def __init__(self, program: bytes, environ: Mapping[str, str]) -> None:
+        self._program = program
+        self._environ = dict(environ)
+        self._process: subprocess.Popen[bytes] | None = None
+        self._orders: socket.socket | None = None
+
+    @property
+    def pid(self) -> int:
+        """The process that orders go to now; 0 while there is none."""
+        return self._process.pid if self._process is not None else 0
+
+    async def bear(self, birth: Birth, gifts: Gifts) -> int:
+        """Make an environment; returns its pid.
+
+        Args:
+            birth: What it is like.
+            gifts: What it gets; :attr:`Gifts.answer` is put in here.
+
+        Raises:
+            StartError: It cannot be made.
+        """
+        for _ in range(_ATTEMPTS):
+            ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            with ours, theirs:
+                ours.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
+                self._order(birth, gifts._replace(answer=theirs.fileno()))
+                theirs.close()
+                answer, pid = await _hear(ours)
+            if answer is None:
+                log.warning("a container's environment died as it was made; it is tried again")
+                continue
+            if answer.error:
+                raise StartError(f"its environment cannot be confined: {answer.error}")
+            return pid
+        raise StartError("its environment dies whenever it is made; is there enough memory?")
+
+    def start(self) -> None:
+        """Start the process if it is not there, to be ready for the first order. Does not wait for it.
+
+        Raises:
+            StartError: It cannot be started.
+        """
+        if self._process is not None and self._process.poll() is None:
+            return
+        self.close()
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            try:
+                self._process = subprocess.Popen(  # noqa: S603
+                    [sys.executable, "-P", "-m", "rce_container.nursery", padding()],
+                    stdin=theirs.fileno(),
+                    stdout=subprocess.DEVNULL,
+                    env=self._environ,
+                    start_new_session=True,
+                )
+            except OSError as error:
+                ours.close()
+                raise StartError(f"cannot start {sys.executable}: {error}") from error
+        ours.setblocking(False)
+        ours.send(self._program)
+        self._orders = ours
+
+    def close(self) -> None:
+        """End the process. What it has given birth to lives on."""
+        if self._orders is not None:
+            self._orders.close()
+            self._orders = None
+        if self._process is not None:
+            try:
+                self._process.wait(_CLOSE_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+            self._process = None
+
+    def _order(self, birth: Birth, gifts: Gifts) -> None:
+        packet = encode(birth)
+        if len(packet) > MAX_PACKET:
+            raise StartError(f"what is to be told of it takes {len(packet)} bytes; {MAX_PACKET} are allowed")
+        for _ in range(_ATTEMPTS):
+            self.start()
+            assert self._orders is not None
+            try:
+                socket.send_fds(self._orders, [packet], gifts)
+            except (BrokenPipeError, ConnectionResetError):
+                self.close()
+            except OSError as error:
+                raise StartError(f"the nursery of environments takes no order: {error}") from error
+            else:
+                return
+        raise StartError("the nursery of environments dies at once; its reason is in this program's log")
+
+
+async def hear_credentials(sock: socket.socket, size: int) -> tuple[bytes, int]:
+    """Wait for data on a socket with ``SO_PASSCRED``; returns it and its sender's pid, as seen from here.
+
+    At the end of the stream both are empty.
+    """
+    loop = asyncio.get_running_loop()
+    sock.setblocking(False)
+    while True:
+        try:
+            data, ancillary, _, _ = sock.recvmsg(size, socket.CMSG_SPACE(_CREDENTIALS.size))
+        except (BlockingIOError, InterruptedError):
+            await _readable(loop, sock)
+            continue
+        except ConnectionResetError:
+            return b"", 0
+        if not data:
+            return b"", 0
+        for level, kind, value in ancillary:
+            if (level, kind) == (socket.SOL_SOCKET, socket.SCM_CREDENTIALS):
+                return data, _CREDENTIALS.unpack(value)[0]
+        return data, 0
+
+
+async def _hear(sock: socket.socket) -> tuple[Answer | None, int]:
+    data, pid = await hear_credentials(sock, MAX_PACKET)
+    if not data:
+        return None, 0
+    with contextlib.suppress(msgspec.DecodeError):
+        return decode_answer(data), pid
+    return None, 0
+
+
+async def _readable(loop: asyncio.AbstractEventLoop, sock: socket.socket) -> None:
+    ready = loop.create_future()
+    loop.add_reader(sock, _wake, ready)
+    try:
+        await ready
+    finally:
+        loop.remove_reader(sock)
+
+
+def _wake(ready: asyncio.Future[None]) -> None:
+    if not ready.done():
+        ready.set_result(None)

@@ -1,0 +1,65 @@
+"""What the manager tells the nursery and what comes back: JSON packets with descriptors.
+
+The first packet holds the filter of system calls; each one after it is a :class:`Birth`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import msgspec
+from msgspec import Struct
+
+from rce_container.environment.messages import Boot
+
+MAX_PACKET = 1 << 18
+"""Bytes."""
+
+
+class Birth(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """An environment to be made. Comes with the descriptors of :class:`Gifts`."""
+
+    boot: Boot
+    environ: dict[str, str]
+    """All of its environment variables."""
+    uid: int
+    """User and group of the machine that it runs as; 0: the nursery's own."""
+    home_bytes: int
+    """Size of the container's home."""
+    tmp_bytes: int
+    """Size of its ``/tmp``, and of its shared memory."""
+    host_network: bool = False
+    join: tuple[str, ...] = ()
+    """See :attr:`rce_container.runtimes.base.Order.join`."""
+    check: tuple[str, ...] = ()
+    """A command that must succeed in the container before the answer says that all is well."""
+
+
+class Gifts(NamedTuple):
+    """The descriptors that come with a birth, in this order."""
+
+    holder: int
+    """A pidfd of the process that holds the namespaces."""
+    answer: int
+    """A socket on which the environment sends its :class:`Answer`, and by that who it is."""
+    tether: int
+    """The holder's other end: the container lives as long as the environment keeps it open."""
+    control: int
+    links: int
+    log: int
+    """Takes the environment's output."""
+
+
+class Answer(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """How a birth went."""
+
+    error: str = ""
+    """Empty if the environment is about to run."""
+
+
+FAREWELL = b"done\n"
+"""Written to the tether by an environment that ended properly, for the holder to do likewise."""
+
+encode = msgspec.json.Encoder().encode
+decode_birth = msgspec.json.Decoder(Birth).decode
+decode_answer = msgspec.json.Decoder(Answer).decode

@@ -1,0 +1,78 @@
+"""The last touches to a container's mounts, from inside of it and before anything of it runs.
+
+Whoever does it may still mount; what runs later may not, and cannot take any of it back.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from rce_container.nursery.kernel import Mount, mount, unmount
+
+HOME = "/home/rce"
+LOGS = "/var/log/rce"
+TEMPORARY = ("/tmp", "/dev/shm")  # noqa: S108 - the container's own
+
+_BYTES_PER_FILE = 4096
+"""A folder of so many bytes may hold a file for each such piece: empty files take memory too."""
+_FLAGS = Mount.NO_SUID | Mount.NO_DEV
+_HIDDEN = (
+    "/proc/acpi",
+    "/proc/asound",
+    "/proc/config.gz",
+    "/proc/driver",
+    "/proc/kallsyms",
+    "/proc/kcore",
+    "/proc/key-users",
+    "/proc/keys",
+    "/proc/kmsg",
+    "/proc/latency_stats",
+    "/proc/modules",
+    "/proc/mtrr",
+    "/proc/sched_debug",
+    "/proc/scsi",
+    "/proc/slabinfo",
+    "/proc/timer_list",
+    "/proc/timer_stats",
+    "/proc/vmallocinfo",
+)
+_READ_ONLY = ("/proc/bus", "/proc/fs", "/proc/irq", "/proc/sys", "/proc/sysrq-trigger")
+
+
+def limit(path: str, size: int, owner: int) -> None:
+    """Bound a folder that lives in memory, and give it to a user.
+
+    Args:
+        path: A tmpfs.
+        size: Bytes.
+        owner: User and group.
+    """
+    options = f"size={size},nr_inodes={size // _BYTES_PER_FILE}"
+    mount(path, Mount.REMOUNT | _FLAGS, options=options)
+    os.chown(path, owner, owner)
+
+
+def take_away_logs(owner: int) -> int:
+    """Leave no path to the container's logs; returns their folder's descriptor, which leads nowhere else."""
+    logs = os.open(LOGS, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    os.fchown(logs, owner, owner)
+    unmount(LOGS)
+    return logs
+
+
+def mask_machine() -> None:
+    """Hide what ``/proc`` tells of the machine and nobody inside needs, and let nothing of it be changed."""
+    for path in filter(os.path.exists, _HIDDEN):
+        if Path(path).is_dir():
+            mount(path, _FLAGS | Mount.READ_ONLY | Mount.NO_EXEC, kind="tmpfs", options="size=0,mode=555")
+        else:
+            _bind_read_only("/dev/null", path)
+    for path in filter(os.path.exists, _READ_ONLY):
+        _bind_read_only(path, path)
+
+
+def _bind_read_only(source: str, target: str) -> None:
+    mount(target, Mount.BIND, source=source)
+    flags = Mount.REMOUNT | Mount.BIND | Mount.READ_ONLY | Mount.NO_SUID | Mount.NO_EXEC
+    mount(target, flags if source == "/dev/null" else flags | Mount.NO_DEV)

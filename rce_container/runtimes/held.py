@@ -1,0 +1,122 @@
+"""Containers whose namespaces a holder keeps, and whose environment is a child of the nursery."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import socket
+import subprocess
+from collections.abc import Sequence
+from typing import Self
+
+from rce_container.environment import proc
+from rce_container.environment.logs import ENVIRONMENT_LOG, segment_path
+from rce_container.exceptions import StartError
+from rce_container.nursery.keeper import Nursery, hear_credentials
+from rce_container.nursery.messages import FAREWELL, Birth, Gifts
+from rce_container.runtimes.base import SHELL, Handle, Order, Prepare, spawn_shim
+
+HOLDER = (SHELL, "-c", f'echo && read -r word && [ "$word" = {FAREWELL.decode().strip()} ]')
+"""Says that the namespaces and mounts are there, then waits for the environment's farewell."""
+
+_GENERATIONS = 4
+"""How far the holder is from the shim, at most: bubblewrap takes one or two processes between them."""
+
+
+class HeldHandle(Handle):
+    """A container whose namespaces exist before its environment does."""
+
+    def __init__(
+        self, process: proc.Process, popen: subprocess.Popen[bytes], birth: Birth, nursery: Nursery
+    ) -> None:
+        super().__init__(process, "", popen)
+        self._birth = birth
+        self._nursery = nursery
+        self._fds: dict[str, int] = {}
+        """What the environment will get; ours until then."""
+
+    @classmethod
+    def start(cls, argv: Sequence[str], order: Order, birth: Birth, nursery: Nursery, lock: int) -> Self:
+        """Start the shim, and with it the holder.
+
+        Args:
+            argv: Makes the namespaces and runs :data:`HOLDER` in them.
+            order: The container.
+            birth: Its environment.
+            nursery: Makes the environment.
+            lock: A descriptor that shim and holder keep open; -1 for none.
+
+        Raises:
+            StartError: It cannot be started.
+        """
+        tether, theirs = socket.socketpair()
+        with theirs, contextlib.ExitStack() as undo:
+            undo.callback(tether.close)
+            tether.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
+            streams = (theirs.fileno(), theirs.fileno())
+            keep = () if lock < 0 else (lock,)
+            popen, process = spawn_shim(order, argv, {"PATH": os.defpath}, streams, keep=keep)
+            undo.pop_all()
+        handle = cls(process, popen, birth, nursery)
+        log = segment_path(order.folder.logs, ENVIRONMENT_LOG, 0)
+        handle._fds = {
+            "tether": tether.detach(),
+            "control": os.dup(order.control),
+            "links": os.dup(order.links),
+            "log": os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC),
+        }
+        return handle
+
+    async def launch(self, prepare: Prepare | None = None) -> None:
+        """Wait for the namespaces, ready them, and let the nursery give birth to the environment."""
+        try:
+            self.namespaces_pid = await self._holder()
+            holder = self._fds["holder"] = self._open_holder(self.namespaces_pid)
+            if prepare is not None:
+                await prepare(self.namespaces_pid)
+            fds = self._fds
+            gifts = Gifts(holder, -1, fds["tether"], fds["control"], fds["links"], fds["log"])
+            self.environment = proc.read(await self._nursery.bear(self._birth, gifts))
+        finally:
+            self._close()
+
+    def abandon(self) -> None:
+        """Leave the container to itself; one without an environment ends then."""
+        self._close()
+        super().abandon()
+
+    async def _holder(self) -> int:
+        with socket.socket(fileno=os.dup(self._fds["tether"])) as tether:
+            said, pid = await hear_credentials(tether, 1)
+        if not said or not pid:
+            raise StartError("bubblewrap cannot make its namespaces")
+        return pid
+
+    def _open_holder(self, pid: int) -> int:
+        """Open the process, and make sure that it is the holder and not one that took over its pid."""
+        try:
+            holder = os.pidfd_open(pid)
+        except OSError as error:
+            raise StartError(f"the holder of its namespaces cannot be used: {error}") from error
+        descends = _descends(pid, self.process.pid)
+        if select.select((holder,), (), (), 0)[0] or not descends:
+            os.close(holder)
+            raise StartError("the holder of its namespaces died")
+        return holder
+
+    def _close(self) -> None:
+        for fd in self._fds.values():
+            os.close(fd)
+        self._fds.clear()
+
+
+def _descends(pid: int, ancestor: int) -> bool:
+    for _ in range(_GENERATIONS):
+        process = proc.read(pid)
+        if process is None:
+            return False
+        pid = process.parent
+        if pid == ancestor:
+            return True
+    return False

@@ -1,0 +1,1 @@
+"""The filter of system calls of containers: what is allowed, and its translation for the kernel."""

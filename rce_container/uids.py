@@ -1,0 +1,70 @@
+"""Users of the machine that belong to nobody, one for each container."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from pathlib import Path
+
+from rce_container.exceptions import StartError
+
+FIRST_UID = 700_000
+UIDS = 10_000
+"""The users for containers, unless others are set."""
+
+LOCKS = Path("/run/rce/uids")
+"""One lock file for each user that was ever given out, for all engines of the machine."""
+
+
+class UidPool:
+    """Gives out users. One is taken for as long as a descriptor of its lock is open in any process.
+
+    So it stays taken when the manager dies and its containers live, and is free when the last process that
+    inherited the lock is gone, however that happened.
+
+    Args:
+        first: The first user, and group.
+        count: How many there are.
+        folder: Where the locks are; one for the whole machine.
+    """
+
+    def __init__(self, first: int, count: int, folder: Path = LOCKS) -> None:
+        self._first = first
+        self._count = count
+        self._folder = folder
+        self._next = 0
+
+    def take(self) -> tuple[int, int]:
+        """Take a user.
+
+        Returns:
+            The user and a descriptor of its lock, for the container's processes to inherit.
+
+        Raises:
+            StartError: All are taken, or the locks cannot be used.
+        """
+        try:
+            self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            for _ in range(self._count):
+                uid = self._first + self._next
+                self._next = (self._next + 1) % self._count
+                lock = self._open(uid)
+                try:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    os.close(lock)
+                else:
+                    return uid, lock
+        except OSError as error:
+            raise StartError(f"cannot give out users by locks in {self._folder}: {error}") from error
+        raise StartError(
+            f"all {self._count} users from {self._first} on belong to containers; allow more of them"
+        )
+
+    def _open(self, uid: int) -> int:
+        """Open a lock; shells use the numbers below ten for themselves."""
+        lock = os.open(self._folder / str(uid), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            return fcntl.fcntl(lock, fcntl.F_DUPFD_CLOEXEC, 10)
+        finally:
+            os.close(lock)
