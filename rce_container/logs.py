@@ -8,9 +8,12 @@ import stat
 from pathlib import Path
 from typing import NamedTuple
 
-from rce_container.environment.logs import ENVIRONMENT_LOG, segments
+from rce_container.environment.logs import ENVIRONMENT_LOG, ROSOUT_LOG, segments
+from rce_container.environment.streams import FRAGMENT_BYTES, text_of
 
 MAX_CHUNK = 1 << 20
+_MIN_FRAGMENTS = 2 * (FRAGMENT_BYTES + 2)
+"""Enough to find the beginning of a fragment, and the whole of it."""
 _FLAGS = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
@@ -22,12 +25,20 @@ class Chunk(NamedTuple):
     """Where the next read goes on."""
 
 
-def read_log(folder: Path, node: str, offset: int, limit: int) -> Chunk:
-    """Read a piece of a node's log.
+class _Raw(NamedTuple):
+    data: bytes
+    offset: int
+    """Of its first byte."""
+    is_start: bool
+    """Whether nothing before it is kept."""
+
+
+def read_log(folder: Path, name: str, offset: int, limit: int) -> Chunk:
+    """Read a piece of a log of plain text: the environment's own, or that of ROS's log records.
 
     Args:
         folder: The container's log folder.
-        node: The node's tag; empty for the environment's own log.
+        name: The log's name.
         offset: Bytes since the log began; negative counts from its end. What is not kept
             any more is passed over.
         limit: Bytes to read at most.
@@ -35,22 +46,61 @@ def read_log(folder: Path, node: str, offset: int, limit: int) -> Chunk:
     Raises:
         OSError: The log cannot be read; ``FileNotFoundError`` if there is none.
     """
-    kept = [(start, path, _size(path)) for start, path in segments(folder, node or ENVIRONMENT_LOG)]
+    raw = _raw(folder, name, offset, max(1, min(limit, MAX_CHUNK)))
+    text, used = _decode(raw.data)
+    return Chunk(text, raw.offset + used)
+
+
+def read_node_log(folder: Path, tag: str, offset: int, limit: int, letters: bytes) -> Chunk:
+    """Read a piece of a node's log, whole lines or whole parts of very long ones.
+
+    Args:
+        folder: The container's log folder.
+        tag: The node.
+        offset: As for :func:`read_log`; within a line, the next one is meant.
+        limit: Bytes of the log to read at most, though never less than it takes to get on.
+        letters: Of which streams (:func:`rce_container.environment.streams.letters_of`). What is left out is
+            passed over: the text may be empty though the log goes on.
+
+    Raises:
+        OSError: As for :func:`read_log`.
+    """
+    raw = _raw(folder, tag, offset, max(_MIN_FRAGMENTS, min(limit, MAX_CHUNK)), before=1)
+    begin = 0 if raw.is_start else raw.data.find(b"\n") + 1
+    end = raw.data.rfind(b"\n") + 1
+    if not end:  # nothing yet, or nothing that an environment wrote
+        used = len(raw.data) if len(raw.data) >= _MIN_FRAGMENTS or not raw.is_start else 0
+        return Chunk("", raw.offset + used)
+    return Chunk(text_of(raw.data[begin:end], letters).decode(errors="replace"), raw.offset + end)
+
+
+def last_line(folder: Path, name: str = ENVIRONMENT_LOG, *, within: int = 4096) -> str:
+    """The last line of a plain log with something in it; empty if there is none to be read."""
+    try:
+        text = read_log(folder, name, -within, within).text
+    except OSError:
+        return ""
+    lines = text.strip().splitlines()
+    return lines[-1].strip() if lines else ""
+
+
+def _raw(folder: Path, name: str, offset: int, limit: int, *, before: int = 0) -> _Raw:
+    """Read bytes; ``before`` so many more than what was asked for, where there are any."""
+    kept = [(start, path, _size(path)) for start, path in segments(folder, name)]
     if not kept:
-        raise FileNotFoundError(f"there is no log of {node or 'the environment'}")
-    end = kept[-1][0] + kept[-1][2]
+        what = {ENVIRONMENT_LOG: "the environment", ROSOUT_LOG: "ROS's log records"}.get(name, name)
+        raise FileNotFoundError(f"there is no log of {what}")
+    first, end = kept[0][0], kept[-1][0] + kept[-1][2]
     if offset < 0:
         offset = end + offset
-    offset = min(max(offset, kept[0][0]), end)
+    offset = max(min(max(offset, first), end) - before, first)
     data = bytearray()
-    limit = max(1, min(limit, MAX_CHUNK))
     at = offset
     for start, path, size in kept:
         if start <= at < start + size and len(data) < limit:
             data += _read(path, at - start, min(limit - len(data), start + size - at))
             at = offset + len(data)
-    text, used = _decode(bytes(data))
-    return Chunk(text, offset + used)
+    return _Raw(bytes(data), offset, offset == first)
 
 
 def _size(path: Path) -> int:

@@ -7,10 +7,12 @@ import contextlib
 import logging
 from collections import deque
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import psutil
 
+from rce.control.logs import LogStream
 from rce.control.messages import (
     CONTROL_VERSION,
     Drop,
@@ -32,13 +34,15 @@ from rce_container.environment import messages as m
 from rce_container.environment import proc
 from rce_container.environment.channel import connect
 from rce_container.environment.exceptions import ChannelError
+from rce_container.environment.logs import ENVIRONMENT_LOG, ROSOUT_LOG
 from rce_container.environment.process import strike_all
+from rce_container.environment.streams import letters_of
 from rce_container.exceptions import ContainerError, NetworkError, StartError, StateError
 from rce_container.folder import ContainerFolder, Record
 from rce_container.life import Phase
 from rce_container.limits import Cell, limits_of
 from rce_container.limits.warden import Warden
-from rce_container.logs import read_log
+from rce_container.logs import Chunk, read_log, read_node_log
 from rce_container.network import Networks
 from rce_container.runtimes.base import Handle, Order
 from rce_container.unit import Office, Unit
@@ -395,10 +399,18 @@ class Manager:
                 request=message.request, offset=message.offset, error=f"there is no log of {message.node!r}"
             )
         try:
-            chunk = read_log(unit.folder.logs, message.node, message.offset, message.limit)
+            chunk = self._read_piece(unit.folder.logs, message)
         except OSError as error:
             return LogChunk(request=message.request, offset=message.offset, error=str(error))
         return LogChunk(request=message.request, offset=chunk.offset, text=chunk.text)
+
+    @staticmethod
+    def _read_piece(folder: Path, message: ReadLog) -> Chunk:
+        if message.node:
+            letters = letters_of(message.streams, message.level)
+            return read_node_log(folder, message.node, message.offset, message.limit, letters)
+        name = ROSOUT_LOG if LogStream.ROSOUT in message.streams else ENVIRONMENT_LOG
+        return read_log(folder, name, message.offset, message.limit)
 
     async def _report_usage(self) -> None:
         while True:

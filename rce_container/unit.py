@@ -23,7 +23,7 @@ from rce_container.environment.exceptions import ChannelError
 from rce_container.exceptions import KillError, LimitError, NetworkError, StartError, StateError
 from rce_container.folder import ContainerFolder
 from rce_container.limits.warden import Warden
-from rce_container.logs import read_log
+from rce_container.logs import last_line
 from rce_container.network import Networks
 from rce_container.runtimes.base import Handle
 from rce_container.settings import ContainerSettings
@@ -32,7 +32,6 @@ log = logging.getLogger(__name__)
 
 _SHIM_TIMEOUT_S = 5.0
 """What the shim gets to remove the folders of a container that ended properly."""
-_LAST_WORDS_BYTES = 4096
 _LAST_WORDS_LENGTH = 300
 _DIAL_TIMEOUT_S = 5.0
 
@@ -277,12 +276,8 @@ class Unit:
     # The end
 
     def _last_words(self) -> str:
-        try:
-            text = read_log(self.folder.logs, "", -_LAST_WORDS_BYTES, _LAST_WORDS_BYTES).text
-        except OSError:
-            return ""
-        lines = text.strip().splitlines()
-        return f"; its last words: {lines[-1].strip()[:_LAST_WORDS_LENGTH]}" if lines else ""
+        words = last_line(self.folder.logs)[:_LAST_WORDS_LENGTH]
+        return f"; its last words: {words}" if words else ""
 
     async def _clean(self, patience: float) -> None:
         """Let the shim do its work for ``patience`` seconds, then kill what is left and remove the folder."""

@@ -13,6 +13,7 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
+from rce.control.logs import LogLevel, LogStream
 from rce.control.model import (
     EndpointSpec,
     EndpointStatus,
@@ -50,6 +51,8 @@ class MachineInfo(Struct, frozen=True, kw_only=True, omit_defaults=True, tag_fie
     """All runtimes that work here."""
     draining: bool = False
     """It takes no new containers: its operator said so where it runs."""
+    requirements: bool = False
+    """Whether it installs what packages that users bring ask for in their ``requirements.txt``."""
     detail: str = ""
     """What is missing on this machine, in words."""
 
@@ -142,6 +145,12 @@ class LogChunk(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """Where the next read goes on."""
     text: str = ""
     error: str = ""
+    life: str = ""
+    """The container's life (its incarnation) of which this is the log."""
+    ended: float = 0.0
+    """When that life ended, in seconds since the epoch; 0 if it has not."""
+    reason: str = ""
+    """Why it ended."""
 
 
 # Master to task set
@@ -215,6 +224,16 @@ class ReadLog(_Message, frozen=True, kw_only=True, omit_defaults=True):
     offset: int = 0
     """Negative: that many bytes before the end."""
     limit: int = 65536
+    streams: tuple[LogStream, ...] = ()
+    """Only these; all if empty. The environment's log knows ``rosout`` only, which is another log there."""
+    level: LogLevel = LogLevel.DEBUG
+    """Of records in ROS only those that are at least as serious."""
+    life: str = ""
+    """Of which life, as :attr:`LogChunk.life` said; empty: of the one that lives, or else the last one."""
+    previous: bool = False
+    """Of the last life that ended, even if the container lives; goes without ``life``."""
+    since: float = 0.0
+    """Not of lives that ended before that, in seconds since the epoch: they were another user's."""
 
 
 ToMaster = Hello | Status | Gone | Fault | Usage | Login | Left | ClientRequest | LogChunk

@@ -18,8 +18,11 @@ from rce.link.handover import HandoverReceiver
 from rce.protocol.names import EndpointId
 from rce.ros.core import Core
 from rce.ros.core.events import Change
+from rce.ros.core.rosout import AGGREGATE
 from rce.ros.errors import RosError
+from rce.ros.logrecord import KIND, MD5SUM
 from rce.ros.node import Node
+from rce.ros.node.runtime import TypeName
 from rce.ros.node.settings import is_loopback
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
@@ -28,13 +31,16 @@ from rce_container.environment import messages as m
 from rce_container.environment.causes import Causes
 from rce_container.environment.channel import Channel, accept
 from rce_container.environment.exceptions import ChannelError
+from rce_container.environment.heartbeats import Heartbeats
 from rce_container.environment.interfaces import InterfaceMaker, Readiness
 from rce_container.environment.launch import OWN_NODE
-from rce_container.environment.nodes import NodeSet, Workshop
+from rce_container.environment.nodelife import Workshop
+from rce_container.environment.nodes import NodeSet
 from rce_container.environment.parameters import Values, difference, evaluate_all
 from rce_container.environment.process import strike_all
 from rce_container.environment.reach import Operator
 from rce_container.environment.reaper import Reaper
+from rce_container.environment.rosout import RosoutLog
 
 log = logging.getLogger(__name__)
 
@@ -92,7 +98,10 @@ class Environment:
             async with asyncio.TaskGroup() as tasks:
                 self._tasks = tasks
                 self._nodes = NodeSet(self._workshop(reaper), tasks)
-                readiness = Readiness(lambda: self._nodes.settling)
+                self._rosout = stack.enter_context(contextlib.closing(self._keep_records()))
+                await node.subscribe_serialized(AGGREGATE, TypeName(KIND, MD5SUM), self._rosout.take)
+                self._heartbeats = Heartbeats(node, self._nodes.beat, self._fault)
+                readiness = Readiness(lambda: self._nodes.is_settling)
                 self._endpoint = Endpoint(
                     EndpointId.parse(self._boot.id),
                     InterfaceMaker(node, types, readiness),
@@ -134,6 +143,9 @@ class Environment:
                 timer.cancel()
         if self._channel is not None:
             self._channel.close()
+
+    def _keep_records(self) -> RosoutLog:
+        return RosoutLog(Path(self._boot.logs), self._nodes.log_of, self._loop.time)
 
     def _workshop(self, reaper: Reaper) -> Workshop:
         return Workshop(
@@ -189,6 +201,7 @@ class Environment:
             await self._news.wait()
             self._news.clear()
             spec = self._desired
+            await self._heartbeats.follow(spec.nodes)
             await self._endpoint.apply(spec)
             self._applied_revision = spec.revision
             self._changed()
@@ -204,7 +217,7 @@ class Environment:
         status = EndpointStatus(
             id=self._boot.id,
             revision=self._applied_revision,
-            state=EndpointState.STOPPING if self._ending.is_set() else EndpointState.RUNNING,
+            state=self._state,
             nodes=self._nodes.statuses,
             interfaces=dict(self._endpoint.interfaces),
             connections=self._endpoint.connections,
@@ -212,6 +225,12 @@ class Environment:
         if status != self._told and self._channel is not None:
             self._told = status
             self._channel.send(m.encode(m.Report(status=status)))
+
+    @property
+    def _state(self) -> EndpointState:
+        if self._ending.is_set():
+            return EndpointState.STOPPING
+        return EndpointState.DEGRADED if self._nodes.is_degraded else EndpointState.RUNNING
 
     def _fault(self, text: str) -> None:
         log.warning("%s", text)
@@ -225,7 +244,11 @@ class Environment:
         with self._core.watch() as events:
             async with RpcClient() as client, asyncio.TaskGroup() as tasks:
                 async for event in events:
-                    if event.change is Change.NODE_APPEARED and not self._nodes.registered(event.node):
+                    if event.change is not Change.NODE_APPEARED:
+                        continue
+                    if self._nodes.registered(event.node):
+                        self._rosout.known(event.node)
+                    else:
                         tasks.create_task(self._identify(client, event.node), name="identify")
 
     async def _identify(self, client: RpcClient, name: str) -> None:
@@ -235,7 +258,8 @@ class Environment:
             return
         try:
             _, _, pid = await client.call(uri, "getPid", (OWN_NODE,), timeout=_GET_PID_TIMEOUT_S)
-            self._nodes.registered_process(int(pid))
+            if self._nodes.registered_process(name, int(pid)):
+                self._rosout.known(name)
         except (RosError, TypeError, ValueError) as error:
             log.info("node %s does not tell its process: %s", name, error)
 

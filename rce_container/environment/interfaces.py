@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from rce.ros.node import Node, Publisher, Service, ServiceClient, Subscriber
     from rce.ros.types import TypeRegistry
 
-READY_TIMEOUT_S = 5.0
-"""How long an interface waits for a node that is starting, at most."""
+READY_TIMEOUT_S = 30.0
+"""How long an interface waits for nodes that start one after the other, at most."""
 _LOOK_AGAIN_S = 0.05
 
 
@@ -25,7 +25,8 @@ class Readiness:
     """Makes a started interface mean: it will be heard.
 
     Args:
-        settling: Whether nodes of the container are just starting, and may yet take up a topic or service.
+        settling: Whether nodes of the container are just starting, or soon will, and may yet take up a topic
+            or service.
     """
 
     def __init__(self, settling: Callable[[], bool]) -> None:

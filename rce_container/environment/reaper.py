@@ -58,8 +58,10 @@ class Reaper:
         signal.signal(signal.SIGCHLD, self._before)
         self._reap()
 
-    def spawn(self, argv: Sequence[str], *, env: Mapping[str, str], cwd: str, output: int) -> Child:
-        """Start a process in a new session, with standard output and error to ``output``.
+    def spawn(
+        self, argv: Sequence[str], *, env: Mapping[str, str], cwd: str, stdout: int, stderr: int
+    ) -> Child:
+        """Start a process in a new session, with standard output and error to two descriptors.
 
         Raises:
             OSError: It cannot be started.
@@ -69,8 +71,8 @@ class Reaper:
             env=env,
             cwd=cwd,
             stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=output,
+            stdout=stdout,
+            stderr=stderr,
             start_new_session=True,
         )
         child = Child(process, asyncio.get_running_loop().create_future())

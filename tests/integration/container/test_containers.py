@@ -257,7 +257,7 @@ async def test_a_namespace_hides_the_machine(machine: Machine, monkeypatch: pyte
         async with machine.engine():
             look = own("look.py", f"127.0.0.1 {port} {machine.folder}/state")
             await machine.put("user/box", nodes=(look, own("talk.py", tag="other")))
-            seen = json.loads((await machine.log_holds(BOX, "node", "}\n")).splitlines()[-1])
+            seen = json.loads((await machine.log_holds(BOX, "node", "}\n")).splitlines()[0])
     assert not [name for name in seen["env"] if name.startswith(("RCE_SECRET", "XDG", "PYTEST"))]
     assert seen["env"]["HOME"] == HOME
     assert seen["host"] == "box"

@@ -13,7 +13,7 @@ from rce.ros.packages import PackageIndex
 from rce_container.environment import system
 from rce_container.environment.exceptions import NodeError
 from rce_container.environment.launch import NODE_MARK, prepare
-from rce_container.environment.nodes import describe_exit
+from rce_container.environment.nodelife import describe_exit
 
 
 @pytest.fixture
