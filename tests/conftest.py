@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import shutil
 import subprocess
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator
@@ -47,6 +49,17 @@ def _can_make_networks() -> bool:
         _runs("ip", "netns", "del", name)
 
 
+def _can_limit() -> bool:
+    """Try as a container task set does."""
+    from rce_container.limits import choose_limiter
+
+    with (
+        tempfile.TemporaryDirectory() as scratch,
+        contextlib.closing(choose_limiter(f"check-{os.getpid()}", Path(scratch) / "cgroups")) as limiter,
+    ):
+        return not limiter.missing
+
+
 _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
     "bwrap": (
         lambda: _runs("bwrap", "--unshare-all", "--ro-bind", "/", "/", "true"),
@@ -72,6 +85,10 @@ _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
         lambda: _runs("pkg-config", "--exists", "roscpp") and shutil.which("g++") is not None,
         "roscpp cannot be compiled against (Debian: g++ pkg-config libroscpp-dev libstd-srvs-dev)",
     ),
+    "roscpp_actionlib": (
+        lambda: _runs("pkg-config", "--exists", "actionlib", "roscpp") and shutil.which("g++") is not None,
+        "roscpp's actionlib cannot be compiled against (Debian: g++ pkg-config libactionlib-dev)",
+    ),
     "roslaunch": (
         lambda: _runs("/usr/bin/python3", "-c", "import roslaunch, rosmaster, rostest, roswtf"),
         "roslaunch is missing (Debian: ros-core python3-rostest python3-roswtf)",
@@ -95,6 +112,7 @@ _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
         "the folder of public maps and logs is absent (set RCE_DATA)",
     ),
     "root": (lambda: os.geteuid() == 0, "needs root"),
+    "cgroups": (_can_limit, "no cgroup can be made here (needs root, or a delegated subtree)"),
     "netns": (_can_make_networks, "may not make network namespaces here (needs root and ip)"),
 }
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+import subprocess
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from rce.ros.actions import ActionClient, ActionServer, GoalFailed, GoalState, S
 from rce.ros.core import Core
 from rce.ros.node import Node
 
-pytestmark = pytest.mark.needs("actionlib")
+pytestmark = [pytest.mark.needs("actionlib"), pytest.mark.timeout(300)]
 
 TEST = "actionlib/TestAction"
 
@@ -111,6 +112,7 @@ goals[0].cancel()
 until(lambda: goals[0].get_comm_state() == actionlib.CommState.DONE)
 many.cancel_all_goals()
 until(lambda: goals[1].get_comm_state() == actionlib.CommState.DONE)
+until(lambda: all(changes.get(n, ["none"])[-1] == "DONE" for n in goals))  # callbacks come after the state
 report["full"] = {n: [GoalStatus.to_string(g.get_terminal_state()), g.get_goal_status_text()]
                   for n, g in goals.items()}
 report["changes"] = changes
@@ -130,13 +132,42 @@ def environment(core: Core, folder: Path) -> dict[str, str]:
     }
 
 
+PROGRAMS = Path(__file__).parent / "programs"
+LANGUAGES = ["rospy", pytest.param("roscpp", marks=pytest.mark.needs("roscpp_actionlib"))]
+Peer = Callable[[str], AbstractAsyncContextManager[asyncio.subprocess.Process]]
+"""Starts "servers" or "client" of a real actionlib."""
+
+
+@pytest.fixture(scope="session")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The roscpp program."""
+    program = tmp_path_factory.mktemp("roscpp_actions") / "roscpp_actions"
+    find = ["pkg-config", "--cflags", "--libs", "actionlib", "roscpp"]
+    flags = subprocess.run(find, capture_output=True, text=True, check=True).stdout.split()
+    source = str(PROGRAMS / "roscpp_actions.cpp")
+    subprocess.run(["g++", "-O0", "-o", str(program), source, *flags], check=True, timeout=240)
+    return program
+
+
+@pytest.fixture(params=LANGUAGES)
+def peer(request: pytest.FixtureRequest, core: Core, tmp_path: Path) -> Peer:
+    """A real actionlib's other end, in both languages."""
+    if request.param == "rospy":
+        script = tmp_path / "program.py"
+
+        def start(what: str) -> AbstractAsyncContextManager[asyncio.subprocess.Process]:
+            script.write_text({"servers": SERVERS, "client": CLIENT}[what])
+            return program(core, tmp_path, "/usr/bin/python3", str(script))
+
+        return start
+    binary = request.getfixturevalue("compiled")
+    return lambda what: program(core, tmp_path, str(binary), what)
+
+
 @asynccontextmanager
-async def rospy_program(core: Core, folder: Path, text: str) -> AsyncIterator[asyncio.subprocess.Process]:
-    script = folder / "program.py"
-    script.write_text(text)
+async def program(core: Core, folder: Path, *argv: str) -> AsyncIterator[asyncio.subprocess.Process]:
     process = await asyncio.create_subprocess_exec(
-        "/usr/bin/python3",
-        str(script),
+        *argv,
         env=environment(core, folder),
         stdout=asyncio.subprocess.PIPE,
         start_new_session=True,
@@ -154,9 +185,9 @@ def node(core: Core) -> Node:
     return Node("ours", argv=[], master_uri=core.uri)
 
 
-async def test_our_client_at_a_simple_server_of_rospy(core: Core, node: Node, tmp_path: Path) -> None:
+async def test_our_client_at_a_simple_server(node: Node, peer: Peer) -> None:
     async with (
-        rospy_program(core, tmp_path, SERVERS),
+        peer("servers"),
         node,
         ActionClient(node, "simple", TEST) as client,
         asyncio.timeout(50),
@@ -182,9 +213,9 @@ async def test_our_client_at_a_simple_server_of_rospy(core: Core, node: Node, tm
         assert (await third.result()).result == 2
 
 
-async def test_our_client_at_a_full_server_of_rospy(core: Core, node: Node, tmp_path: Path) -> None:
+async def test_our_client_at_a_full_server(node: Node, peer: Peer) -> None:
     async with (
-        rospy_program(core, tmp_path, SERVERS) as process,
+        peer("servers") as process,
         node,
         ActionClient(node, "full", TEST, patience=4) as client,
         asyncio.timeout(50),
@@ -230,11 +261,11 @@ async def choose(goal: ServerGoal) -> dict[str, Any] | None:
     return await answer(goal)
 
 
-async def test_rospys_clients_at_our_servers(core: Core, node: Node, tmp_path: Path) -> None:
+async def test_real_clients_at_our_servers(node: Node, peer: Peer) -> None:
     go = asyncio.Semaphore(0)
 
     async def patient(goal: ServerGoal) -> dict[str, Any] | None:
-        """Wait until the client knows of its goal: rospy's simple client forgets one that ends before."""
+        """Wait until the client knows of its goal: a real simple client forgets one that ends before."""
         await go.acquire()
         return await answer(goal)
 
@@ -245,7 +276,7 @@ async def test_rospys_clients_at_our_servers(core: Core, node: Node, tmp_path: P
         asyncio.timeout(50),
     ):
         await node.advertise_service("go", "roscpp/Empty", lambda _: go.release())
-        async with rospy_program(core, tmp_path, CLIENT) as process:
+        async with peer("client") as process:
             output, _ = await process.communicate()
     assert process.returncode == 0
     report = json.loads(output)
