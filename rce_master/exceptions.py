@@ -8,7 +8,9 @@
     |   +-- NotFound            it names something that is not there
     |   +-- Conflict            it contradicts what is there
     |   +-- LimitReached        there are too many already
+    |   +-- NoRoom              no machine, or not its own, has enough of what a container asks for
     |   +-- Forbidden           this user may not do it
+    |   +-- Busy                too much of the kind is done just now
     +-- AuthError
     |   +-- WrongCredentials    unknown user, wrong password, unknown or expired token
     |   +-- TooManyFailures     too many wrong passwords; wait
@@ -60,10 +62,22 @@ class LimitReached(Refused):
     status = 409
 
 
+class NoRoom(Refused):
+    """No machine, or not its own, has enough of what a container asks for."""
+
+    status = 409
+
+
 class Forbidden(Refused):
     """The user may not do it."""
 
     status = 403
+
+
+class Busy(Refused):
+    """Too much of the kind is done just now."""
+
+    status = 503
 
 
 class AuthError(MasterError):

@@ -87,6 +87,10 @@ class Realm:
         """
         return self.state.spec(endpoint)
 
+    def copy_spec(self, endpoint: str) -> tuple[str, EndpointSpec] | None:
+        """Tell where a container is being handed over to, and what is desired there; None if it is not."""
+        return self.state.copy_spec(endpoint)
+
     async def submit(self, command: Command) -> None:
         """Do a command; returns when it is stored and everybody was told.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Protocol
 
-from rce.control.exceptions import ControlError
+from rce.control.exceptions import ControlError, PeerRefusedError
 from rce.control.messages import (
     Drop,
     Fault,
@@ -21,7 +21,7 @@ from rce.control.messages import (
     ToTaskSet,
     Usage,
 )
-from rce_master.exceptions import NotFound, TaskSetAway
+from rce_master.exceptions import NotFound, Refused, TaskSetAway
 from rce_master.state import commands
 from rce_master.state.lifecycle import RobotSession
 
@@ -69,11 +69,14 @@ class Reconciler:
         """Take a task set that just connected: adopt what runs there and tell it what is desired.
 
         Raises:
+            PeerRefusedError: Its name cannot be used.
             StoreError: It cannot be stored; the task set is not taken.
         """
         self._arriving[peer.process] = peer
         try:
             await self._realm.submit(commands.TaskSetArrived(hello=hello))
+        except Refused as error:
+            raise PeerRefusedError(str(error)) from error
         finally:
             self._arriving.pop(peer.process, None)
 
@@ -138,6 +141,9 @@ class Reconciler:
             endpoint = self._realm.tables.endpoints.get(id_)
             if endpoint is not None and id_ != changes.answered:
                 self._send(endpoint.task_set, Put(endpoint=self._realm.spec(id_)))
+                copy = self._realm.copy_spec(id_)
+                if copy is not None:
+                    self._send(copy[0], Put(endpoint=copy[1]))
         if changes.arrived:
             self._sync(changes.arrived)
         for notice in changes.notices:

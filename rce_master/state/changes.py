@@ -12,8 +12,10 @@ from rce_master.state.records import (
     Container,
     ContainerLive,
     Counter,
+    Drain,
     Endpoint,
     Link,
+    Move,
     PackageKey,
     Presence,
     Robot,
@@ -142,7 +144,9 @@ class Transaction:
         | RobotLive
         | ContainerLive
         | Presence
-        | Tombstone,
+        | Tombstone
+        | Drain
+        | Move,
     ) -> None:
         """Write a record into its table."""
         self._assign(self._table_of(record), record)
@@ -232,5 +236,7 @@ class Transaction:
             ContainerLive: tables.live,
             Presence: tables.presence,
             Tombstone: tables.tombstones,
+            Drain: tables.drains,
+            Move: tables.moves,
         }
         return by_type[type(record)]

@@ -155,6 +155,15 @@ class RobotLeft:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SetDraining:
+    """An operator wants a machine to be emptied, or not any more."""
+
+    machine: str
+    """Its name, or that of its container task set."""
+    draining: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Tick:
     """Time passed: grace times end, waiting containers are placed."""
 
@@ -302,6 +311,7 @@ Command: TypeAlias = (
     | FaultReported
     | RobotLogin
     | RobotLeft
+    | SetDraining
     | Tick
     | Request
 )

@@ -7,19 +7,20 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from rce.control.messages import TaskSetKind
 from rce.control.model import (
     EndpointState,
     EndpointStatus,
     LinkAddress,
+    NodeSpec,
     NodeState,
     NodeStatus,
     ParameterValue,
 )
+from rce.protocol.wishes import find_circle
 from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
-from rce_master.state import endpoints, packages
+from rce_master.state import capacity, draining, endpoints, packages, placing
 from rce_master.state.lifecycle import ContainerEvent, ContainerPhase, next_phase
-from rce_master.state.records import Container, ContainerLive, TaskSet, tombstone_key
+from rce_master.state.records import Container, ContainerLive
 
 if TYPE_CHECKING:
     from rce_master.state.changes import Transaction
@@ -37,6 +38,7 @@ _INT32 = 2**31
 _EVENTS = {
     EndpointState.STARTING: ContainerEvent.STARTING,
     EndpointState.RUNNING: ContainerEvent.RUNNING,
+    EndpointState.DEGRADED: ContainerEvent.DEGRADED,
     EndpointState.ABSENT: ContainerEvent.STARTING,
     EndpointState.STOPPING: ContainerEvent.STOPPING,
     EndpointState.FAILED: ContainerEvent.FAILED,
@@ -51,32 +53,34 @@ def create_container(tx: Transaction, command: CreateContainer) -> None:
     id_ = f"{command.user}/{command.tag}"
     there = tx.tables.endpoints.get(id_)
     if isinstance(there, Container):
-        if there.resources != command.resources:
+        if command.resources not in (there.resources, there.made):
             raise Conflict(
-                f"container {command.tag!r} exists with other settings; destroy it first or use another tag"
+                f"container {command.tag!r} exists with other settings; resize or destroy it first"
             )
         return
     if there is not None:
         raise Conflict(f"{command.tag!r} is a robot already; a container needs another tag")
     if len(tx.tables.containers(command.user)) >= tx.settings.max_containers:
         raise LimitReached(f"you have {tx.settings.max_containers} containers already; destroy one first")
-    made = Container(id=id_, resources=command.resources)
+    capacity.check_wish(tx, command.user, id_, command.resources)
+    made = Container(id=id_, resources=command.resources, number=tx.next_number("container"))
     tx.put(replace(made, size=endpoints.grown(tx, made, command.resources)))
     tx.put(ContainerLive(id=id_, phase=ContainerPhase.REQUESTED, since=tx.now))
     tx.touch(id_)
     tx.happen("container_requested", id_)
+    placing.admit(tx, made, wait=command.wait)
 
 
 def destroy_container(tx: Transaction, command: DestroyContainer) -> None:
     """Remove a container with all that is in it and connected to it."""
-    container = _find(tx, command.user, command.tag)
+    container = find(tx, command.user, command.tag)
     endpoints.remove(tx, container.id, "destroyed by its user")
     tx.happen("container_destroyed", container.id)
 
 
 def add_node(tx: Transaction, command: AddNode) -> None:
     """Add a node; the same one again is accepted silently."""
-    container = _find(tx, command.user, command.container)
+    container = find(tx, command.user, command.container)
     node = command.node
     there = container.nodes.get(node.tag)
     if there == node:
@@ -86,6 +90,7 @@ def add_node(tx: Transaction, command: AddNode) -> None:
             f"node {node.tag!r} of container {container.tag!r} exists with other settings; remove it first"
         )
     packages.check_node(tx.tables, command.user, node)
+    _check_order(container, node)
     if len(container.nodes) >= tx.settings.max_nodes:
         raise LimitReached(f"container {container.tag!r} has {tx.settings.max_nodes} nodes already")
     size = endpoints.grown(tx, container, node)
@@ -93,9 +98,17 @@ def add_node(tx: Transaction, command: AddNode) -> None:
     tx.touch(container.id)
 
 
+def _check_order(container: Container, node: NodeSpec) -> None:
+    """Refuse nodes that would wait for one another for ever; what a node comes after may be yet to come."""
+    after = {other.tag: other.after for other in (*container.nodes.values(), node)}
+    circle = find_circle(node.tag, after)
+    if circle:
+        raise Invalid(f"node {node.tag!r}: after goes round in a circle: {' after '.join(circle)}")
+
+
 def remove_node(tx: Transaction, command: RemoveNode) -> None:
     """Remove a node."""
-    container = _find(tx, command.user, command.container)
+    container = find(tx, command.user, command.container)
     if command.tag not in container.nodes:
         raise NotFound(f"container {container.tag!r} has no node {command.tag!r}")
     kept = {t: n for t, n in container.nodes.items() if t != command.tag}
@@ -106,7 +119,7 @@ def remove_node(tx: Transaction, command: RemoveNode) -> None:
 
 def set_parameter(tx: Transaction, command: SetParameter) -> None:
     """Set a parameter, whatever it was before."""
-    container = _find(tx, command.user, command.container)
+    container = find(tx, command.user, command.container)
     _check_value(command.name, command.value)
     there = container.parameters.get(command.name)
     if there == command.value and type(there) is type(command.value):
@@ -124,7 +137,7 @@ def set_parameter(tx: Transaction, command: SetParameter) -> None:
 
 def delete_parameter(tx: Transaction, command: DeleteParameter) -> None:
     """Delete a parameter."""
-    container = _find(tx, command.user, command.container)
+    container = find(tx, command.user, command.container)
     if command.name not in container.parameters:
         raise NotFound(f"container {container.tag!r} has no parameter {command.name!r}")
     kept = {n: v for n, v in container.parameters.items() if n != command.name}
@@ -141,7 +154,12 @@ def _check_value(name: str, value: ParameterValue) -> None:
             raise Invalid(f"parameter {name!r}: {item} is not a finite number")
 
 
-def _find(tx: Transaction, user: str, tag: str) -> Container:
+def find(tx: Transaction, user: str, tag: str) -> Container:
+    """Find a container of a user.
+
+    Raises:
+        Refused: There is none; the text says what there is.
+    """
     found = tx.tables.endpoints.get(f"{user}/{tag}")
     if isinstance(found, Container):
         return found
@@ -150,81 +168,13 @@ def _find(tx: Transaction, user: str, tag: str) -> Container:
     raise NotFound(f"there is no container {tag!r}; create it first")
 
 
-# Placement
-
-
-def place_waiting(tx: Transaction) -> None:
-    """Place every container that is placed nowhere and for which there is a machine."""
-    for endpoint in tx.tables.endpoints.by("task_set", ""):
-        if isinstance(endpoint, Container):
-            task_set = _choose(tx, endpoint)
-            if task_set is not None:
-                bind(tx, endpoint, task_set.process)
-
-
-def bind(tx: Transaction, container: Container, process: str) -> None:
-    """Make a task set responsible for a container."""
-    tx.put(replace(container, task_set=process))
-    _happened(tx, container.id, ContainerEvent.PLACE)
-    tx.touch(container.id)
-
-
-def _choose(tx: Transaction, container: Container) -> TaskSet | None:
-    fitting = [
-        task_set
-        for task_set in tx.connected_task_sets(TaskSetKind.CONTAINER)
-        if _fits(tx, container, task_set)
-    ]
-    return min(
-        fitting, key=lambda s: (tx.tables.endpoints.count("task_set", s.process), s.process), default=None
-    )
-
-
-def _fits(tx: Transaction, container: Container, task_set: TaskSet) -> bool:
-    if tombstone_key(task_set.process, container.id) in tx.tables.tombstones:
-        return False
-    wished = container.resources
-    if not set(wished.special_features) <= set(task_set.machine.labels):
-        return False
-    if not wished.memory or not task_set.machine.memory:
-        return True
-    promised = sum(
-        e.resources.memory
-        for e in tx.tables.endpoints.by("task_set", task_set.process)
-        if isinstance(e, Container)
-    )
-    return promised + wished.memory <= task_set.machine.memory
-
-
-def tell_waiting(tx: Transaction) -> None:
-    """Tell users once of containers that have been waiting for a machine for long."""
-    for endpoint in tx.tables.endpoints.by("task_set", ""):
-        live = tx.tables.live[endpoint.id]
-        if not isinstance(endpoint, Container) or not isinstance(live, ContainerLive) or live.told:
-            continue
-        if tx.now - live.since >= tx.settings.placement_patience:
-            text = _why_waiting(tx, endpoint)
-            tx.put(replace(live, told=True))
-            tx.notify(endpoint.user, text)
-            tx.happen("container_waiting", endpoint.id, text)
-
-
-def _why_waiting(tx: Transaction, container: Container) -> str:
-    there = list(tx.connected_task_sets(TaskSetKind.CONTAINER))
-    start = f"container {container.tag!r} waits for a machine and starts as soon as there is one: "
-    if not there:
-        return start + "no container task set is connected"
-    features = container.resources.special_features
-    if features and not any(set(features) <= set(s.machine.labels) for s in there):
-        return start + f"none offers {', '.join(features)}"
-    return start + "none has room for it"
-
-
 # What task sets report
 
 
 def lose(tx: Transaction, container: Container) -> None:
     """Give a container up at a task set that stayed away."""
+    if draining.promote(tx, container):
+        return
     text = f"container {container.tag!r} was lost with its machine {container.task_set!r}"
     _unbind(tx, container, ContainerEvent.LOSE)
     tx.notify(container.user, text)
@@ -233,6 +183,8 @@ def lose(tx: Transaction, container: Container) -> None:
 
 def ended(tx: Transaction, container: Container) -> None:
     """Note that a container's task set ended it though it is desired; it is placed anew."""
+    if draining.promote(tx, container):
+        return
     _unbind(tx, container, ContainerEvent.WITHDRAW)
     tx.happen("container_gone", container.id, "its task set ended it; it is placed anew")
 
@@ -240,7 +192,7 @@ def ended(tx: Transaction, container: Container) -> None:
 def _unbind(tx: Transaction, container: Container, event: ContainerEvent) -> None:
     _move(tx, container, LinkAddress())
     tx.put(replace(tx.tables.endpoints[container.id], task_set=""))
-    _happened(tx, container.id, event)
+    placing.happened(tx, container.id, event)
     tx.put(replace(tx.tables.container_live(container.id), status=None))
 
 
@@ -248,7 +200,7 @@ def missing(tx: Transaction, container: Container) -> None:
     """Note that a task set came back without a container that is placed there; it makes it again."""
     live = tx.tables.container_live(container.id)
     if live.phase is not ContainerPhase.PLACED:
-        _happened(tx, container.id, ContainerEvent.PLACE)
+        placing.happened(tx, container.id, ContainerEvent.PLACE)
     tx.put(replace(tx.tables.container_live(container.id), status=None))
     _move(tx, container, LinkAddress())
 
@@ -258,7 +210,7 @@ def reported(tx: Transaction, container: Container, status: EndpointStatus) -> N
     before = tx.tables.container_live(container.id)
     event = _EVENTS[status.state]
     if next_phase(before.phase, event) is not before.phase:
-        _happened(tx, container.id, event)
+        placing.happened(tx, container.id, event)
         tx.happen(f"container_{event.value}", container.id, status.detail)
     elif before.status and before.status.incarnation != status.incarnation:
         tx.happen("container_restarted", container.id, status.detail)
@@ -271,8 +223,15 @@ def _compare_nodes(tx: Transaction, id_: str, before: EndpointStatus | None, now
     old = {node.tag: node for node in before.nodes} if before else {}
     for node in now.nodes:
         was = old.get(node.tag)
+        if was is not None and node.restarts > was.restarts:
+            tx.happen("node_restarted", f"{id_}/{node.tag}", f"for the {_ordinal(node.restarts)} time")
         if was is None or (was.state, was.pid) != (node.state, node.pid):
             tx.happen(f"node_{node.state.value}", f"{id_}/{node.tag}", _node_text(node))
+
+
+def _ordinal(number: int) -> str:
+    teens = number % 100 in (11, 12, 13)
+    return f"{number}{'th' if teens else {1: 'st', 2: 'nd', 3: 'rd'}.get(number % 10, 'th')}"
 
 
 def _node_text(node: NodeStatus) -> str:
@@ -288,8 +247,3 @@ def _move(tx: Transaction, container: Container, address: LinkAddress) -> None:
     if current.address != address:
         tx.put(replace(current, address=address))
         endpoints.touch_dialers(tx, container.id)
-
-
-def _happened(tx: Transaction, id_: str, event: ContainerEvent) -> None:
-    live = tx.tables.container_live(id_)
-    tx.put(replace(live, phase=next_phase(live.phase, event), since=tx.now, told=False))

@@ -6,9 +6,21 @@ import secrets
 from typing import TYPE_CHECKING, Any
 
 import msgspec
+from msgspec.structs import replace
 
 from rce_master.exceptions import StoreError
-from rce_master.state import commands, containers, packages, robots, task_sets, users, wiring
+from rce_master.state import (
+    commands,
+    containers,
+    draining,
+    packages,
+    placing,
+    resizing,
+    robots,
+    task_sets,
+    users,
+    wiring,
+)
 from rce_master.state.changes import Changes, Transaction
 from rce_master.state.invariants import validate
 from rce_master.state.settings import StateSettings
@@ -39,6 +51,8 @@ _HANDLERS: dict[type, Callable[[Transaction, Any], None]] = {
     commands.RobotLogin: robots.login,
     commands.RobotLeft: robots.left,
     commands.Tick: task_sets.tick,
+    commands.SetDraining: draining.set_draining,
+    commands.ResizeContainer: resizing.resize_container,
     commands.DestroyContainer: containers.destroy_container,
     commands.AddNode: containers.add_node,
     commands.RemoveNode: containers.remove_node,
@@ -53,7 +67,7 @@ _HANDLERS: dict[type, Callable[[Transaction, Any], None]] = {
 
 def _create_and_place(tx: Transaction, command: commands.CreateContainer) -> None:
     containers.create_container(tx, command)
-    containers.place_waiting(tx)
+    placing.place_waiting(tx)
 
 
 _HANDLERS[commands.CreateContainer] = _create_and_place
@@ -124,6 +138,19 @@ class State:
             KeyError: There is no such endpoint.
         """
         return build_spec(self.tables, endpoint)
+
+    def copy_spec(self, endpoint: str) -> tuple[str, EndpointSpec] | None:
+        """Tell what is desired of a container's copy at the machine that it moves to; None if there is none.
+
+        Returns:
+            The process name of the task set, and what it is to make: all that is in the container, but
+            nothing that joins it with others.
+        """
+        move = self.tables.moves.get(endpoint)
+        if move is None:
+            return None
+        whole = self.spec(endpoint)
+        return move.to, replace(whole, interfaces=(), links=(), connections=())
 
     def validate(self) -> None:
         """Check all invariants.

@@ -46,6 +46,7 @@ def grown(tx: Transaction, endpoint: Endpoint, part: object, instead_of: object 
 def remove(tx: Transaction, id_: str, reason: str) -> None:
     """Remove an endpoint with its links and have its task set drop it."""
     endpoint = tx.tables.endpoints[id_]
+    drop_copy(tx, id_, reason)
     for link in tx.tables.links.by("endpoint", id_):
         tx.put_link(replace(link, connections={}))
     tx.delete(tx.tables.endpoints, id_)
@@ -64,6 +65,17 @@ def withdraw(tx: Transaction, endpoint: Endpoint, reason: str) -> None:
     tx.withdraw(endpoint.task_set, endpoint.id, reason)
     if isinstance(endpoint, Container):
         tx.put(Tombstone(process=endpoint.task_set, id=endpoint.id))
+
+
+def drop_copy(tx: Transaction, id_: str, reason: str) -> None:
+    """Have the copy of a container that is being handed over dropped, if there is one."""
+    move = tx.tables.moves.get(id_)
+    if move is None:
+        return
+    tx.delete(tx.tables.moves, id_)
+    if tx.tables.is_connected(move.to):
+        tx.withdraw(move.to, id_, reason)
+        tx.put(Tombstone(process=move.to, id=id_))
 
 
 def dials(tables: Tables, link: Link, endpoint: str) -> bool:

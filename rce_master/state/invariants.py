@@ -28,6 +28,7 @@ def validate(tables: Tables) -> None:
         _check_link(tables, link)
     _check_connections(tables)
     _check_observed(tables)
+    _check_moves(tables)
     for record in (*tables.bundles, *tables.package_keys):
         assert record.user in tables.users, f"{record.id}: its user is unknown"
 
@@ -132,6 +133,17 @@ def _check_container(tables: Tables, live: ContainerLive) -> None:
     if container.task_set:
         tombstone = f"{container.task_set} {container.id}"
         assert tombstone not in tables.tombstones, f"{live.id}: placed where its former self still ends"
+
+
+def _check_moves(tables: Tables) -> None:
+    for move in tables.moves:
+        container = tables.container(move.id)
+        assert container is not None, f"{move.id}: moves and is no container"
+        assert container.task_set, f"{move.id}: moves and is placed nowhere"
+        assert move.to != container.task_set, f"{move.id}: moves to where it is"
+        assert tables.is_connected(move.to), f"{move.id}: moves to {move.to}, which is away"
+        assert tables.task_sets[move.to].kind is TaskSetKind.CONTAINER, f"{move.id}: moves to robots"
+        assert f"{move.to} {move.id}" not in tables.tombstones, f"{move.id}: moves to where it still ends"
 
 
 def _counter(tables: Tables, name: str) -> int:

@@ -11,7 +11,9 @@ Container:
 
 - *requested*: Desired, and placed nowhere yet.
 - *placed*: A task set was told to make it, and has not reported it since.
-- *starting*, *running*, *failed*, *stopping*: What its task set reports.
+- *starting*, *running*, *degraded*, *failed*, *stopping*: What its task set reports. A degraded one runs, but
+  a node of it failed, is stuck, or pauses after a failure; a failed one is made again.
+- *stopped*: Its task set ended it, as when it is shut down. Placed anew as soon as there is somewhere to go.
 - *lost*: Its task set stayed away beyond the grace time. Placed anew as soon as there is somewhere to go;
   bound again if the task set comes back with it first.
 """
@@ -49,14 +51,16 @@ class ContainerPhase(Enum):
     PLACED = "placed"
     STARTING = "starting"
     RUNNING = "running"
+    DEGRADED = "degraded"
     FAILED = "failed"
     STOPPING = "stopping"
+    STOPPED = "stopped"
     LOST = "lost"
 
     @property
     def is_placed(self) -> bool:
         """Whether a task set is responsible for it."""
-        return self not in (ContainerPhase.REQUESTED, ContainerPhase.LOST)
+        return self not in (ContainerPhase.REQUESTED, ContainerPhase.STOPPED, ContainerPhase.LOST)
 
 
 class ContainerEvent(Enum):
@@ -66,6 +70,7 @@ class ContainerEvent(Enum):
     """A task set is told to make it."""
     STARTING = "starting"
     RUNNING = "running"
+    DEGRADED = "degraded"
     FAILED = "failed"
     STOPPING = "stopping"
     WITHDRAW = "withdraw"
@@ -91,9 +96,10 @@ _REPORTED: dict[ContainerEvent, ContainerPhase] = {
     ContainerEvent.PLACE: ContainerPhase.PLACED,
     ContainerEvent.STARTING: ContainerPhase.STARTING,
     ContainerEvent.RUNNING: ContainerPhase.RUNNING,
+    ContainerEvent.DEGRADED: ContainerPhase.DEGRADED,
     ContainerEvent.FAILED: ContainerPhase.FAILED,
     ContainerEvent.STOPPING: ContainerPhase.STOPPING,
-    ContainerEvent.WITHDRAW: ContainerPhase.REQUESTED,
+    ContainerEvent.WITHDRAW: ContainerPhase.STOPPED,
     ContainerEvent.LOSE: ContainerPhase.LOST,
 }
 
@@ -102,8 +108,10 @@ _CONTAINER: dict[ContainerPhase, dict[ContainerEvent, ContainerPhase]] = {
     ContainerPhase.PLACED: _REPORTED,
     ContainerPhase.STARTING: _REPORTED,
     ContainerPhase.RUNNING: _REPORTED,
+    ContainerPhase.DEGRADED: _REPORTED,
     ContainerPhase.FAILED: _REPORTED,
     ContainerPhase.STOPPING: _REPORTED,
+    ContainerPhase.STOPPED: {ContainerEvent.PLACE: ContainerPhase.PLACED},
     ContainerPhase.LOST: {ContainerEvent.PLACE: ContainerPhase.PLACED},
 }
 

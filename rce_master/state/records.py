@@ -150,6 +150,10 @@ class Container(_Endpoint, frozen=True, kw_only=True, tag=True):
     """A desired container."""
 
     resources: Resources = Resources()
+    made: Resources | None = None
+    """What it was asked for with at first, if it was resized since."""
+    number: int = 0
+    """Grows from container to container: the order in which they were asked for."""
     nodes: dict[str, NodeSpec] = {}
     """By tag."""
     parameters: dict[str, ParameterValue] = {}
@@ -200,6 +204,13 @@ class TaskSet(Struct, frozen=True, kw_only=True):
     address: LinkAddress = LinkAddress()
 
 
+class Drain(Struct, frozen=True, kw_only=True):
+    """A machine that an operator wants to be emptied; kept until that is taken back."""
+
+    process: str
+    """Of its container task set."""
+
+
 class Counter(Struct, frozen=True, kw_only=True):
     """A number that only grows: what it gave out is never given out again."""
 
@@ -227,6 +238,21 @@ class ContainerLive(Struct, frozen=True, kw_only=True):
     status: EndpointStatus | None = None
     told: bool = False
     """Whether its user was told that there is nowhere to place it."""
+    stays: str = ""
+    """Why it is still at a machine that is draining, as operators were told."""
+    rest_until: float = 0.0
+    """When a move of it that failed may be tried again."""
+
+
+class Move(Struct, frozen=True, kw_only=True):
+    """A container that is being handed over from the machine where it is to another."""
+
+    id: str
+    to: str
+    """Process name of the task set that was told to make its copy."""
+    since: float
+    status: EndpointStatus | None = None
+    """What is reported of the copy."""
 
 
 Live: TypeAlias = RobotLive | ContainerLive

@@ -17,10 +17,21 @@ class StateSettings:
     """How long a container waits for a machine until its user is told."""
     login_patience: float = 15.0
     """How long a robot that was let in may take until its task set reports it; then it counts as away."""
+    move_patience: float = 60.0
+    """How long a container's copy at another machine may take to come up, when its machine is drained."""
+    move_rest: float = 30.0
+    """How long a container stays after a move of it failed, until the next is tried."""
     max_robots: int = 2000
     """Of one user."""
     max_containers: int = 1000
     """Of one user."""
+    max_slots: int = 0
+    """All containers of one user together, as ``size`` counts them; 0 for no limit. This and the next two
+    do not apply to administrators."""
+    max_cpu: float = 0.0
+    """Cores that one user's containers may ask for together; 0 for no limit."""
+    max_memory: int = 0
+    """Bytes that one user's containers may ask for together; 0 for no limit."""
     max_nodes: int = 500
     """In one container."""
     max_parameters: int = 5000

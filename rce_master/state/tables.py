@@ -11,9 +11,11 @@ from rce_master.state.records import (
     Container,
     ContainerLive,
     Counter,
+    Drain,
     Endpoint,
     Link,
     Live,
+    Move,
     PackageKey,
     Presence,
     Robot,
@@ -143,6 +145,8 @@ class Tables:
     - ``live``: exactly one record for each endpoint.
     - ``presence``: exactly one record for each task set.
     - ``tombstones``: only of connected task sets.
+    - ``drains``: also of task sets that are gone: they may come back.
+    - ``moves``: only of containers that are placed, to task sets that are connected.
     """
 
     def __init__(self) -> None:
@@ -169,10 +173,14 @@ class Tables:
         self.links = Table[Link]("links", type_=Link, key=lambda k: k.id, endpoint=lambda k: [k.a, k.b])
         self.task_sets = Table[TaskSet]("task_sets", type_=TaskSet, key=lambda s: s.process)
         self.counters = Table[Counter]("counters", type_=Counter, key=lambda c: c.name)
+        self.drains = Table[Drain]("drains", type_=Drain, key=lambda d: d.process)
         self.live = Table[Live]("live", type_=Any, key=lambda o: o.id, persistent=False)
         self.presence = Table[Presence]("presence", type_=Any, key=lambda p: p.process, persistent=False)
         self.tombstones = Table[Tombstone](
             "tombstones", type_=Any, key=lambda t: t.key, persistent=False, process=lambda t: [t.process]
+        )
+        self.moves = Table[Move](
+            "moves", type_=Any, key=lambda m: m.id, persistent=False, to=lambda m: [m.to]
         )
 
     @property
@@ -187,9 +195,11 @@ class Tables:
             self.links,
             self.task_sets,
             self.counters,
+            self.drains,
             self.live,
             self.presence,
             self.tombstones,
+            self.moves,
         )
 
     def robot(self, endpoint: str) -> Robot | None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 from rce.control.messages import Hello, TaskSetKind
 from rce.control.model import EndpointState, EndpointStatus
-from rce_master.exceptions import NotFound
-from rce_master.state import containers, endpoints, robots
+from rce_master.exceptions import Conflict, Invalid, NotFound
+from rce_master.state import capacity, containers, draining, endpoints, placing, robots
 from rce_master.state.lifecycle import ContainerPhase, RobotSession
 from rce_master.state.records import (
     Container,
@@ -30,10 +31,13 @@ if TYPE_CHECKING:
         Tick,
     )
 
+_PROCESS = re.compile(r"[^\s\x00-\x1f\x7f]{1,255}")
+
 
 def arrived(tx: Transaction, command: TaskSetArrived) -> None:
     """Take a task set: adopt what runs there, note what is missing; ``Sync`` says the rest."""
     hello = command.hello
+    _check_name(tx, hello)
     _register(tx, hello)
     running = {status.id: status for status in hello.endpoints}
     # Revisions go on above all that was ever applied, even if the store was restored from an old copy.
@@ -48,7 +52,15 @@ def arrived(tx: Transaction, command: TaskSetArrived) -> None:
         if endpoint.id in running and running[endpoint.id].revision > endpoint.revision:
             tx.touch(endpoint.id)
     tx.changes.arrived = hello.process
-    containers.place_waiting(tx)
+    placing.place_waiting(tx)
+
+
+def _check_name(tx: Transaction, hello: Hello) -> None:
+    if not _PROCESS.fullmatch(hello.process):
+        raise Invalid(f"{hello.process!r:.60} names no task set: it takes 1 to 255 characters and no blanks")
+    before = tx.tables.task_sets.get(hello.process)
+    if before is not None and before.kind is not hello.kind:
+        raise Conflict(f"there is a {before.kind.value} task set {hello.process!r} already")
 
 
 def _register(tx: Transaction, hello: Hello) -> None:
@@ -75,16 +87,23 @@ def _register(tx: Transaction, hello: Hello) -> None:
 
 def _adopt(tx: Transaction, process: str, status: EndpointStatus) -> None:
     endpoint = tx.tables.endpoints.get(status.id)
-    if isinstance(endpoint, Container) and not endpoint.task_set and _may_adopt(tx, process, status):
-        containers.bind(tx, endpoint, process)
+    if (
+        isinstance(endpoint, Container)
+        and not endpoint.task_set
+        and _may_adopt(tx, process, endpoint, status)
+    ):
+        placing.bind(tx, endpoint, process)
         endpoint = tx.tables.endpoints[status.id]
     if endpoint is not None and endpoint.task_set == process:
         _note(tx, endpoint, status)
 
 
-def _may_adopt(tx: Transaction, process: str, status: EndpointStatus) -> bool:
-    is_container_set = tx.tables.task_sets[process].kind is TaskSetKind.CONTAINER
-    return is_container_set and status.state is not EndpointState.STOPPING
+def _may_adopt(tx: Transaction, process: str, container: Container, status: EndpointStatus) -> bool:
+    """Whether a container that is placed nowhere may go on where it is: not if it grew too much meanwhile."""
+    task_set = tx.tables.task_sets[process]
+    if task_set.kind is not TaskSetKind.CONTAINER or status.state is EndpointState.STOPPING:
+        return False
+    return not capacity.room_at(tx.tables, task_set).shortages(container.resources)
 
 
 def _miss(tx: Transaction, endpoint: Container | Robot) -> None:
@@ -105,15 +124,19 @@ def left(tx: Transaction, command: TaskSetLeft) -> None:
     for endpoint in tx.tables.endpoints.by("task_set", process):
         if isinstance(endpoint, Robot):
             robots.leave(tx, endpoint, f"its task set {process!r} is away")
+    draining.left(tx, process)
     tx.happen("task_set_left", process, user="")
-    containers.place_waiting(tx)
+    placing.place_waiting(tx)
 
 
 def status_reported(tx: Transaction, command: StatusReported) -> None:
     """Note what a task set reports of one endpoint; of one that is not placed there it is ignored."""
     endpoint = tx.tables.endpoints.get(command.status.id)
+    move = tx.tables.moves.get(command.status.id)
     if endpoint is not None and endpoint.task_set == command.process:
         _note(tx, endpoint, command.status)
+    elif move is not None and move.to == command.process:
+        draining.reported(tx, move, command.status)
 
 
 def _note(tx: Transaction, endpoint: Container | Robot, status: EndpointStatus) -> None:
@@ -131,10 +154,19 @@ def gone(tx: Transaction, command: EndpointGone) -> None:
         if command.id not in tx.tables.endpoints:
             tx.happen("container_gone", command.id)
     else:
-        endpoint = tx.tables.endpoints.get(command.id)
-        if isinstance(endpoint, Container) and endpoint.task_set == command.process:
-            containers.ended(tx, endpoint)
-    containers.place_waiting(tx)
+        _ended(tx, command)
+    draining.advance(tx)
+    placing.place_waiting(tx)
+
+
+def _ended(tx: Transaction, command: EndpointGone) -> None:
+    """Note that a task set ended by itself what it was told to make."""
+    endpoint = tx.tables.endpoints.get(command.id)
+    move = tx.tables.moves.get(command.id)
+    if isinstance(endpoint, Container) and endpoint.task_set == command.process:
+        containers.ended(tx, endpoint)
+    elif move is not None and move.to == command.process:
+        draining.give_up(tx, move, "was ended there")
 
 
 def fault(tx: Transaction, command: FaultReported) -> None:
@@ -152,8 +184,9 @@ def tick(tx: Transaction, _: Tick) -> None:
     for presence in list(tx.tables.presence):
         if not presence.connected:
             _expire(tx, presence)
-    containers.place_waiting(tx)
-    containers.tell_waiting(tx)
+    draining.advance(tx)
+    placing.place_waiting(tx)
+    placing.tell_waiting(tx)
 
 
 def _expire(tx: Transaction, presence: Presence) -> None:

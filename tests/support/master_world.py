@@ -56,7 +56,7 @@ class World:
         )
 
     def container_set(
-        self, process: str = "c1", endpoints: tuple[EndpointStatus, ...] = (), **machine: Any
+        self, process: str = "c1", endpoints: tuple[EndpointStatus, ...] = (), name: str = "m", **machine: Any
     ) -> Changes:
         return self.do(
             commands.TaskSetArrived(
@@ -64,7 +64,7 @@ class World:
                     version=CONTROL_VERSION,
                     kind=TaskSetKind.CONTAINER,
                     process=process,
-                    machine=MachineInfo(name="m", **machine),
+                    machine=MachineInfo(name=name, **machine),
                     endpoints=endpoints,
                 )
             )
@@ -83,8 +83,11 @@ class World:
             self.report(process, EndpointStatus(id=id_, revision=1, state=EndpointState.RUNNING))
         return changes
 
-    def container(self, tag: str = "c", user: str = "anna", **resources: Any) -> Changes:
-        return self.do(commands.CreateContainer(user=user, tag=tag, resources=Resources(**resources)))
+    def container(
+        self, tag: str = "c", user: str = "anna", *, wait: bool = False, **resources: Any
+    ) -> Changes:
+        wish = Resources(**resources)
+        return self.do(commands.CreateContainer(user=user, tag=tag, resources=wish, wait=wait))
 
     def interface(
         self,

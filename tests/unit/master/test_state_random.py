@@ -13,11 +13,12 @@ from rce.control.model import (
     EndpointStatus,
     InterfaceSpec,
     LinkAddress,
+    Network,
     NodeSpec,
     Resources,
 )
 from rce_master.exceptions import Refused
-from rce_master.state import commands
+from rce_master.state import capacity, commands
 from rce_master.state.core import State
 from rce_master.state.records import User, UserRole
 from rce_master.state.settings import StateSettings
@@ -27,7 +28,7 @@ TAGS = st.sampled_from(["a", "b", "c", "d"])
 INTERFACES = st.sampled_from(["i", "j"])
 PATHS = st.builds("{}/{}".format, TAGS, INTERFACES)
 ROBOT_SETS = st.sampled_from(["r1", "r2"])
-CONTAINER_SETS = st.sampled_from(["c1", "c2"])
+CONTAINER_SETS = st.sampled_from(["c1", "c2", "c3"])
 ADDRESSES = st.builds(LinkAddress, unix=st.sampled_from(["", "/x", "/y"]))
 TYPES = st.builds(
     "{}{}".format,
@@ -42,8 +43,15 @@ STATUSES = st.builds(
     incarnation=st.sampled_from(["1", "2"]),
     address=ADDRESSES,
 )
+SLOTS = 3
 LIMITS = StateSettings(
-    robot_grace=3, container_grace=2, placement_patience=1, max_containers=3, max_connections=6
+    move_patience=3,
+    move_rest=2,
+    robot_grace=3,
+    container_grace=2,
+    placement_patience=1,
+    max_containers=3,
+    max_connections=6,
 )
 
 
@@ -101,6 +109,11 @@ class Histories(RuleBasedStateMachine):
             assert self.state.spec(endpoint.id).id == endpoint.id
 
     @invariant()
+    def promises_no_more_than_there_is(self) -> None:
+        for room in capacity.rooms(self.state.tables, away=True).values():
+            assert room.slots <= SLOTS, f"{room.process}: {room.slots} slots promised"
+
+    @invariant()
     def is_stored(self) -> None:
         assert {k: v for k, v in self.image(persistent_only=True).items() if v} == {
             k: v for k, v in self.stored.items() if v
@@ -132,7 +145,7 @@ class Histories(RuleBasedStateMachine):
             version=CONTROL_VERSION,
             kind=kind,
             process=process,
-            machine=MachineInfo(name="m"),
+            machine=MachineInfo(name=process, slots=SLOTS, networks=("none", "group")),
             address=address,
             endpoints=tuple(endpoints),
         )
@@ -158,9 +171,28 @@ class Histories(RuleBasedStateMachine):
     def robot_leaves(self, process: str, user: str, tag: str) -> None:
         self.do(commands.RobotLeft(process=process, id=f"{user}/{tag}"))
 
-    @rule(user=USERS, tag=TAGS, size=st.sampled_from([1, 2]))
-    def create(self, user: str, tag: str, size: int) -> None:
-        self.do(commands.CreateContainer(user=user, tag=tag, resources=Resources(size=size)))
+    @rule(user=USERS, tag=TAGS, size=st.sampled_from([1, 2]), wait=st.booleans(), grouped=st.booleans())
+    def create(self, user: str, tag: str, size: int, wait: bool = False, grouped: bool = False) -> None:
+        group = {"network": Network.GROUP, "group": "g"} if grouped else {}
+        wish = Resources(size=size, **group)  # type: ignore[arg-type]
+        self.do(commands.CreateContainer(user=user, tag=tag, resources=wish, wait=wait))
+
+    @rule(user=USERS, tag=TAGS, size=st.sampled_from([1, 2, 3, 4]))
+    def resize(self, user: str, tag: str, size: int) -> None:
+        self.do(commands.ResizeContainer(user=user, tag=tag, size=size))
+
+    @rule(process=CONTAINER_SETS, draining=st.booleans())
+    def drain(self, process: str, draining: bool) -> None:
+        self.do(commands.SetDraining(machine=process, draining=draining))
+
+    @rule(state=st.sampled_from(EndpointState), leave=st.booleans())
+    def copies_report(self, state: EndpointState, leave: bool) -> None:
+        for move in list(self.state.tables.moves):
+            if leave:
+                self.do(commands.EndpointGone(process=move.to, id=move.id))
+            else:
+                status = EndpointStatus(id=move.id, revision=1, state=state)
+                self.do(commands.StatusReported(process=move.to, status=status))
 
     @rule(user=USERS, tag=TAGS)
     def destroy(self, user: str, tag: str) -> None:

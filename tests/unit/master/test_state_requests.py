@@ -32,7 +32,9 @@ def test_the_same_thing_again_is_accepted_and_changes_nothing(world: World) -> N
 def test_something_else_under_the_same_tag_is_refused(world: World) -> None:
     world.wired()
     world.node("c", "n")
-    with pytest.raises(Conflict, match=r"container 'c' exists with other settings; destroy it first"):
+    with pytest.raises(
+        Conflict, match=r"container 'c' exists with other settings; resize or destroy it first"
+    ):
         world.container(memory=5)
     with pytest.raises(
         Conflict, match="node 'n' of container 'c' exists with other settings; remove it first"

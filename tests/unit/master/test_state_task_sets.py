@@ -24,6 +24,8 @@ from rce_master.state.lifecycle import (
     next_session,
 )
 
+MB = 1 << 20
+
 
 def status(
     tag: str, state: EndpointState = EndpointState.RUNNING, revision: int = 1, **fields: object
@@ -42,7 +44,10 @@ def test_lifecycles_refuse_what_cannot_happen() -> None:
         next_phase(ContainerPhase.REQUESTED, ContainerEvent.RUNNING)
     for phase in ContainerPhase:
         if phase.is_placed:
-            assert {next_phase(phase, event) for event in ContainerEvent} == set(ContainerPhase)
+            reached = {next_phase(phase, event) for event in ContainerEvent}
+            assert reached == set(ContainerPhase) - {ContainerPhase.REQUESTED}
+        else:
+            assert next_phase(phase, ContainerEvent.PLACE) is ContainerPhase.PLACED
 
 
 # Placement
@@ -71,14 +76,14 @@ def test_containers_spread_over_machines(world: World) -> None:
 
 
 def test_features_and_memory_are_respected(world: World) -> None:
-    world.container_set("c1", memory=100)
-    world.container("gpu", special_features=("gpu",))
-    world.container("big", memory=80)
-    world.container("bigger", memory=30)
+    world.container_set("c1", memory=100 * MB)
+    gpu = world.container("gpu", wait=True, special_features=("gpu",))
+    world.container("big", memory=60 * MB)
+    bigger = world.container("bigger", wait=True, memory=50 * MB)
     assert [world.phase(tag) for tag in ("gpu", "big", "bigger")] == ["requested", "placed", "requested"]
-    texts = [notice.text for notice in world.tick(10).notices]
-    assert any("none offers gpu" in text for text in texts)
-    assert any("none has room" in text for text in texts)
+    assert "m lacks the label gpu" in gpu.notices[0].text
+    assert "m has 40 of 100 MB memory free, 50 MB needed" in bigger.notices[0].text
+    assert world.tick(10).notices == []
     world.container_set("c2", labels=("gpu",))
     assert [world.phase(tag) for tag in ("gpu", "bigger")] == ["placed", "placed"]
 
@@ -269,7 +274,7 @@ def test_containers_of_a_machine_that_stays_away_move(world: World) -> None:
     changes = world.tick(1)
     assert world.state.tables.endpoints["anna/c"].task_set == "c2"
     assert world.phase() == "placed"
-    assert kinds(changes) == ["container_lost", "task_set_gone"]
+    assert kinds(changes) == ["container_lost", "task_set_gone", "container_placed"]
     assert "was lost with its machine" in changes.notices[0].text
     world.container_set("c1", endpoints=(status("c"),))
     assert world.state.tables.endpoints["anna/c"].task_set == "c2"

@@ -1,0 +1,190 @@
+"""What the machines have and what was promised of it, out of the tables; and what one user may ask for."""
+
+from __future__ import annotations
+
+import ipaddress
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from rce.control.limits import MEGABYTE, MIN_MEMORY
+from rce.control.messages import TaskSetKind
+from rce.control.model import Network, Resources
+from rce.protocol.quantities import write_cores
+from rce.protocol.wishes import DEFAULT_PREFIX
+from rce_master.exceptions import Conflict, Forbidden, Invalid, LimitReached
+from rce_master.state.placement import Room
+from rce_master.state.records import Container, TaskSet, UserRole, tombstone_key
+
+if TYPE_CHECKING:
+    from rce_master.state.changes import Transaction
+    from rce_master.state.tables import Tables
+
+
+def is_draining(tables: Tables, task_set: TaskSet) -> bool:
+    """Whether a machine takes no new containers and hands over those that it has."""
+    return task_set.machine.draining or task_set.process in tables.drains
+
+
+def room_at(tables: Tables, task_set: TaskSet) -> Room:
+    """Count what is promised at a machine: to the containers there and to those that are on their way."""
+    placed = [e for e in tables.endpoints.by("task_set", task_set.process) if isinstance(e, Container)]
+    coming = [tables.container(move.id) for move in tables.moves.by("to", task_set.process)]
+    room = Room(
+        process=task_set.process,
+        machine=task_set.machine,
+        name=_name(tables, task_set),
+        draining=is_draining(tables, task_set),
+    )
+    for container in (*placed, *coming):
+        if container is not None:
+            room = room.with_(container.resources)
+    return room
+
+
+def _name(tables: Tables, task_set: TaskSet) -> str:
+    """What people call a machine: its name, or its process where several are on one machine."""
+    namesakes = sum(
+        s.machine.name == task_set.machine.name and s.kind is TaskSetKind.CONTAINER for s in tables.task_sets
+    )
+    return task_set.machine.name if namesakes == 1 else task_set.process
+
+
+def rooms(tables: Tables, *, away: bool = False) -> dict[str, Room]:
+    """Count all container machines that are connected, or also those that may still come back, by process."""
+    return {
+        task_set.process: room_at(tables, task_set)
+        for task_set in tables.task_sets
+        if task_set.kind is TaskSetKind.CONTAINER and (away or tables.is_connected(task_set.process))
+    }
+
+
+def group_mates(tables: Tables, container: Container) -> list[Container]:
+    """List the other containers that must be on the same machine: those of its group's network."""
+    wish = container.resources
+    if wish.network is not Network.GROUP:
+        return []
+    return [
+        other
+        for other in tables.containers(container.user)
+        if other.id != container.id
+        and (other.resources.network, other.resources.group) == (Network.GROUP, wish.group)
+    ]
+
+
+def open_to(tables: Tables, container: Container, found: dict[str, Room]) -> list[Room]:
+    """Choose, of machines, those where a container may be: with its group, not where it still ends."""
+    tied = {mate.task_set for mate in group_mates(tables, container) if mate.task_set}
+    return [
+        room
+        for room in found.values()
+        if (not tied or room.process in tied)
+        and tombstone_key(room.process, container.id) not in tables.tombstones
+    ]
+
+
+def company(tables: Tables, container: Container) -> Counter[str]:
+    """Count, by process, what a container belongs together with: its peers, and others of its group.
+
+    A robot counts for the container machines on the same machine as its task set.
+    """
+    found: Counter[str] = Counter()
+    for link in tables.links.by("endpoint", container.id):
+        peer = tables.endpoints[link.peer(container.id)]
+        found.update(_processes_near(tables, peer.task_set))
+    group = container.resources.group
+    if group:
+        found.update(
+            other.task_set
+            for other in tables.containers(container.user)
+            if other.id != container.id and other.resources.group == group
+        )
+    return found
+
+
+def _processes_near(tables: Tables, process: str) -> list[str]:
+    task_set = tables.task_sets.get(process)
+    if task_set is None or task_set.kind is TaskSetKind.CONTAINER:
+        return [process]
+    return [
+        other.process
+        for other in tables.task_sets
+        if other.kind is TaskSetKind.CONTAINER and other.machine.name == task_set.machine.name
+    ]
+
+
+def own(tables: Tables, container: Container) -> Counter[str]:
+    """Count, by process, the other containers of a container's user."""
+    return Counter(c.task_set for c in tables.containers(container.user) if c.id != container.id)
+
+
+# What a user may ask for
+
+
+def check_wish(tx: Transaction, user: str, id_: str, wish: Resources) -> None:
+    """Check that a user may ask for this.
+
+    Args:
+        tx: The transaction.
+        user: Whose container it is.
+        id_: The container; what it was promised before does not count.
+        wish: What it is to get.
+
+    Raises:
+        Refused: They may not; the text says why and how to mend it.
+    """
+    if 0 < wish.memory < MIN_MEMORY:
+        raise Invalid(
+            f"memory: {wish.memory / MEGABYTE:.3g} MB are too little; a container itself needs "
+            f"{MIN_MEMORY // MEGABYTE} MB (a plain number is MB)"
+        )
+    others = [c for c in tx.tables.containers(user) if c.id != id_]
+    _check_group(wish, others)
+    if tx.tables.users[user].role is not UserRole.ADMIN:
+        _check_privileges(wish)
+        _check_sums(tx, [wish, *(c.resources for c in others)])
+
+
+def _check_privileges(wish: Resources) -> None:
+    if wish.network is Network.HOST:
+        raise Forbidden("network: host is for containers of administrators; use none or group")
+    if wish.image.startswith("/"):
+        raise Forbidden("image: folders of the machine are for administrators; use an OCI image's name")
+
+
+def _check_sums(tx: Transaction, wishes: list[Resources]) -> None:
+    settings = tx.settings
+    sums: list[tuple[float, float, str]] = [
+        (sum(max(1, w.size) for w in wishes), settings.max_slots, "slots"),
+        (sum(w.cpu for w in wishes), settings.max_cpu, "cores"),
+        (sum(w.memory for w in wishes) / MEGABYTE, settings.max_memory / MEGABYTE, "MB of memory"),
+    ]
+    for asked, most, what in sums:
+        if most and asked > most + 1e-6:
+            raise LimitReached(
+                f"your containers would have {write_cores(asked)} {what} in all, and you may have "
+                f"{write_cores(most)}; make others smaller (rce resize) or destroy them"
+            )
+
+
+def _check_group(wish: Resources, others: list[Container]) -> None:
+    if wish.network is not Network.GROUP or not wish.group_ip:
+        return
+    address = _address(wish.group_ip)
+    for other in others:
+        theirs = other.resources
+        if (theirs.network, theirs.group) != (Network.GROUP, wish.group) or not theirs.group_ip:
+            continue
+        there = _address(theirs.group_ip)
+        if there.ip == address.ip:
+            raise Conflict(
+                f"groupIp: {address.ip} is the address of container {other.tag!r} of the group {wish.group!r}"
+            )
+        if there.network != address.network:
+            raise Conflict(
+                f"groupIp: {address} is not in {there.network}, where container {other.tag!r} of the group "
+                f"{wish.group!r} is; give all of them addresses of one network"
+            )
+
+
+def _address(text: str) -> ipaddress.IPv4Interface:
+    return ipaddress.IPv4Interface(text if "/" in text else f"{text}/{DEFAULT_PREFIX}")

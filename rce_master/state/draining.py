@@ -1,0 +1,243 @@
+"""Machines that are to be emptied: they take no new containers, and those they have are handed over.
+
+A container is *handed over* by a move: a copy of it, with its nodes and parameters but without interfaces and
+connections, is made at another machine while the container goes on; once all nodes of the copy are up, the
+copy becomes the container, gets the interfaces and connections, and the former one is dropped. One container
+at a time moves away from a machine; those in the network of one group move together. What finds room nowhere
+stays where it is, and is looked at again at every tick.
+
+A drain outlives a restart of the master. A move does not: the copy is dropped, and the move begins anew.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from msgspec.structs import replace
+
+from rce.control.messages import TaskSetKind
+from rce.control.model import EndpointState, EndpointStatus, NodeState
+from rce_master.exceptions import NotFound
+from rce_master.state import capacity, endpoints, placing
+from rce_master.state.lifecycle import ContainerEvent
+from rce_master.state.placement import Room, choose, refusals
+from rce_master.state.records import Container, Drain, Move, TaskSet, tombstone_key
+
+if TYPE_CHECKING:
+    from rce_master.state.changes import Transaction
+    from rce_master.state.commands import SetDraining
+    from rce_master.state.tables import Tables
+
+_NOT_YET = frozenset({NodeState.WAITING, NodeState.STARTING})
+
+
+def set_draining(tx: Transaction, command: SetDraining) -> None:
+    """Drain a machine, or take that back; what is so already is accepted silently."""
+    for process in _processes(tx.tables, command.machine):
+        if command.draining == (process in tx.tables.drains):
+            continue
+        if command.draining:
+            tx.put(Drain(process=process))
+            tx.happen("machine_draining", process, user="")
+        else:
+            tx.delete(tx.tables.drains, process)
+            _call_back(tx, process)
+            tx.happen("machine_undrained", process, user="")
+    advance(tx)
+    placing.place_waiting(tx)
+
+
+def _processes(tables: Tables, name: str) -> list[str]:
+    """Find the container task sets of a machine, by its name or that of a task set."""
+    found = [
+        s.process
+        for s in tables.task_sets
+        if s.kind is TaskSetKind.CONTAINER and name in (s.process, s.machine.name)
+    ]
+    if name in tables.drains and name not in found:
+        found.append(name)
+    if not found:
+        raise NotFound(f"there is no container machine {name!r}; rce machines lists them")
+    return found
+
+
+def advance(tx: Transaction) -> None:
+    """Begin the next move from each machine that is draining, and give up moves that take too long."""
+    for move in list(tx.tables.moves):
+        if tx.now - move.since >= tx.settings.move_patience:
+            give_up(tx, move, f"did not come up there within {tx.settings.move_patience:.0f} s")
+    for task_set in list(tx.connected_task_sets(TaskSetKind.CONTAINER)):
+        if capacity.is_draining(tx.tables, task_set):
+            _advance(tx, task_set)
+
+
+def _advance(tx: Transaction, task_set: TaskSet) -> None:
+    here = [e for e in tx.tables.endpoints.by("task_set", task_set.process) if isinstance(e, Container)]
+    if any(container.id in tx.tables.moves for container in here):
+        return
+    for container in sorted(here, key=lambda c: c.number):
+        live = tx.tables.container_live(container.id)
+        if tx.now < live.rest_until:
+            continue
+        unit = _unit(tx.tables, container)
+        target = _target(tx, unit)
+        if target:
+            for each in unit:
+                _begin(tx, each, target)
+            return
+        _stay(tx, container, obstacle(tx.tables, container))
+
+
+def _unit(tables: Tables, container: Container) -> list[Container]:
+    """List what moves together with a container, itself first."""
+    mates = capacity.group_mates(tables, container)
+    return [container, *(mate for mate in mates if mate.task_set == container.task_set)]
+
+
+def _target(tx: Transaction, unit: list[Container]) -> str:
+    """Find a machine that takes all of some containers; empty if there is none."""
+    rooms = capacity.rooms(tx.tables)
+    first = unit[0]
+    company, own = capacity.company(tx.tables, first), capacity.own(tx.tables, first)
+    while rooms:
+        room = choose(
+            [r for r in rooms.values() if _open(tx, unit, r.process)],
+            first.resources,
+            company=company,
+            own=own,
+        )
+        if room is None:
+            return ""
+        process = room.process
+        filled = room.with_(first.resources)
+        for other in unit[1:]:
+            filled = filled.with_(other.resources) if filled.fits(other.resources) else filled
+        if filled.containers == room.containers + len(unit):
+            return process
+        del rooms[process]
+    return ""
+
+
+def _open(tx: Transaction, unit: list[Container], process: str) -> bool:
+    return all(tombstone_key(process, each.id) not in tx.tables.tombstones for each in unit)
+
+
+def obstacle(tables: Tables, container: Container) -> str:
+    """Say why a container cannot be handed over."""
+    rooms = [r for r in capacity.rooms(tables).values() if r.process != container.task_set]
+    mates = len(_unit(tables, container)) - 1
+    whole = f"it moves with {mates} others of its group; " if mates else ""
+    return whole + (refusals(rooms, container.resources) or _nothing_said(rooms, mates))
+
+
+def _nothing_said(rooms: list[Room], mates: int) -> str:
+    if not rooms:
+        return "there is no other machine"
+    return "no machine has room for all of them" if mates else "it is about to move"
+
+
+def _begin(tx: Transaction, container: Container, to: str) -> None:
+    tx.put(Move(id=container.id, to=to, since=tx.now))
+    tx.put(replace(tx.tables.container_live(container.id), stays=""))
+    tx.touch(container.id)
+    tx.happen("container_moving", container.id, f"from {container.task_set} to {to}")
+
+
+def _stay(tx: Transaction, container: Container, why: str) -> None:
+    live = tx.tables.container_live(container.id)
+    if live.stays != why:
+        tx.put(replace(live, stays=why))
+        tx.happen(
+            "container_stays", container.id, f"at {container.task_set}, which is draining: {why}", user=""
+        )
+
+
+# What becomes of moves
+
+
+def reported(tx: Transaction, move: Move, status: EndpointStatus) -> None:
+    """Note what is reported of a container's copy."""
+    container = tx.tables.container(move.id)
+    assert container is not None
+    if status.state is EndpointState.FAILED:
+        give_up(tx, move, f"failed there: {status.detail or 'no reason was given'}")
+        return
+    tx.put(replace(move, status=status))
+    moves = [m for each in _unit(tx.tables, container) if (m := tx.tables.moves.get(each.id)) is not None]
+    if all(_is_ready(tx, m) for m in moves):
+        for m in moves:
+            _switch(tx, m)
+        advance(tx)
+
+
+def _is_ready(tx: Transaction, move: Move) -> bool:
+    """Whether the copy does as well as the container does."""
+    status, former = move.status, tx.tables.container_live(move.id).status
+    if status is None or any(node.state in _NOT_YET for node in status.nodes):
+        return False
+    if status.state is EndpointState.DEGRADED:
+        return former is None or former.state is not EndpointState.RUNNING
+    return status.state is EndpointState.RUNNING
+
+
+def _switch(tx: Transaction, move: Move) -> None:
+    container = tx.tables.container(move.id)
+    assert container is not None
+    assert move.status is not None
+    tx.delete(tx.tables.moves, move.id)
+    endpoints.withdraw(tx, container, "it was handed over to another machine")
+    _settle(tx, container, move)
+    tx.put(replace(tx.tables.container_live(move.id), status=move.status))
+    placing.happened(tx, move.id, _PHASES[move.status.state])
+    tx.put(replace(tx.tables.endpoints[move.id], address=move.status.address))
+    tx.happen("container_moved", move.id, f"from {container.task_set} to {move.to}")
+
+
+_PHASES = {EndpointState.RUNNING: ContainerEvent.RUNNING, EndpointState.DEGRADED: ContainerEvent.DEGRADED}
+
+
+def _settle(tx: Transaction, container: Container, move: Move) -> None:
+    tx.put(replace(container, task_set=move.to))
+    placing.happened(tx, move.id, ContainerEvent.PLACE)
+    tx.touch(move.id)
+    endpoints.touch_dialers(tx, move.id)
+
+
+def promote(tx: Transaction, container: Container) -> bool:
+    """Let a container's copy take over at once, because the container itself is gone.
+
+    Returns:
+        Whether there is a copy.
+    """
+    move = tx.tables.moves.get(container.id)
+    if move is None:
+        return False
+    tx.delete(tx.tables.moves, move.id)
+    _settle(tx, container, move)
+    tx.put(replace(tx.tables.container_live(move.id), status=None))
+    tx.happen("container_moved", move.id, f"to {move.to}, before it was up there")
+    return True
+
+
+def give_up(tx: Transaction, move: Move, why: str) -> None:
+    """End a move: the container stays where it is for now, and its copy is dropped."""
+    endpoints.drop_copy(tx, move.id, "the move was given up")
+    live = tx.tables.container_live(move.id)
+    tx.put(replace(live, rest_until=tx.now + tx.settings.move_rest))
+    container = tx.tables.container(move.id)
+    assert container is not None
+    _stay(tx, container, f"{move.to}: it {why}; tried again in {tx.settings.move_rest:.0f} s")
+
+
+def left(tx: Transaction, process: str) -> None:
+    """End the moves to a task set that went away; what it has of them it drops when it comes back."""
+    for move in list(tx.tables.moves.by("to", process)):
+        give_up(tx, move, "went away")
+
+
+def _call_back(tx: Transaction, process: str) -> None:
+    """End the moves away from a machine that is not drained any more."""
+    for container in tx.tables.endpoints.by("task_set", process):
+        endpoints.drop_copy(tx, container.id, "its machine is not drained any more")
+        if isinstance(container, Container):
+            tx.put(replace(tx.tables.container_live(container.id), stays=""))

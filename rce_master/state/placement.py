@@ -1,0 +1,188 @@
+"""Where a container fits, and where it fits best. Pure: knows machines and promises, not the state's tables.
+
+A machine is *full* for a container when what was promised to the containers there, and what this one asks
+for, is more than it has of slots, cores or memory. What a container does not ask for explicitly is not
+promised, but memory: there it counts with as many slots' shares as its size.
+
+Among the machines with room, the one is taken that is left least loaded in what it is shortest of. Beside
+that, containers that belong together are put together: a machine with more of the container's company (what
+it is joined with, the others of its group) is preferred as long as its load is not larger by :data:`DETOUR`.
+Of equals, the one with more containers of the same user is taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from rce.control.limits import MEGABYTE
+from rce.control.model import Network, Resources
+from rce.protocol.quantities import write_cores
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from rce.control.messages import MachineInfo
+
+DETOUR = 0.2
+"""So much more of a machine may be in use, as a share of it, for the sake of a container's company."""
+CROWD = 16
+"""Where nobody counts slots, so many containers for each core count as a full load (but are no limit)."""
+PODMAN = "podman"
+_TINY = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Need:
+    """What a container takes of a machine."""
+
+    slots: int
+    cpu: float
+    """Cores."""
+    memory: int
+    """Bytes."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Room:
+    """A machine and what was promised there."""
+
+    process: str
+    """Of its task set."""
+    machine: MachineInfo
+    name: str = ""
+    """What people call it; the machine's name if empty."""
+    draining: bool = False
+    slots: int = 0
+    cpu: float = 0.0
+    memory: int = 0
+    containers: int = 0
+
+    def need(self, wish: Resources) -> Need:
+        """Tell what a container takes here."""
+        slots = max(1, wish.size)
+        share = self.machine.memory // self.machine.slots if self.machine.slots else 0
+        return Need(slots=slots, cpu=wish.cpu, memory=wish.memory or slots * share)
+
+    def with_(self, wish: Resources) -> Room:
+        """Tell what it is like with one more container."""
+        return self._changed(wish, 1)
+
+    def without(self, wish: Resources) -> Room:
+        """Tell what it is like with one container less."""
+        return self._changed(wish, -1)
+
+    def _changed(self, wish: Resources, sign: int) -> Room:
+        need = self.need(wish)
+        return replace(
+            self,
+            slots=self.slots + sign * need.slots,
+            cpu=self.cpu + sign * need.cpu,
+            memory=self.memory + sign * need.memory,
+            containers=self.containers + sign,
+        )
+
+    def obstacles(self, wish: Resources) -> list[str]:
+        """Tell why it would not take a container even if it were empty; nothing if it would."""
+        machine = self.machine
+        found = [f"lacks the label {label}" for label in wish.special_features if label not in machine.labels]
+        if wish.network is not Network.NONE and wish.network.value not in machine.networks:
+            found.append(f"has no network {wish.network.value}")
+        if wish.image and PODMAN not in (machine.runtime, *machine.runtimes):
+            found.append(f"has no {PODMAN} for the image {wish.image}")
+        if self.draining:
+            found.append("is draining")
+        return found
+
+    def shortages(self, wish: Resources, had: Resources | None = None) -> list[str]:
+        """Tell what it has too little of for a container; nothing if it has enough.
+
+        Args:
+            wish: What the container asks for.
+            had: What it has been promised before, and is not counted here: of what it asks for no more of
+                than that, there is enough in any case.
+        """
+        need, before = self.need(wish), self.need(had) if had is not None else None
+        machine, found = self.machine, []
+        if machine.slots and (before is None or need.slots > before.slots):
+            free = machine.slots - self.slots
+            if need.slots > free:
+                found.append(f"has {max(0, free)} of {machine.slots} slots free, {need.slots} needed")
+        if machine.cores and (before is None or need.cpu > before.cpu):
+            cores = machine.cores - self.cpu
+            if need.cpu > cores + _TINY:
+                texts = [write_cores(max(0.0, value)) for value in (cores, machine.cores, need.cpu)]
+                found.append("has {} of {} cores free, {} needed".format(*texts))
+        if machine.memory and (before is None or need.memory > before.memory):
+            memory = machine.memory - self.memory
+            if need.memory > memory:
+                texts = [f"{max(0, value) // MEGABYTE}" for value in (memory, machine.memory)]
+                needed = -(-need.memory // MEGABYTE)
+                found.append("has {} of {} MB memory free, {} MB needed".format(*texts, needed))
+        return found
+
+    def fits(self, wish: Resources) -> bool:
+        """Whether it takes a container now."""
+        return not self.obstacles(wish) and not self.shortages(wish)
+
+    def why_not(self, wish: Resources) -> str:
+        """Say why it does not take a container now; empty if it does."""
+        reasons = self.obstacles(wish) or self.shortages(wish)
+        return f"{self.name or self.machine.name} {' and '.join(reasons)}" if reasons else ""
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """How much of each thing that is counted is promised, 1 for all of it."""
+        machine = self.machine
+        counted = {
+            "slots": (self.slots, machine.slots),
+            "cores": (self.cpu, machine.cores),
+            "memory": (self.memory, machine.memory),
+        }
+        return {name: used / there for name, (used, there) in counted.items() if there}
+
+    @property
+    def load(self) -> float:
+        """How much is promised of what it is shortest of."""
+        crowd = 0.0 if self.machine.slots else self.containers / (CROWD * max(1, self.machine.cores))
+        return max(crowd, *self.shares.values(), 0.0)
+
+
+def choose(
+    rooms: Iterable[Room],
+    wish: Resources,
+    *,
+    company: Mapping[str, int] | None = None,
+    own: Mapping[str, int] | None = None,
+) -> Room | None:
+    """Choose the machine for a container.
+
+    Args:
+        rooms: The machines that may be taken.
+        wish: What the container asks for.
+        company: How much of what belongs together with it is where, by process.
+        own: How many other containers of its user are where, by process.
+
+    Returns:
+        The best, or None if it fits nowhere.
+    """
+    fitting = [room for room in rooms if room.fits(wish)]
+    if not fitting:
+        return None
+    loads = {room.process: room.with_(wish).load for room in fitting}
+    near = min(loads.values()) + DETOUR + _TINY
+    company, own = company or {}, own or {}
+
+    def rank(room: Room) -> tuple[float, float, int, str]:
+        load = round(loads[room.process], 6)
+        together = company.get(room.process, 0) if load <= near else 0
+        return -together, load, -own.get(room.process, 0), room.process
+
+    return min(fitting, key=rank)
+
+
+def refusals(rooms: Iterable[Room], wish: Resources, *, most: int = 8) -> str:
+    """Say of each machine why it does not take a container."""
+    found = [text for room in rooms if (text := room.why_not(wish))]
+    more = f"; and {len(found) - most} more machines" if len(found) > most else ""
+    return "; ".join(found[:most]) + more

@@ -1,0 +1,63 @@
+"""Changes what a container may use, while it runs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from msgspec.structs import replace
+
+from rce.control.limits import MEGABYTE
+from rce.control.model import Resources
+from rce.protocol.quantities import write_bandwidth, write_cores
+from rce_master.exceptions import NoRoom
+from rce_master.state import capacity, endpoints, placing
+from rce_master.state.containers import find
+
+if TYPE_CHECKING:
+    from rce_master.state.changes import Transaction
+    from rce_master.state.commands import ResizeContainer
+    from rce_master.state.records import Container
+
+_SIZES = ("size", "cpu", "memory", "bandwidth")
+
+
+def resize_container(tx: Transaction, command: ResizeContainer) -> None:
+    """Change a container's wishes; the same ones again are accepted silently."""
+    container = find(tx, command.user, command.tag)
+    given = {key: value for key in _SIZES if (value := getattr(command, key)) is not None}
+    had, wish = container.resources, replace(container.resources, **given)
+    if wish == had:
+        return
+    capacity.check_wish(tx, command.user, container.id, wish)
+    _check_room(tx, container, wish)
+    size = endpoints.grown(tx, container, wish, had)
+    tx.put(replace(container, resources=wish, made=container.made or had, size=size))
+    tx.touch(container.id)
+    tx.happen("container_resized", container.id, describe(wish))
+    placing.place_waiting(tx)
+
+
+def _check_room(tx: Transaction, container: Container, wish: Resources) -> None:
+    """Check the machine where it is, and the one that it is on its way to."""
+    had = container.resources
+    move = tx.tables.moves.get(container.id)
+    for process in (container.task_set, move.to if move else ""):
+        task_set = tx.tables.task_sets.get(process)
+        if task_set is None:
+            continue
+        room = capacity.room_at(tx.tables, task_set)
+        lacks = room.without(had).shortages(wish, had)
+        if lacks:
+            raise NoRoom(
+                f"container {container.tag!r} cannot grow so far: {room.name} {' and '.join(lacks)}; "
+                "nothing was changed"
+            )
+
+
+def describe(wish: Resources) -> str:
+    """Write what a container may use, as people write it."""
+    parts = [f"size {wish.size}"]
+    parts += [f"cpu {write_cores(wish.cpu)}"] if wish.cpu else []
+    parts += [f"memory {wish.memory / MEGABYTE:g} MB"] if wish.memory else []
+    parts += [f"bandwidth {write_bandwidth(wish.bandwidth)}/s"] if wish.bandwidth else []
+    return ", ".join(parts)

@@ -1,0 +1,240 @@
+"""Machines that are emptied: containers are handed over, one by one, without a gap."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from support.master_world import World
+
+from rce.control.model import EndpointState, EndpointStatus, LinkAddress, Network, NodeState, NodeStatus
+from rce_master.exceptions import NoRoom, NotFound
+from rce_master.state import commands
+from rce_master.state.changes import Changes
+from rce_master.state.core import State
+
+
+def drain(world: World, machine: str = "m1", *, undo: bool = False) -> Changes:
+    return world.do(commands.SetDraining(machine=machine, draining=not undo))
+
+
+def report(
+    world: World, tag: str, process: str, state: EndpointState = EndpointState.RUNNING, **fields: Any
+) -> Changes:
+    fields.setdefault("address", LinkAddress(machine=process, unix=f"/{process}/{tag}"))
+    return world.report(process, EndpointStatus(id=f"anna/{tag}", revision=1, state=state, **fields))
+
+
+def at(world: World, tag: str) -> str:
+    return world.state.tables.endpoints[f"anna/{tag}"].task_set
+
+
+def moves(world: World) -> dict[str, str]:
+    return {move.id.partition("/")[2]: move.to for move in world.state.tables.moves}
+
+
+def kinds(changes: Changes) -> list[str]:
+    return [happening.kind for happening in changes.happenings]
+
+
+@pytest.fixture
+def two() -> World:
+    """Two containers at machine m1, one of them joined with a robot, and an empty machine m2."""
+    world = World()
+    world.robot_set()
+    world.container_set("c1", name="m1", slots=4)
+    world.login()
+    for tag in ("c", "d"):
+        world.container(tag)
+        report(world, tag, "c1")
+    world.node("c", "n")
+    world.interface("rob/out", "SubscriberConverter")
+    world.interface("c/in", "PublisherInterface")
+    world.connect("rob/out", "c/in")
+    world.container_set("c2", name="m2", slots=4)
+    return world
+
+
+def test_a_copy_is_made_first_and_takes_over_when_it_is_up(two: World) -> None:
+    changes = drain(two)
+    assert moves(two) == {"c": "c2"}, "one at a time"
+    assert at(two, "c") == "c1"
+    assert "anna/c" in changes.touched
+    process, copy = two.state.copy_spec("anna/c") or ("", None)
+    assert process == "c2"
+    assert copy is not None
+    assert ([node.tag for node in copy.nodes], copy.interfaces, copy.links, copy.connections) == (
+        ["n"],
+        (),
+        (),
+        (),
+    )
+    starting = (NodeStatus(tag="n", state=NodeState.STARTING),)
+    assert report(two, "c", "c2", nodes=starting).withdrawals == []
+    assert at(two, "c") == "c1", "its node is not up yet"
+    assert two.spec("rob").links[0].address.unix == "/c1/c"
+    before = two.spec("c").revision
+    changes = report(two, "c", "c2", nodes=(NodeStatus(tag="n", state=NodeState.RUNNING),))
+    assert [(w.process, w.id) for w in changes.withdrawals] == [("c1", "anna/c")]
+    assert (at(two, "c"), two.phase("c")) == ("c2", "running")
+    assert two.spec("c").revision > before
+    assert len(two.spec("c").connections) == 1
+    assert two.spec("rob").links[0].address.unix == "/c2/c"
+    assert {"anna/c", "anna/rob"} <= set(changes.touched)
+    assert moves(two) == {"d": "c2"}, "then the next"
+    report(two, "d", "c2")
+    assert (at(two, "d"), moves(two)) == ("c2", {})
+
+
+def test_a_draining_machine_takes_nothing_new(two: World) -> None:
+    drain(two)
+    two.container("new")
+    assert at(two, "new") == "c2"
+    drain(two, "c2")
+    with pytest.raises(NoRoom, match="m1 is draining; m2 is draining"):
+        two.container("newer")
+    drain(two, "m1", undo=True)
+    two.container("newer")
+    assert at(two, "newer") == "c1"
+    with pytest.raises(NotFound, match="there is no container machine 'm3'"):
+        drain(two, "m3")
+
+
+def test_what_has_room_nowhere_stays_and_the_operator_is_told_once(two: World) -> None:
+    two.container("large", size=4)
+    assert at(two, "large") == "c2"
+    changes = drain(two)
+    (first, second) = [h for h in changes.happenings if h.kind == "container_stays"]
+    assert (first.subject, first.user) == ("anna/c", "")
+    assert "m2 has 0 of 4 slots free, 1 needed" in first.text
+    assert second.subject == "anna/d"
+    assert moves(two) == {}
+    assert kinds(two.tick(1)) == []
+    two.do(commands.DestroyContainer(user="anna", tag="large"))
+    two.do(commands.EndpointGone(process="c2", id="anna/large"))
+    assert moves(two) == {"c": "c2"}
+
+
+def test_a_copy_that_fails_is_dropped_and_tried_again_later(two: World) -> None:
+    drain(two)
+    changes = report(two, "c", "c2", EndpointState.FAILED, detail="no such package")
+    assert [(w.process, w.id) for w in changes.withdrawals] == [("c2", "anna/c")]
+    stays = [h.text for h in changes.happenings if h.kind == "container_stays"]
+    assert "failed there: no such package" in stays[0]
+    assert at(two, "c") == "c1"
+    two.do(commands.EndpointGone(process="c2", id="anna/c"))
+    assert moves(two) == {"d": "c2"}, "the others go on"
+    report(two, "d", "c2")
+    assert moves(two) == {}
+    two.tick(30)
+    assert moves(two) == {"c": "c2"}
+    changes = two.tick(60)
+    assert "did not come up there within 60 s" in changes.happenings[0].text
+
+
+def test_a_copy_waits_until_its_former_one_is_gone_there(two: World) -> None:
+    drain(two)
+    report(two, "c", "c2")
+    drain(two, "m1", undo=True)
+    drain(two, "m2")
+    assert moves(two) == {}, "the former c still ends at m1"
+    two.do(commands.EndpointGone(process="c1", id="anna/c"))
+    assert moves(two) == {"c": "c1"}
+
+
+def test_undoing_calls_what_is_on_its_way_back(two: World) -> None:
+    drain(two)
+    changes = drain(two, undo=True)
+    assert [(w.process, w.id) for w in changes.withdrawals] == [("c2", "anna/c")]
+    assert (moves(two), at(two, "c")) == ({}, "c1")
+    assert kinds(drain(two, undo=True)) == []
+
+
+def test_a_container_that_is_destroyed_takes_its_copy_along(two: World) -> None:
+    drain(two)
+    changes = two.do(commands.DestroyContainer(user="anna", tag="c"))
+    assert {(w.process, w.id) for w in changes.withdrawals} == {("c1", "anna/c"), ("c2", "anna/c")}
+
+
+def test_a_machine_that_is_shut_down_meanwhile_leaves_what_moves_to_its_copy(two: World) -> None:
+    drain(two)
+    two.do(commands.EndpointGone(process="c1", id="anna/c"))
+    assert (at(two, "c"), two.phase("c")) == ("c2", "placed")
+    report(two, "c", "c2")
+    assert two.phase("c") == "running"
+    two.leave("c1")
+    two.tick(30)
+    assert at(two, "d") == "c2"
+
+
+def test_a_target_that_goes_away_ends_the_move(two: World) -> None:
+    drain(two)
+    two.leave("c2")
+    assert (moves(two), at(two, "c")) == ({}, "c1")
+    status = EndpointStatus(id="anna/c", revision=9, state=EndpointState.RUNNING)
+    two.container_set("c2", name="m2", slots=4, endpoints=(status,))
+    assert at(two, "c") == "c1"
+
+
+def test_a_copy_that_is_as_degraded_as_its_original_takes_over(two: World) -> None:
+    drain(two)
+    report(two, "c", "c2", EndpointState.DEGRADED)
+    assert at(two, "c") == "c1"
+    report(two, "c", "c1", EndpointState.DEGRADED)
+    report(two, "c", "c2", EndpointState.DEGRADED)
+    assert (at(two, "c"), two.phase("c")) == ("c2", "degraded")
+
+
+def test_copies_count_where_they_are_made(two: World) -> None:
+    two.container("large", size=3)
+    drain(two)
+    assert moves(two) == {"c": "c2"}
+    with pytest.raises(NoRoom, match="m2 has 0 of 4 slots free"):
+        two.container("more")
+    with pytest.raises(NoRoom, match="m2 has 1 of 4 slots free, 2 needed"):
+        two.do(commands.ResizeContainer(user="anna", tag="c", size=2))
+
+
+def test_a_group_moves_as_a_whole(world: World) -> None:
+    machine = {"networks": ("none", "group")}
+    world.container_set("c1", name="m1", slots=4, **machine)
+    for tag in "ab":
+        world.container(tag, network=Network.GROUP, group="g")
+        report(world, tag, "c1")
+    world.container_set("c2", name="m2", slots=1, **machine)
+    changes = drain(world)
+    texts = [h.text for h in changes.happenings if h.kind == "container_stays"]
+    assert "it moves with 1 others of its group; no machine has room for all of them" in texts[0]
+    world.container_set("c3", name="m3", slots=2, **machine)
+    world.tick(1)
+    assert moves(world) == {"a": "c3", "b": "c3"}
+    report(world, "a", "c3")
+    assert at(world, "a") == "c1", "the whole group, or none of it"
+    report(world, "b", "c3")
+    assert (at(world, "a"), at(world, "b")) == ("c3", "c3")
+
+
+def test_a_drain_outlives_a_restart_of_the_master(two: World) -> None:
+    drain(two)
+    snapshot = {
+        table.name: {table.key(r): table.encode(r) for r in table}
+        for table in two.state.tables.all
+        if table.persistent
+    }
+    two.state = State.load(snapshot, two.now)
+    two.state.validate()
+    running = tuple(EndpointStatus(id=f"anna/{tag}", revision=1, state=EndpointState.RUNNING) for tag in "cd")
+    two.container_set("c2", name="m2", slots=4, endpoints=running[:1])
+    two.container_set("c1", name="m1", slots=4, endpoints=running)
+    two.tick(1)
+    assert moves(two) == {"c": "c2"}
+
+
+def test_a_machine_may_say_itself_that_it_drains(two: World) -> None:
+    running = tuple(EndpointStatus(id=f"anna/{tag}", revision=1, state=EndpointState.RUNNING) for tag in "cd")
+    two.leave("c1")
+    two.container_set("c1", name="m1", slots=4, draining=True, endpoints=running)
+    two.tick(1)
+    assert moves(two) == {"c": "c2"}
+    two.container("new")
+    assert at(two, "new") == "c2"
