@@ -11,6 +11,7 @@ import uvloop
 
 from rce.config.exceptions import RunDirError, SecretError
 from rce.config.secret import load_secret
+from rce.guard.files import raise_file_limit
 from rce.ros.tcpros.allocator import keep_large_blocks
 from rce_robot.app import App
 from rce_robot.settings import RobotSettings
@@ -64,6 +65,7 @@ def robot(
         origins=tuple(origin or ()),
     )
     keep_large_blocks()
+    raise_file_limit()
     try:
         secret = load_secret(secret_file, dev=dev)
         program = App(

@@ -20,6 +20,7 @@ from rce.config.resources import examples_dir
 from rce.control.channel import TaskSetChannel
 from rce.control.messages import MachineInfo
 from rce.control.model import LinkAddress
+from rce.guard.lobby import Lobby
 from rce.link import LinkHub
 from rce.link.address import in_url, is_any, own_address
 from rce.link.unix import remove_stale_sockets
@@ -91,9 +92,10 @@ class App:
             channel = TaskSetChannel(control, self.secret, task_set.hello, task_set.handle)
             task_set.use(channel)
             gate = Gate(task_set, settings.session, settings.origins)
+            lobby = Lobby("robots", per_address=settings.strangers_per_address, in_all=settings.strangers)
             async with asyncio.TaskGroup() as tasks:
                 running = [tasks.create_task(channel.run())]
-                async with serve_robots(gate, settings, listener):
+                async with serve_robots(gate, settings, listener, lobby):
                     running.append(tasks.create_task(task_set.run()))
                     running.append(tasks.create_task(_announce(channel, url, ready)))
                     yield

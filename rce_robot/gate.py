@@ -54,6 +54,7 @@ class Gate:
     async def admit(self, connection: ServerConnection, request: Request) -> Response | None:
         """Let a robot in (None), or say why not."""
         assert isinstance(connection, RobotSocket)
+        connection.speak()
         if request.headers.get("Upgrade", "").lower() != "websocket":
             return None  # the library knows what to say to what is no WebSocket handshake
         try:
@@ -68,6 +69,7 @@ class Gate:
         session = Session(connection, namespace, self._settings, namespace.dropped)
         namespace.session = session
         connection.receiver = session
+        connection.become_known()
         if connection.protocol.state is not State.CONNECTING:
             session.on_lost("the robot left during the handshake")
         return None

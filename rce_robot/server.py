@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from websockets.asyncio.server import serve
 
+from rce.guard.websocket import guarded
 from rce_robot.session import Session
 from rce_robot.websocket import RobotSocket
 
@@ -14,11 +15,12 @@ if TYPE_CHECKING:
 
     from websockets.asyncio.server import Server, ServerConnection
 
+    from rce.guard.lobby import Lobby
     from rce_robot.gate import Gate
     from rce_robot.settings import RobotSettings
 
 
-def serve_robots(gate: Gate, settings: RobotSettings, listener: socket.socket) -> Server:
+def serve_robots(gate: Gate, settings: RobotSettings, listener: socket.socket, lobby: Lobby) -> Server:
     """Return the server, to be used with ``async with``.
 
     There is no compression: per-message deflate costs each message more time than it saves on any link but
@@ -29,7 +31,7 @@ def serve_robots(gate: Gate, settings: RobotSettings, listener: socket.socket) -
         _run_session,
         sock=listener,
         process_request=gate.admit,
-        create_connection=RobotSocket,
+        create_connection=guarded(RobotSocket, lobby),
         compression=None,
         open_timeout=settings.open_timeout,
         ping_interval=session.ping_interval,

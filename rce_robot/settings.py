@@ -52,6 +52,10 @@ class RobotSettings:
     """How long a robot at the door waits for a master that is away."""
     open_timeout: float = 20.0
     """The whole handshake; more than ``login_timeout``."""
+    strangers: int = 1024
+    """Connections whose robot has not logged in yet."""
+    strangers_per_address: int = 256
+    """The same from one address."""
     call_timeout: float = 30.0
     """How long a robot may take to answer a service call."""
     usage_interval: float = 2.0

@@ -19,9 +19,10 @@ import socket
 import struct
 from typing import TYPE_CHECKING, Protocol
 
-from websockets.asyncio.server import ServerConnection
 from websockets.frames import CloseCode, Frame, Opcode
 from websockets.protocol import State
+
+from rce.guard.websocket import GuardedConnection
 
 if TYPE_CHECKING:
     import asyncio
@@ -62,8 +63,8 @@ class Receiver(Protocol):
         """The connection ended. Called once, also when the handshake did not complete."""
 
 
-class RobotSocket(ServerConnection):
-    """A robot's WebSocket connection; made by ``websockets.asyncio.server.serve(create_connection=...)``."""
+class RobotSocket(GuardedConnection):
+    """A robot's WebSocket connection."""
 
     receiver: Receiver | None = None
     """Gets what arrives. Set while the handshake is answered."""

@@ -11,6 +11,7 @@ import msgspec
 from websockets.asyncio.server import serve
 from websockets.exceptions import ConnectionClosed
 
+from rce.control.contents import answer, is_for_contents
 from rce.control.exceptions import PeerRefusedError
 from rce.control.messages import (
     CONTROL_VERSION,
@@ -23,6 +24,8 @@ from rce.control.messages import (
 )
 from rce.control.peer import Peer
 from rce.control.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, ControlTimeouts
+from rce.guard.lobby import PER_ADDRESS, Lobby
+from rce.guard.websocket import GuardedConnection, guarded
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -33,9 +36,13 @@ if TYPE_CHECKING:
     from websockets.http11 import Request, Response
 
     from rce.config.secret import Secret
+    from rce.control.contents import ReadContent
     from rce.control.messages import ToMaster
 
 _log = logging.getLogger(__name__)
+
+STRANGERS_PER_ADDRESS = PER_ADDRESS
+"""Connections from one address that have not shown the secret yet."""
 
 _GARBAGE, _POLICY, _INTERNAL, _GOING_AWAY = 1007, 1008, 1011, 1001
 _MAX_REASON = 123  # bytes of a WebSocket close frame's reason
@@ -57,6 +64,7 @@ class ControlServer:
         host: Address to listen on.
         port: Port to listen on; 0 takes a free one.
         timeouts: Times of this end.
+        contents: Gives contents to task sets that ask for them (:mod:`rce.control.contents`).
     """
 
     def __init__(
@@ -70,8 +78,10 @@ class ControlServer:
         host: str = "127.0.0.1",
         port: int = 8080,
         timeouts: ControlTimeouts = DEFAULT_TIMEOUTS,
+        contents: ReadContent | None = None,
     ) -> None:
         self._secret = secret
+        self._contents = contents
         self._on_hello = on_hello
         self._on_message = on_message
         self._on_gone = on_gone
@@ -100,7 +110,10 @@ class ControlServer:
             self._serve,
             self._host,
             self._port,
-            process_request=self._authenticate,
+            process_request=self._admit,
+            create_connection=guarded(
+                GuardedConnection, Lobby("task sets", per_address=STRANGERS_PER_ADDRESS)
+            ),
             origins=[None],  # no browser's page has any business here
             compression=None,
             open_timeout=self._timeouts.open,
@@ -118,10 +131,18 @@ class ControlServer:
         self._server.close(code=_GOING_AWAY, reason="the master is shutting down")
         await self._server.wait_closed()
 
+    async def _admit(self, socket: ServerConnection, request: Request) -> Response | None:
+        refusal = self._authenticate(socket, request)
+        if refusal is None and self._contents is not None and is_for_contents(request.path):
+            return await answer(request, self._contents)
+        return refusal
+
     def _authenticate(self, socket: ServerConnection, request: Request) -> Response | None:
         given = request.headers.get_all("Authorization")
         scheme, _, token = given[0].partition(" ") if len(given) == 1 else ("", "", "")
         if scheme.lower() == "bearer" and self._secret.matches(token.strip()):
+            assert isinstance(socket, GuardedConnection)
+            socket.become_known()
             return None
         _log.warning("a task set at %s came with a wrong secret", socket.remote_address)
         return socket.respond(HTTPStatus.UNAUTHORIZED, "Task sets prove themselves by the engine's secret.\n")

@@ -19,6 +19,7 @@ import os
 import socket
 from typing import TYPE_CHECKING
 
+from rce.guard.lobby import Lobby, address_of
 from rce.link.exceptions import LinkError, LinkLost, LinkRefused, ProtocolError
 from rce.link.frames import HANDSHAKE_SIZE, HEADER_SIZE, Frame, FrameReader, FrameType, encode, parse_hello
 from rce.link.settings import LinkLimits, LinkTimeouts
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_MAX_GREETINGS = 1024
-"""Accepted connections that have not been handed over yet."""
 _BUSY_PAUSE = 0.1
 """Seconds to wait after the system refused to accept, for want of file descriptors for example."""
 _FD = array.array("i")
@@ -159,11 +158,20 @@ def _receive(sock: socket.socket) -> tuple[bytes, list[int]]:
 
 
 class Doorman:
-    """Accepts TCP links for the endpoints of other processes and hands each to the right one."""
+    """Accepts TCP links for the endpoints of other processes and hands each to the right one.
+
+    Attributes:
+        lobby: Accepted connections that have not been handed over yet.
+    """
 
     def __init__(self, timeouts: LinkTimeouts | None = None, limits: LinkLimits | None = None) -> None:
         self._timeouts = timeouts or LinkTimeouts()
         self._limits = limits or LinkLimits()
+        self.lobby = Lobby(
+            "links to hand over",
+            per_address=self._limits.strangers_per_address,
+            in_all=self._limits.strangers,
+        )
         self._routes: dict[str, HandoverSender] = {}
         self._assigned = asyncio.Condition()
         self._sockets: list[socket.socket] = []
@@ -212,29 +220,37 @@ class Doorman:
         loop = asyncio.get_running_loop()
         while True:
             try:
-                connection, _ = await loop.sock_accept(sock)
+                connection, peer = await loop.sock_accept(sock)
             except OSError as error:
                 log.warning("cannot accept a link: %s", error)
                 await asyncio.sleep(_BUSY_PAUSE)
                 continue
-            if len(self._scope) > _MAX_GREETINGS:
-                connection.close()
-                continue
-            self._scope.spawn(self._pass_on(connection), "link to hand over")
+            self._scope.spawn(self._receive(connection, address_of(peer)), "link to hand over")
+
+    async def _receive(self, connection: socket.socket, address: str) -> None:
+        """Pass a connection on, if there is room for it; one that must make room is cancelled."""
+        task = asyncio.current_task()
+        assert task is not None
+        with connection:
+            guest = self.lobby.enter(address, task.cancel)
+            if guest is not None:
+                try:
+                    await self._pass_on(connection)
+                finally:
+                    guest.leave()
 
     async def _pass_on(self, connection: socket.socket) -> None:
-        with connection:
-            try:
-                async with asyncio.timeout(self._timeouts.handshake):
-                    received = await read_hello(connection, self._limits)
-                    sender = await self._find(received.link)
-                    await sender.send(connection, received.data)
-            except LinkRefused as error:
-                log.warning("link refused: %s", error)
-                with contextlib.suppress(OSError):
-                    connection.send(encode(Frame(FrameType.REFUSE, payload=b"unknown link or wrong token")))
-            except (LinkError, OSError) as error:
-                log.info("a link was not handed over: %s", str(error) or type(error).__name__)
+        try:
+            async with asyncio.timeout(self._timeouts.handshake):
+                received = await read_hello(connection, self._limits)
+                sender = await self._find(received.link)
+                await sender.send(connection, received.data)
+        except LinkRefused as error:
+            log.warning("link refused: %s", error)
+            with contextlib.suppress(OSError):
+                connection.send(encode(Frame(FrameType.REFUSE, payload=b"unknown link or wrong token")))
+        except (LinkError, OSError) as error:
+            log.info("a link was not handed over: %s", str(error) or type(error).__name__)
 
     async def _find(self, link: str) -> HandoverSender:
         """Return who takes a link; the news of it may still be on its way."""

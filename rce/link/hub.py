@@ -10,6 +10,7 @@ import socket
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rce.guard.lobby import Lobby, address_of
 from rce.link.carrier import Carrier, LocalCarrier
 from rce.link.exceptions import LinkError, LinkLost, LinkRefused
 from rce.link.frames import Frame, FrameType, check_answer, encode, encode_hello, parse_hello
@@ -22,13 +23,11 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from rce.control.model import LinkAddress, LinkSpec
+    from rce.guard.lobby import Guest
     from rce.link.frames import Hello
     from rce.link.link import Link
 
 log = logging.getLogger(__name__)
-
-_MAX_GREETINGS = 1024
-"""Accepted connections that have not shown yet who they are."""
 
 
 class LinkHub:
@@ -45,6 +44,7 @@ class LinkHub:
         machine: As given.
         timeouts: As given.
         limits: As given.
+        lobby: Accepted connections that have not shown yet which link they are for.
     """
 
     def __init__(
@@ -58,6 +58,9 @@ class LinkHub:
         self.machine = machine
         self.timeouts = timeouts or LinkTimeouts()
         self.limits = limits or LinkLimits()
+        self.lobby = Lobby(
+            "links", per_address=self.limits.strangers_per_address, in_all=self.limits.strangers
+        )
         self._dial = dial
         self._accepting: dict[str, Link] = {}
         self._waiters: dict[str, set[asyncio.Future[None]]] = {}
@@ -254,22 +257,34 @@ class LinkHub:
 
     # Accepting
 
-    def _new_carrier(self, received: bytes = b"") -> SocketCarrier:
-        carrier = SocketCarrier(
-            self.limits, self.timeouts, received=received, on_closed=self._carriers.discard
+    def _new_carrier(self) -> SocketCarrier:
+        return self._keep(SocketCarrier(self.limits, self.timeouts, on_closed=self._carriers.discard))
+
+    def _accept(self, received: bytes = b"") -> SocketCarrier:
+        return self._keep(
+            SocketCarrier(
+                self.limits,
+                self.timeouts,
+                received=received,
+                on_open=self._let_in,
+                on_closed=self._carriers.discard,
+            )
         )
+
+    def _keep(self, carrier: SocketCarrier) -> SocketCarrier:
         self._carriers.add(carrier)
         return carrier
 
-    def _accept(self, received: bytes = b"") -> SocketCarrier:
-        carrier = self._new_carrier(received)
-        if self._closed or len(self._greetings) >= _MAX_GREETINGS:
-            carrier.abort(LinkLost("too many connections come at once"))
+    def _let_in(self, carrier: SocketCarrier) -> None:
+        """Wait for the HELLO of an accepted connection, if there is room."""
+        crowded = LinkLost("too many connections come at once")
+        guest = self.lobby.enter(address_of(carrier.peer), lambda: carrier.abort(crowded))
+        if self._closed or guest is None:
+            carrier.abort(crowded)
         else:
-            self._greetings.spawn(self._greet(carrier), "link greeting")
-        return carrier
+            self._greetings.spawn(self._greet(carrier, guest), "link greeting")
 
-    async def _greet(self, carrier: SocketCarrier) -> None:
+    async def _greet(self, carrier: SocketCarrier, guest: Guest) -> None:
         """Shake hands as the accepting end."""
         try:
             async with asyncio.timeout(self.timeouts.handshake):
@@ -288,6 +303,8 @@ class LinkHub:
         else:
             carrier.greet(encode(Frame(FrameType.WELCOME)))
             link.attach(carrier)
+        finally:
+            guest.leave()
 
     async def _find(self, hello: Hello) -> Link:
         """Return the link that a peer asks for; its spec may still be on its way."""

@@ -59,11 +59,13 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         timeouts: LinkTimeouts,
         *,
         received: bytes = b"",
+        on_open: Callable[[SocketCarrier], None] = lambda _: None,
         on_closed: Callable[[SocketCarrier], None] = lambda _: None,
     ) -> None:
         self._limits = limits
         self._timeouts = timeouts
         self._received = received
+        self._on_open = on_open
         self._on_closed = on_closed
         self._loop = asyncio.get_running_loop()
         self._reader = FrameReader(limits, max_message=HANDSHAKE_SIZE)
@@ -100,6 +102,11 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         if not self._early:
             raise self._reason or LinkLost("the connection ended before the handshake")
         return self._early.pop(0)
+
+    @property
+    def peer(self) -> object:
+        """The peer's address, as sockets say it; none before the connection is there."""
+        return None if self._transport is None else self._transport.get_extra_info("peername")
 
     def greet(self, frame: bytes) -> None:
         """Send an encoded frame of the handshake."""
@@ -206,8 +213,9 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
             if hasattr(socket, "TCP_NOTSENT_LOWAT"):
                 sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _NOT_SENT)
         self._writable = self._straight = True
+        self._on_open(self)
         received, self._received = self._received, b""
-        if received:
+        if received and not self._ending:
             self.received = len(received)
             self._take(self._reader.feed, received)
 
@@ -329,7 +337,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
                 return
 
     def _next_through(self, valve: Valve) -> Chunk | None:
-        """Return what may be sent next, paid for. Frames of the link itself, which keep it alive, never wait."""
+        """Return what may be sent next, paid for. Frames of the link itself never wait: it lives by them."""
         urgent = self._lanes.control or self._lanes.urgent
         limit = FRAGMENT_SIZE if self._lanes.control else valve.room(urgent=urgent)
         chunk = self._lanes.next(limit) if limit else None

@@ -2,25 +2,39 @@
 
 from __future__ import annotations
 
-from ssl import SSLContext
-from typing import Self
+import asyncio
+from typing import TYPE_CHECKING, Self, cast
 
 from aiohttp import web
 from yarl import URL
 
+from rce.guard.lobby import Guest, Lobby, address_of
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+    from ssl import SSLContext
+
 SHUTDOWN_S = 0.5
 """How long open requests may go on when the server ends."""
-
-
 IDLE_S = 30.0
 """A connection that sends no request, or does not come to its end, for so long is closed."""
+
+_TLS_HANDSHAKE_S = 10.0
+_BACKLOG = 512
+_FIRST_ERROR = 400
+_SWEEP_EVERY = 32
+"""Connections after which those that have ended are forgotten."""
 
 
 class HttpServer:
     """Serves an application. Use it as an asynchronous context manager.
 
+    Who has no answer is a stranger, and so is who waits between requests; a connection that streams what it
+    was granted is not. When there are too many strangers, those without a request are closed first.
+
     Attributes:
         url: Where it listens, once it does.
+        lobby: The strangers.
     """
 
     def __init__(
@@ -31,26 +45,97 @@ class HttpServer:
         ssl: SSLContext | None = None,
         *,
         idle_timeout: float = IDLE_S,
+        lobby: Lobby | None = None,
     ) -> None:
+        self.lobby = Lobby("HTTP") if lobby is None else lobby
+        self._guests: dict[asyncio.BaseTransport, Guest] = {}
+        self._handled: set[Guest] = set()
+        """Those whose request a handler works on."""
+        self._arrivals = 0
+        app.middlewares.insert(0, self._track)
+        app.on_response_prepare.append(self._grant)
         self._runner = web.AppRunner(
             app, access_log=None, shutdown_timeout=SHUTDOWN_S, keepalive_timeout=idle_timeout
         )
         self._host = host
         self._port = port
         self._ssl = ssl
+        self._server: asyncio.Server | None = None
         self.url = ""
 
     async def __aenter__(self) -> Self:
         await self._runner.setup()
         try:
-            await web.TCPSite(self._runner, self._host, self._port, ssl_context=self._ssl).start()
+            self._server = await asyncio.get_running_loop().create_server(
+                lambda: _Arrival(self._let_in),
+                self._host or None,
+                self._port,
+                ssl=self._ssl,
+                ssl_handshake_timeout=_TLS_HANDSHAKE_S if self._ssl else None,
+                backlog=_BACKLOG,
+            )
         except BaseException:
             await self._runner.cleanup()
             raise
-        port = self._runner.addresses[0][1]
+        port = self._server.sockets[0].getsockname()[1]
         host = "127.0.0.1" if self._host in ("", "0.0.0.0", "::") else self._host  # noqa: S104 - compared, not bound
         self.url = str(URL.build(scheme="https" if self._ssl else "http", host=host, port=port, path="/"))
         return self
 
     async def __aexit__(self, *_: object) -> None:
+        assert self._server is not None
+        self._server.close()
         await self._runner.cleanup()
+        await self._server.wait_closed()
+
+    # Who comes
+
+    def _let_in(self, transport: asyncio.Transport) -> None:
+        """Serve a new connection, if there is room for it."""
+        self._arrivals += 1
+        if self._arrivals % _SWEEP_EVERY == 0:
+            self._forget_ended()
+        guest = self.lobby.enter(address_of(transport.get_extra_info("peername")), transport.abort)
+        if guest is None or self._runner.server is None:
+            transport.abort()
+            return
+        self._guests[transport] = guest
+        protocol = cast("asyncio.Protocol", self._runner.server())
+        transport.set_protocol(protocol)
+        protocol.connection_made(transport)
+
+    def _forget_ended(self) -> None:
+        for transport in [transport for transport in self._guests if transport.is_closing()]:
+            self._guests.pop(transport).leave()
+
+    @web.middleware
+    async def _track(
+        self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
+    ) -> web.StreamResponse:
+        """Keep a connection's place in the lobby while its request is handled."""
+        guest = None if request.transport is None else self._guests.get(request.transport)
+        if guest is None:
+            return await handler(request)
+        guest.speak()
+        self._handled.add(guest)
+        try:
+            return await handler(request)
+        finally:
+            self._handled.discard(guest)
+            guest.rest()
+
+    async def _grant(self, request: web.Request, response: web.StreamResponse) -> None:
+        """Take note that a handler began to stream: who may have that is no stranger."""
+        guest = None if request.transport is None else self._guests.get(request.transport)
+        if guest in self._handled and response.status < _FIRST_ERROR:
+            guest.leave()
+
+
+class _Arrival(asyncio.Protocol):
+    """A connection's protocol until it is let in."""
+
+    def __init__(self, let_in: Callable[[asyncio.Transport], None]) -> None:
+        self._let_in = let_in
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._let_in(cast("asyncio.Transport", transport))

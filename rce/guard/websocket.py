@@ -1,0 +1,52 @@
+"""WebSocket servers with a lobby."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeVar
+
+from websockets.asyncio.server import ServerConnection
+
+from rce.guard.lobby import address_of
+
+if TYPE_CHECKING:
+    import asyncio
+
+    from rce.guard.lobby import Guest, Lobby
+
+
+class GuardedConnection(ServerConnection):
+    """A connection that waits in a lobby until it is known; made by what :func:`guarded` returns."""
+
+    lobby: Lobby
+    _guest: Guest | None = None
+
+    def speak(self) -> None:
+        """Take note that its handshake's request has come, so that others do not take its place any more."""
+        if self._guest is not None:
+            self._guest.speak()
+
+    def become_known(self) -> None:
+        """Count it among strangers no longer."""
+        if self._guest is not None:
+            self._guest.leave()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Come into the lobby, or be dropped."""
+        super().connection_made(transport)
+        address = address_of(transport.get_extra_info("peername"))
+        self._guest = self.lobby.enter(address, self.transport.abort)
+        if self._guest is None:
+            self.transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Leave."""
+        super().connection_lost(exc)
+        self.become_known()
+
+
+ConnectionT = TypeVar("ConnectionT", bound=GuardedConnection)
+
+
+def guarded(kind: type[ConnectionT], lobby: Lobby) -> type[ConnectionT]:
+    """Return the kind of connection with this lobby, for ``serve(create_connection=...)``."""
+    return type(kind.__name__, (kind,), {"lobby": lobby, "__module__": kind.__module__})

@@ -1,0 +1,179 @@
+"""Connections that are held open without a word lock nobody out: robots, HTTP, task sets, links."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from contextlib import AsyncExitStack, asynccontextmanager
+from typing import TYPE_CHECKING
+
+import pytest
+from aiohttp import ClientSession, web
+from support.cloud import DIGEST, SECRET, running_cloud
+from websockets.asyncio.client import connect
+
+from rce.control.server import ControlServer
+from rce.guard.lobby import Lobby
+from rce.link.exceptions import LinkRefused
+from rce.link.frames import FrameReader, check_answer, encode_hello
+from rce.link.handover import Doorman, HandoverReceiver, HandoverSender
+from rce.link.hub import LinkHub
+from rce.link.settings import LinkLimits, LinkTimeouts
+from rce.web.server import HttpServer
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+ADDRESS = "127.0.0.1"
+FEW = 8
+MANY = 40
+QUICK = LinkTimeouts(unknown_link=0.2)
+GO = web.AppKey("go", asyncio.Event)
+
+
+@asynccontextmanager
+async def held_open(port: int, first: bytes = b"") -> AsyncIterator[list[socket.socket]]:
+    """Hold many connections open, from one address, that come no further than their first bytes."""
+    loop = asyncio.get_running_loop()
+    with_all = [socket.socket() for _ in range(MANY)]
+    try:
+        for sock in with_all:
+            sock.setblocking(False)
+            await loop.sock_connect(sock, (ADDRESS, port))
+            if first:
+                await loop.sock_sendall(sock, first)
+        yield with_all
+    finally:
+        for sock in with_all:
+            sock.close()
+
+
+async def ended(sock: socket.socket) -> bool:
+    """Wait for a connection's end; false for data."""
+    try:
+        return await asyncio.get_running_loop().sock_recv(sock, 1) == b""
+    except ConnectionResetError:
+        return True
+
+
+@pytest.mark.parametrize("first", [b"", b"GET /?userID=testUser HTTP/1.1\r\nHost: h\r\n"])
+async def test_robots_come_in(first: bytes) -> None:
+    async with running_cloud(strangers_per_address=FEW) as cloud:
+        port = int(cloud.ws_url.rstrip("/").rpartition(":")[2])
+        async with held_open(port, first) as crowd:
+            url = f"{cloud.ws_url}?userID=testUser&robotID=r&password={DIGEST}"
+            async with connect(url, proxy=None) as robot:
+                for sock in crowd[: MANY - FEW]:
+                    assert await ended(sock)
+                await (await robot.ping())
+
+
+async def test_robots_that_are_known_are_not_counted() -> None:
+    async with running_cloud(strangers_per_address=2) as cloud, AsyncExitStack() as stack:
+        robots = [
+            await stack.enter_async_context(
+                connect(f"{cloud.ws_url}?userID=testUser&robotID=r{n}&password={DIGEST}", proxy=None)
+            )
+            for n in range(6)
+        ]
+        for robot in robots:
+            await (await robot.ping())
+
+
+async def _answer(_: web.Request) -> web.Response:
+    return web.Response(text="here")
+
+
+async def _stream(request: web.Request) -> web.StreamResponse:
+    response = web.StreamResponse()
+    await response.prepare(request)
+    await response.write(b"first")
+    await request.app[GO].wait()
+    await response.write(b"last")
+    return response
+
+
+@asynccontextmanager
+async def web_server() -> AsyncIterator[tuple[HttpServer, asyncio.Event]]:
+    app = web.Application()
+    go = asyncio.Event()
+    app[GO] = go
+    app.router.add_get("/", _answer)
+    app.router.add_get("/stream", _stream)
+    async with HttpServer(app, ADDRESS, 0, lobby=Lobby("test", per_address=FEW)) as server:
+        yield server, go
+
+
+@pytest.mark.parametrize(
+    "first", [b"", b"GET / HTTP/1.1\r\nHost: h\r\n", b"GET / HTTP/1.1\r\nHost: h\r\n\r\n"]
+)
+async def test_http_answers(first: bytes) -> None:
+    async with web_server() as (server, _), ClientSession() as session:
+        port = int(server.url.rstrip("/").rpartition(":")[2])
+        async with held_open(port, first), session.get(server.url) as response:
+            assert await response.text() == "here"
+        assert server.lobby.turned_away >= MANY - FEW
+        assert len(server.lobby) <= FEW
+
+
+async def test_http_streams_go_on() -> None:
+    async with web_server() as (server, go), AsyncExitStack() as stack:
+        session = await stack.enter_async_context(ClientSession())
+        streams = [
+            await stack.enter_async_context(session.get(f"{server.url}stream")) for _ in range(2 * FEW)
+        ]
+        for stream in streams:
+            assert await stream.content.readexactly(5) == b"first"
+        async with held_open(int(server.url.rstrip("/").rpartition(":")[2])):
+            go.set()
+            for stream in streams:
+                assert await stream.content.read() == b"last"
+
+
+async def test_task_sets_come_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rce.control.server.STRANGERS_PER_ADDRESS", FEW)
+
+    async def nothing(*_: object) -> None:
+        pass
+
+    header = {"Authorization": f"Bearer {SECRET.reveal()}"}
+    async with (
+        ControlServer(SECRET, on_hello=nothing, on_message=nothing, on_gone=nothing, port=0) as server,
+        held_open(server.port) as crowd,
+        connect(f"ws://{ADDRESS}:{server.port}", additional_headers=header, proxy=None) as peer,
+    ):
+        for sock in crowd[: MANY - FEW]:
+            assert await ended(sock)
+        await (await peer.ping())
+
+
+@pytest.mark.parametrize("first", [b"", encode_hello("unheard of", "t")])
+@pytest.mark.parametrize("way", ["hub", "doorman"])
+async def test_links_are_answered(way: str, first: bytes) -> None:
+    limits = LinkLimits(strangers_per_address=FEW)
+    async with AsyncExitStack() as stack:
+        hub = LinkHub("here", QUICK, limits)
+        stack.push_async_callback(hub.close)
+        if way == "hub":
+            port = await hub.listen_tcp(ADDRESS, 0)
+            lobby = hub.lobby
+        else:
+            ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            sender, receiver = HandoverSender(ours), HandoverReceiver(theirs, hub.adopt)
+            stack.callback(sender.close)
+            stack.push_async_callback(receiver.close)
+            doorman = Doorman(QUICK, limits)
+            stack.push_async_callback(doorman.close)
+            await doorman.assign(sender, ["L"])
+            port = await doorman.listen(ADDRESS, 0)
+            lobby = doorman.lobby
+        async with held_open(port, first) as crowd:
+            for sock in crowd[: MANY - FEW]:
+                assert await ended(sock)
+            assert len(lobby) == FEW
+            reader, writer = await asyncio.open_connection(ADDRESS, port)
+            writer.write(encode_hello("L", "wrong"))
+            with pytest.raises(LinkRefused):
+                check_answer(FrameReader(limits).feed(await reader.read(1000))[0])
+            writer.close()
+            await writer.wait_closed()
