@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 from rce.control.server import ControlServer
 from rce.web.server import HttpServer
 from rce_master.auth import Authenticator, client_digest
+from rce_master.bundles.contents import ContentStore
+from rce_master.bundles.office import PackageOffice
 from rce_master.desk import Desk
 from rce_master.events import EventLog
 from rce_master.exceptions import MasterError
@@ -88,10 +90,15 @@ class Master:
         authenticator = Authenticator(realm.tables, hasher=self._hasher)
         desk = Desk(realm, reconciler, authenticator)
         lifetime = self._settings.token_lifetime
-        services = Services(realm, reconciler, authenticator, events, time.time, lifetime)
+        self._contents = ContentStore(self._settings.state_dir / "bundles")
+        packages = PackageOffice(realm, self._contents)
+        services = Services(realm, reconciler, authenticator, events, time.time, lifetime, packages)
         try:
             async with asyncio.TaskGroup() as group:
-                workers = [group.create_task(work) for work in (realm.run(), desk.run(), _tick(realm))]
+                workers = [
+                    group.create_task(work)
+                    for work in (realm.run(), desk.run(), packages.run(), _tick(realm))
+                ]
                 try:
                     await self._serve(services, desk, on_ready)
                 finally:
@@ -114,6 +121,7 @@ class Master:
             master="rce-master",
             host=settings.bind,
             port=settings.control_port,
+            contents=self._contents.read,
         )
         http = HttpServer(app, settings.bind, settings.http_port, settings.ssl_context())
         async with AsyncExitStack() as stack:

@@ -5,6 +5,7 @@
     ControlError
     +-- MasterUnavailableError   the master did not answer in time
     +-- UnsendableError          a message is too long, or holds what no frame can hold
+    +-- ContentError             a content cannot be fetched from the master
     +-- PeerGoneError            a task set left before it answered
     +-- PeerTimeoutError         a task set did not answer in time
     +-- PeerRefusedError         raised by the master's ``on_hello``: the task set is not taken
@@ -45,6 +46,18 @@ class UnsendableError(ControlError):
 
     def __str__(self) -> str:
         return f"the message cannot be sent: {self.problem}"
+
+
+class ContentError(ControlError):
+    """A content cannot be fetched from the master.
+
+    Attributes:
+        missing: Whether the master answered that it does not have it.
+    """
+
+    def __init__(self, problem: str, *, missing: bool = False) -> None:
+        super().__init__(problem)
+        self.missing = missing
 
 
 class PeerGoneError(ControlError):

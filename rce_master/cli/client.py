@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import aiohttp
 import msgspec
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from rce_master.cli.credentials import Credentials
 
 REQUEST_S = 30.0
+UPLOAD_S = 300.0
+"""For an answer to what was sent: the master looks through it first."""
 RETRY_S = 1.0
 _OK = 400
 
@@ -71,6 +73,26 @@ class ApiClient:
         """
         try:
             async with self._session.request(method, self._base + path, json=body, params=query) as reply:
+                return await _result(reply)
+        except (aiohttp.ClientError, TimeoutError, ValueError) as error:
+            raise CliError(f"cannot use the master at {self._base}: {str(error) or 'no answer'}") from error
+
+    async def upload(self, path: str, file: BinaryIO, query: dict[str, str]) -> Any:
+        """Send a file's contents.
+
+        Returns:
+            What came back.
+
+        Raises:
+            ApiError: The master refused.
+            CliError: The master could not be reached.
+        """
+        timeout = aiohttp.ClientTimeout(total=None, sock_connect=REQUEST_S, sock_read=UPLOAD_S)
+        headers = {"Content-Type": "application/gzip"}
+        try:
+            async with self._session.put(
+                self._base + path, data=file, params=query, headers=headers, timeout=timeout
+            ) as reply:
                 return await _result(reply)
         except (aiohttp.ClientError, TimeoutError, ValueError) as error:
             raise CliError(f"cannot use the master at {self._base}: {str(error) or 'no answer'}") from error

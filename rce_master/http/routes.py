@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from aiohttp.web import StreamResponse
 
     from rce_master.auth import Authenticator
+    from rce_master.bundles.office import PackageOffice
     from rce_master.events import EventLog
     from rce_master.realm import Realm
     from rce_master.reconciler import Reconciler
@@ -40,6 +41,7 @@ class Services:
     """Seconds since 1970."""
     token_lifetime: float
     """Seconds."""
+    packages: PackageOffice
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ from rce_master.exceptions import (
     TooManyLogins,
     WrongCredentials,
 )
-from rce_master.http import api_account, api_control, api_read, api_stream
+from rce_master.http import api_account, api_control, api_packages, api_read, api_stream
 from rce_master.http.entry import Entry
 from rce_master.http.metrics import make_registry
 from rce_master.http.models import Error
@@ -47,6 +47,7 @@ ROUTES: list[Route] = [
     *api_account.routes,
     *api_read.routes,
     *api_control.routes,
+    *api_packages.routes,
     *api_stream.routes,
 ]
 

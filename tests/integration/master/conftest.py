@@ -129,10 +129,12 @@ class Site:
 
 
 @asynccontextmanager
-async def running_site(store: Store | None = None, **options: Any) -> AsyncIterator[Site]:
+async def running_site(
+    store: Store | None = None, state_dir: Path = Path("unused"), **options: Any
+) -> AsyncIterator[Site]:
     """Run a master in development mode on free ports."""
     settings = MasterSettings(
-        bind=LOOPBACK, http_port=0, control_port=0, state_dir=Path("unused"), dev=True, **options
+        bind=LOOPBACK, http_port=0, control_port=0, state_dir=state_dir, dev=True, **options
     )
     ready: asyncio.Future[RunningMaster] = asyncio.get_running_loop().create_future()
     master = Master(settings, SECRET, store or MemoryStore(), hasher=HASHER)

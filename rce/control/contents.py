@@ -1,0 +1,171 @@
+"""Contents by their hash, from the master to task sets: a plain GET on the control port, piece by piece.
+
+``GET /contents/SHA256`` with the secret of the task sets and ``Range: bytes=OFFSET-`` answers 206 with the
+next piece and, in ``Content-Range``, the size of the whole. A piece is small enough for a server that has
+nothing but the time of a handshake, and a fetch that broke goes on where it broke.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import re
+from http import HTTPStatus
+from typing import TYPE_CHECKING, NamedTuple
+
+import h11
+from websockets.datastructures import Headers
+from websockets.http11 import Response
+
+from rce.control.exceptions import ContentError
+from rce.control.timeouts import DEFAULT_TIMEOUTS, ControlTimeouts
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from websockets.http11 import Request
+
+    from rce.config.secret import Secret
+
+    ReadContent = Callable[[str, int, int], Awaitable[tuple[bytes, int] | None]]
+    """Gives a piece (hash, offset, bytes) and the size of the whole; None if there is no such content."""
+
+PIECE = 512 << 10
+"""Bytes."""
+_PREFIX = "/contents/"
+_PATH = re.compile(rf"{_PREFIX}([0-9a-f]{{64}})")
+_FROM = re.compile(r"bytes=([0-9]{1,15})-")
+_RANGE = re.compile(r"bytes [0-9]+-[0-9]+/([0-9]{1,15})")
+_CHUNK = 1 << 16
+
+
+def is_for_contents(path: str) -> bool:
+    """Tell whether a request's path asks for contents."""
+    return path.startswith(_PREFIX)
+
+
+async def answer(request: Request, read: ReadContent) -> Response:
+    """Answer a request for a piece; whoever calls this has checked the secret."""
+    found = _PATH.fullmatch(request.path)
+    start = _FROM.fullmatch(request.headers.get("Range", "bytes=0-"))
+    if found is None or start is None:
+        return _refuse(HTTPStatus.BAD_REQUEST, "the path must be /contents/SHA256, the range bytes=OFFSET-")
+    offset = int(start[1])
+    try:
+        piece = await read(found[1], offset, PIECE)
+    except OSError as error:
+        return _refuse(HTTPStatus.SERVICE_UNAVAILABLE, f"it cannot be read: {error.strerror}")
+    if piece is None:
+        return _refuse(HTTPStatus.NOT_FOUND, "the master does not have it")
+    data, size = piece
+    if offset >= size:
+        return _refuse(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, f"it has {size} bytes only")
+    headers = Headers(
+        {
+            "Content-Type": "application/octet-stream",
+            "Content-Length": str(len(data)),
+            "Content-Range": f"bytes {offset}-{offset + len(data) - 1}/{size}",
+            "Connection": "close",
+        }
+    )
+    return Response(HTTPStatus.PARTIAL_CONTENT, HTTPStatus.PARTIAL_CONTENT.phrase, headers, data)
+
+
+def _refuse(status: HTTPStatus, text: str) -> Response:
+    body = text.encode()
+    headers = Headers({"Content-Type": "text/plain", "Content-Length": str(len(body)), "Connection": "close"})
+    return Response(status, status.phrase, headers, body)
+
+
+class Piece(NamedTuple):
+    """A part of a content."""
+
+    data: bytes
+    size: int
+    """Bytes of the whole."""
+
+
+class ContentClient:
+    """Fetches contents from a master.
+
+    Args:
+        host: Where the master is.
+        port: Its port for task sets.
+        secret: Proves that this is a task set of the same engine.
+        timeouts: Times of this end.
+    """
+
+    def __init__(
+        self, host: str, port: int, secret: Secret, timeouts: ControlTimeouts = DEFAULT_TIMEOUTS
+    ) -> None:
+        self._host = host
+        self._port = port
+        self._secret = secret
+        self._timeouts = timeouts
+
+    async def piece(self, sha256: str, offset: int) -> Piece:
+        """Fetch the piece that begins at ``offset``. Cancelling closes the connection.
+
+        Raises:
+            ContentError: The master is away or does not have it.
+        """
+        try:
+            async with asyncio.timeout(self._timeouts.request):
+                status, headers, body = await self._get(f"{_PREFIX}{sha256}", offset)
+        except (OSError, TimeoutError, h11.RemoteProtocolError) as error:
+            why = str(error) or "no answer in time"
+            raise ContentError(
+                f"the master at {self._host}:{self._port} does not hand it out: {why}"
+            ) from error
+        found = _RANGE.fullmatch(headers.get("content-range", ""))
+        if status != HTTPStatus.PARTIAL_CONTENT or found is None or not body:
+            text = body[:200].decode(errors="replace").strip()
+            raise ContentError(
+                f"the master does not hand it out: {text or status}", missing=status == _MISSING
+            )
+        return Piece(body, int(found[1]))
+
+    async def _get(self, path: str, offset: int) -> tuple[int, dict[str, str], bytes]:
+        reader, writer = await asyncio.open_connection(self._host, self._port)
+        try:
+            connection = h11.Connection(h11.CLIENT)
+            request = h11.Request(
+                method="GET",
+                target=path,
+                headers=[
+                    ("Host", f"{self._host}:{self._port}"),
+                    ("Authorization", f"Bearer {self._secret.reveal()}"),
+                    ("Range", f"bytes={offset}-"),
+                ],
+            )
+            writer.write(connection.send(request) or b"")
+            return await _response(connection, reader)
+        finally:
+            writer.close()
+            with contextlib.suppress(OSError):
+                await writer.wait_closed()
+
+
+_MISSING = HTTPStatus.NOT_FOUND
+
+
+async def _response(
+    connection: h11.Connection, reader: asyncio.StreamReader
+) -> tuple[int, dict[str, str], bytes]:
+    status, headers, body = 0, dict[str, str](), bytearray()
+    while True:
+        event = connection.next_event()
+        match event:
+            case h11.Response():
+                status = event.status_code
+                headers = {name.decode(): value.decode("latin-1") for name, value in event.headers}
+            case h11.Data():
+                body += event.data
+                if len(body) > PIECE:
+                    raise h11.RemoteProtocolError("a piece is too long")
+            case h11.EndOfMessage():
+                return status, headers, bytes(body)
+            case h11.NEED_DATA:
+                connection.receive_data(await reader.read(_CHUNK))
+            case _:
+                raise h11.RemoteProtocolError("the connection was closed")

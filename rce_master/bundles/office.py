@@ -1,0 +1,182 @@
+"""Takes packages that users push, and lets go of the contents that nobody needs any more."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rce.bundles.exceptions import BadKey, BadSignature
+from rce.bundles.signing import statement, verify
+from rce.control.messages import TaskSetKind
+from rce_master.exceptions import Busy, Forbidden, Invalid
+from rce_master.state import commands, packages
+from rce_master.state.records import Bundle, bundle_key, package_key_key
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Iterator
+
+    from rce.bundles.contents import Contents
+    from rce_master.bundles.contents import ContentStore, Incoming
+    from rce_master.realm import Realm
+    from rce_master.state.changes import Changes
+
+logger = logging.getLogger(__name__)
+
+MAX_UPLOADS = 8
+"""At the same time; of one user one."""
+
+
+_NOT_INSTALLED = (
+    "requirements.txt: no machine of this engine installs what it asks for; its operator may allow it by:"
+    " rce-container --allow-requirements"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wish:
+    """A version that a user wants to be taken."""
+
+    user: str
+    name: str
+    version: str
+    key: str
+    """The public key of the signature, in hex."""
+    signature: str
+    """In hex, over :func:`rce.bundles.signing.statement`."""
+
+
+class PackageOffice:
+    """Where packages come in.
+
+    Args:
+        realm: Knows the versions and the keys.
+        store: Keeps what they hold.
+        clock: Seconds since 1970.
+    """
+
+    def __init__(self, realm: Realm, store: ContentStore, clock: Callable[[], float] = time.time) -> None:
+        self._realm = realm
+        self._store = store
+        self._clock = clock
+        self._uploading: set[str] = set()
+        # Held while contents are there of which the state does not know yet, or any more.
+        self._lock = asyncio.Lock()
+        self._dirty = asyncio.Event()
+        realm.listeners.append(self._note)
+
+    async def run(self) -> None:
+        """Let go of contents that nobody needs, until cancelled."""
+        await asyncio.to_thread(self._store.forget_incoming)
+        self._dirty.set()
+        while True:
+            await self._dirty.wait()
+            self._dirty.clear()
+            async with self._lock:
+                known = {bundle.sha256 for bundle in self._realm.tables.bundles}
+                try:
+                    await asyncio.to_thread(self._store.sweep, known)
+                except OSError as error:
+                    logger.error("packages that are needed no more stay on the disk: %s", error)  # noqa: TRY400
+
+    async def push(
+        self, wish: Wish, size: int, chunks: AsyncIterator[bytes]
+    ) -> tuple[Bundle, tuple[str, ...]]:
+        """Take a version of a package.
+
+        Args:
+            wish: What it is to be.
+            size: Bytes of the archive as its sender says; 0 if it does not.
+            chunks: The archive.
+
+        Returns:
+            The version as it is known from now on, and what its owner should know.
+
+        Raises:
+            Refused: It cannot be taken.
+            StoreError: It cannot be kept.
+        """
+        self._check_early(wish, size)
+        with self._turn(wish.user):
+            async with self._store.receive(chunks) as incoming:
+                _verify(wish, incoming)
+                contents = await incoming.inspect()
+                bundle = self._bundle(wish, incoming, contents)
+                packages.check_new(self._realm.tables, bundle)
+                async with self._lock:
+                    try:
+                        await self._store.keep(incoming)
+                        await self._realm.submit(commands.AddBundle(bundle=bundle))
+                    finally:
+                        self._dirty.set()
+        kept = self._realm.tables.bundles.get(bundle.id) or bundle
+        return kept, (*contents.warnings, *self._warnings(contents))
+
+    def _check_early(self, wish: Wish, size: int) -> None:
+        """Refuse what is to be refused anyway before all of it has come."""
+        tables, settings = self._realm.tables, self._realm.state.settings
+        if package_key_key(wish.user, wish.key) not in tables.package_keys:
+            raise Forbidden("the key is not registered with your account; run: rce package key register")
+        if bundle_key(wish.user, wish.name, wish.version) not in tables.bundles:
+            packages.check_room(tables, wish.user, size, settings.max_packages, settings.max_package_bytes)
+
+    @contextlib.contextmanager
+    def _turn(self, user: str) -> Iterator[None]:
+        if user in self._uploading:
+            raise Busy("you are pushing another package just now; try again when it is done")
+        if len(self._uploading) >= MAX_UPLOADS:
+            raise Busy("too many packages are pushed at the same time; try again in a moment")
+        self._uploading.add(user)
+        try:
+            yield
+        finally:
+            self._uploading.discard(user)
+
+    def _bundle(self, wish: Wish, incoming: Incoming, contents: Contents) -> Bundle:
+        if contents.name != wish.name:
+            raise Invalid(f"the archive holds the package {contents.name!r}, not {wish.name!r}")
+        return Bundle(
+            user=wish.user,
+            name=wish.name,
+            version=wish.version,
+            sha256=incoming.sha256,
+            digest=contents.digest,
+            signature=wish.signature,
+            key=wish.key,
+            packed=incoming.size,
+            size=contents.size,
+            files=contents.files,
+            created=self._clock(),
+            description=contents.description,
+            executables=contents.executables,
+            requirements=contents.requirements,
+        )
+
+    def _warnings(self, contents: Contents) -> tuple[str, ...]:
+        if not contents.requirements:
+            return ()
+        tables = self._realm.tables
+        if any(
+            task_set.machine.requirements
+            for task_set in tables.task_sets
+            if task_set.kind is TaskSetKind.CONTAINER and tables.is_connected(task_set.process)
+        ):
+            return ()
+        return (_NOT_INSTALLED,)
+
+    def _note(self, changes: Changes) -> None:
+        if any(table == "bundles" for table, _ in changes.written()):
+            self._dirty.set()
+
+
+def _verify(wish: Wish, incoming: Incoming) -> None:
+    signed = statement(wish.user, wish.name, wish.version, incoming.sha256)
+    try:
+        verify(wish.key, wish.signature, signed)
+    except (BadKey, BadSignature) as error:
+        raise Invalid(
+            f"{error}; the package was changed on its way, or signed for another user or version"
+        ) from error

@@ -1,0 +1,165 @@
+"""REST: packages that users bring, and the keys that sign them."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+from aiohttp import web
+
+from rce.bundles.exceptions import BadKey
+from rce.bundles.signing import key_id
+from rce.web.openapi import Query
+from rce.web.server import IDLE_S
+from rce_master.bundles.office import Wish
+from rce_master.exceptions import Invalid, NotFound
+from rce_master.http import package_models as models
+from rce_master.http.routes import OF_USER, Call, RouteTable
+from rce_master.state import commands
+from rce_master.state.packages import find
+from rce_master.state.records import Bundle, PackageKey, bundle_key
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from rce_master.state.tables import Tables
+
+routes = RouteTable("packages")
+
+_CHUNK = 1 << 16
+_QUERY = (OF_USER,)
+
+
+@routes.route("GET", "/packages", "List packages that users brought", reply=models.PackagesOut, query=_QUERY)
+async def list_packages(call: Call) -> models.PackagesOut:
+    """List all versions of all packages."""
+    tables = call.services.realm.tables
+    scope = call.scope
+    found = tables.bundles if scope is None else tables.bundles.by("user", scope)
+    return models.PackagesOut(
+        packages=[_package_out(tables, bundle) for bundle in sorted(found, key=lambda bundle: bundle.id)]
+    )
+
+
+@routes.route("GET", "/packages/{name}/{version}", "Show a package", reply=models.PackageOut, query=_QUERY)
+async def show_package(call: Call) -> models.PackageOut:
+    """Show a version of a package."""
+    tables = call.services.realm.tables
+    name, version = call.path("name"), call.path("version")
+    found = tables.bundles.get(bundle_key(call.owner, name, version))
+    if found is None:
+        raise NotFound(f"there is no package {name!r} of version {version!r}")
+    return _package_out(tables, found)
+
+
+@routes.route(
+    "PUT",
+    "/packages/{name}/{version}",
+    "Push a package: the body is its archive (application/gzip)",
+    reply=models.PackageOut,
+    query=(
+        Query(name="key", description="The public key, in hex, that signed it.", required=True),
+        Query(
+            name="signature", description="Ed25519, in hex, over what the documentation says.", required=True
+        ),
+    ),
+)
+async def push_package(call: Call) -> models.PackageOut:
+    """Take a version of a package; the same one again changes nothing."""
+    wish = Wish(
+        user=call.caller.name,
+        name=call.path("name"),
+        version=call.path("version"),
+        key=call.query("key"),
+        signature=call.query("signature"),
+    )
+    size = call.request.content_length or 0
+    bundle, warnings = await call.services.packages.push(wish, size, _body(call.request))
+    return _package_out(call.services.realm.tables, bundle, warnings)
+
+
+@routes.route(
+    "DELETE", "/packages/{name}/{version}", "Remove a version of a package", status=204, query=_QUERY
+)
+async def remove_package(call: Call) -> None:
+    """Remove a version that no node needs."""
+    command = commands.RemoveBundle(user=call.owner, name=call.path("name"), version=call.path("version"))
+    await call.services.realm.submit(command)
+
+
+@routes.route(
+    "GET", "/package-keys", "List the keys that sign packages", reply=models.PackageKeysOut, query=_QUERY
+)
+async def list_package_keys(call: Call) -> models.PackageKeysOut:
+    """List a user's keys."""
+    found = call.services.realm.tables.package_keys.by("user", call.owner)
+    return models.PackageKeysOut(keys=[_key_out(key) for key in found])
+
+
+@routes.route(
+    "POST",
+    "/package-keys",
+    "Trust a key that signs your packages",
+    body=models.PackageKeyIn,
+    reply=models.PackageKeyOut,
+    status=201,
+)
+async def register_package_key(call: Call) -> models.PackageKeyOut:
+    """Trust a key."""
+    body = call.read(models.PackageKeyIn)
+    try:
+        key_id(body.key)
+    except BadKey as error:
+        raise Invalid(str(error)) from error
+    key = PackageKey(user=call.caller.name, key=body.key, label=body.label, created=call.services.clock())
+    await call.services.realm.submit(commands.AddPackageKey(key=key))
+    return _key_out(key)
+
+
+@routes.route("DELETE", "/package-keys/{id}", "Trust a key no more", status=204, query=_QUERY)
+async def revoke_package_key(call: Call) -> None:
+    """Trust a key no more."""
+    await call.services.realm.submit(commands.RemovePackageKey(user=call.owner, id=call.path("id")))
+
+
+async def _body(request: web.Request) -> AsyncIterator[bytes]:
+    """Read the body piece by piece, each of which must come in good time."""
+    while True:
+        try:
+            async with asyncio.timeout(IDLE_S):
+                chunk = await request.content.read(_CHUNK)
+        except TimeoutError:
+            raise web.HTTPRequestTimeout from None
+        if not chunk:
+            return
+        yield chunk
+
+
+def _package_out(tables: Tables, bundle: Bundle, warnings: tuple[str, ...] = ()) -> models.PackageOut:
+    return models.PackageOut(
+        user=bundle.user,
+        name=bundle.name,
+        version=bundle.version,
+        newest=find(tables, bundle.user, bundle.name) == bundle,
+        description=bundle.description,
+        executables=list(bundle.executables),
+        requirements=bundle.requirements,
+        files=bundle.files,
+        size=bundle.size,
+        packed=bundle.packed,
+        sha256=bundle.sha256,
+        digest=bundle.digest,
+        key=key_id(bundle.key),
+        created=bundle.created,
+        nodes=[
+            f"{container.tag}/{node.tag}"
+            for container in tables.containers(bundle.user)
+            for node in container.nodes.values()
+            if find(tables, bundle.user, node.pkg) == bundle
+        ],
+        warnings=list(warnings),
+    )
+
+
+def _key_out(key: PackageKey) -> models.PackageKeyOut:
+    return models.PackageKeyOut(id=key_id(key.key), key=key.key, label=key.label, created=key.created)
