@@ -281,7 +281,7 @@ def quota(cpu: float) -> int:
 
 def _drop_if_empty(folder: Path) -> None:
     with contextlib.suppress(OSError):
-        folder.rmdir()
+        files.remove(folder)
 
 
 def _up(folder: Path, mount: Path) -> Iterator[Path]:

@@ -104,7 +104,7 @@ class Cgroup2(CgroupLimiter):
                 f"the cgroup {base} may not be used: {error.strerror}; {_HINT}"
             ) from error
         if not os.access(base / files.PROCS, os.W_OK):
-            (base / self._folder).rmdir()
+            files.remove(base / self._folder)
             raise LimitsUnavailableError(f"no process may be moved within the cgroup {base}; {_HINT}")
         self._bases, self._mounts = (base,), (place.mount,)
         self._missing = frozenset(CONTROLLERS[name] for name in CONTROLLERS.keys() - set(wanted))

@@ -73,4 +73,13 @@ def drop(folder: Path) -> None:
     """
     for one in tree(folder):
         with contextlib.suppress(FileNotFoundError):  # the container's last process removes it too
-            one.rmdir()
+            remove(one)
+
+
+def remove(folder: Path) -> None:
+    """Remove a cgroup.
+
+    Raises:
+        OSError: It does not exist, or something is in there.
+    """
+    folder.rmdir()

@@ -29,10 +29,15 @@ def rlimits_of(limits: Limits) -> dict[int, int]:
 
 
 class RlimitCell(Cell):
-    """Exists on paper only."""
+    """Exists on paper only.
 
-    def __init__(self, limits: Limits) -> None:
-        self.limits = limits._replace(cpu=0.0)
+    Args:
+        limits: What its processes limit; None if that is not known (yet).
+    """
+
+    def __init__(self, limits: Limits | None) -> None:
+        self._known = limits is not None
+        self.limits = (limits or Limits())._replace(cpu=0.0)
 
     @property
     def join(self) -> tuple[str, ...]:
@@ -46,6 +51,8 @@ class RlimitCell(Cell):
 
     def apply(self, limits: Limits) -> None:
         """Refuse: nobody can change another process's limits for it and its children at once."""
+        if not self._known:
+            self._known, self.limits = True, limits._replace(cpu=0.0)
         if limits._replace(cpu=0.0) != self.limits:
             raise LimitError(
                 "its limits cannot be changed while it runs: its machine has no cgroups that can be used; "
@@ -95,8 +102,8 @@ class RlimitLimiter(Limiter):
         return RlimitCell(limits)
 
     def adopt(self, mark: str) -> RlimitCell:  # noqa: ARG002
-        """What its limits were, its processes know."""
-        return RlimitCell(Limits())
+        """Take the next limits that are asked for as those that it has."""
+        return RlimitCell(None)
 
     def sweep(self, keep: Collection[str]) -> None:
         """Nothing is ever left."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-import signal
 import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
@@ -295,15 +294,14 @@ class Machine:
             runtime.close()
         for process in self.processes():
             proc.kill(process)
-        for cell in self.cells():
-            for pid in (cell / "cgroup.procs").read_text().split():
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(int(pid), signal.SIGKILL)
         for pid in self.pids:
             with contextlib.suppress(ChildProcessError):
                 os.waitpid(pid, 0)
-        for folder in [*self.cells(), *self.cell_parents()]:
-            folder.rmdir()
+        if self.cell_parents():
+            with StateFolder(self.folder / "state", self.folder / "run") as state:
+                limiter = choose_limiter(state.token, state.cgroups)
+                limiter.sweep(())
+                limiter.close()
 
     @property
     def containers(self) -> list[Path]:

@@ -1,0 +1,227 @@
+"""Limits that hold, on the machine's own cgroups; nodes here try to take more than they may."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.containers import Machine, until
+
+from rce.control.messages import Gone
+from rce.control.model import EndpointState, NodeSpec, NodeState, NodeUsage, Resources
+from rce_container.environment import proc
+from rce_container.folder import StateFolder
+from rce_container.limits import Limits, choose_limiter
+
+pytestmark = pytest.mark.needs("cgroups")
+
+MB = 1 << 20
+BOX, OTHER = "user/box", "user/other"
+SMALL = Resources(memory=64 * MB)
+OUT_OF_MEMORY = (
+    "out of memory: the container's limit of 64 MB; ask for more with `rce resize box --memory 128M`"
+)
+
+NODES = {
+    "hog.py": (
+        "import sys, time\n"
+        "kept = []\n"
+        "for count in range(int(sys.argv[1])):\n"
+        "    kept.append(b'x' * 1000000)\n"
+        "    if count % 10 == 0:\n        print('has', count, flush=True)\n"
+        "print('has all', flush=True)\n"
+        "time.sleep(600)\n"
+    ),
+    "spawn.py": (
+        "import subprocess, sys, time\n"
+        "code = 'kept = [bytes(1) + b\"x\" * 1000000 for _ in range(200)]'\n"
+        "print('child ended with', subprocess.run([sys.executable, '-c', code]).returncode, flush=True)\n"
+        "time.sleep(600)\n"
+    ),
+    "bomb.py": (
+        "import os, time\n"
+        "count = 0\n"
+        "while True:\n"
+        "    try:\n        pid = os.fork()\n"
+        "    except OSError:\n        break\n"
+        "    if pid == 0:\n        time.sleep(600)\n        os._exit(0)\n"
+        "    count += 1\n"
+        "print('made', count, flush=True)\n"
+        "time.sleep(600)\n"
+    ),
+    "spin.py": "print('spins', flush=True)\nwhile True:\n    pass\n",
+}
+
+
+@pytest.fixture
+def packages(machine: Machine) -> Machine:
+    nodes = machine.packages / "greedy" / "nodes"
+    nodes.mkdir(parents=True)
+    (machine.packages / "greedy" / "package.yaml").write_text("name: greedy\n")
+    for name, text in NODES.items():
+        (nodes / name).write_text(text)
+    return machine
+
+
+def greedy(tag: str, args: str = "") -> NodeSpec:
+    return NodeSpec(tag=tag, pkg="greedy", exe=f"{tag}.py", args=args)
+
+
+def usage(machine: Machine, id_: str) -> Any:
+    return machine.usage[-1].endpoints.get(id_) if machine.usage else None
+
+
+def node_usage(machine: Machine, id_: str, tag: str) -> NodeUsage:
+    known = usage(machine, id_)
+    return known.nodes.get(tag, NodeUsage()) if known else NodeUsage()
+
+
+async def test_who_takes_too_much_memory_dies_alone(packages: Machine) -> None:
+    machine = packages
+    talk = NodeSpec(tag="talk", pkg="own", exe="talk.py")
+    async with machine.engine():
+        await machine.put(BOX, resources=SMALL, nodes=(talk, greedy("hog", "200")))
+        await machine.put(OTHER, resources=Resources(memory=256 * MB), nodes=(greedy("hog", "100"),))
+        died = await machine.node_is(BOX, "hog", NodeState.FAILED)
+        assert died.exit_code == -signal.SIGKILL
+        assert died.detail.startswith(OUT_OF_MEMORY)
+        assert any(OUT_OF_MEMORY in fault for fault in machine.faults)
+        await machine.log_holds(OTHER, "hog", "has all")
+        pid = machine.node(BOX, "talk").pid
+        seen = await until(lambda: (one := usage(machine, BOX)) and one.oom_kills and one)
+        assert (seen.oom_kills, seen.memory_limit) == (1, 64 * MB)
+        assert 50 * MB < seen.memory_peak <= 64 * MB
+        await until(lambda: node_usage(machine, OTHER, "hog").memory > 100_000_000)
+        assert usage(machine, OTHER).oom_kills == 0
+        assert Path(f"/proc/{pid}").exists()
+        assert not [fault for fault in machine.faults if "a node started" in fault]
+
+
+async def test_a_process_of_a_node_that_ran_out_of_memory_is_told_of(packages: Machine) -> None:
+    async with packages.engine():
+        await packages.put(BOX, resources=SMALL, nodes=(greedy("spawn"),))
+        await packages.log_holds(BOX, "spawn", "child ended with -9")
+        await until(lambda: any("a process that a node started was killed" in f for f in packages.faults))
+        assert packages.node(BOX, "spawn").state in (NodeState.STARTING, NodeState.RUNNING)
+
+
+async def test_a_container_that_cannot_live_at_all_says_why(packages: Machine) -> None:
+    async with packages.engine():
+        await packages.put(BOX, resources=Resources(memory=2 * MB))
+        await until(
+            lambda: any("out of memory: the container's limit of 2 MB" in f for f in packages.faults),
+            what=lambda: packages.faults,
+        )
+
+
+async def test_a_share_of_a_processor_is_not_exceeded(packages: Machine) -> None:
+    async with packages.engine():
+        await packages.put(BOX, resources=Resources(cpu=0.2), nodes=(greedy("spin"),))
+        await packages.log_holds(BOX, "spin", "spins")
+        first = await until(lambda: usage(packages, BOX))
+        begin = time.monotonic()
+        await until(lambda: usage(packages, BOX).cpu_s >= first.cpu_s + 0.5, timeout=50)
+        last = usage(packages, BOX)
+        assert (last.cpu_s - first.cpu_s) / (time.monotonic() - begin) < 0.4
+        assert last.throttled_s > first.throttled_s
+        assert last.cpu_limit == pytest.approx(0.2)
+
+
+async def test_a_fork_bomb_stops_at_the_limit(packages: Machine) -> None:
+    machine = packages
+    async with machine.engine(slot_processes=40):
+        await machine.put(OTHER, nodes=(NodeSpec(tag="talk", pkg="own", exe="talk.py"),))
+        await machine.put(BOX, nodes=(greedy("bomb"),))
+        text = await machine.log_holds(BOX, "bomb", "made")
+        assert 0 < int(text.split("made")[1].split()[0]) < 40
+        text = "its limit of 40 processes and threads is reached"
+        await until(lambda: any(text in fault for fault in machine.faults))
+        await until(lambda: node_usage(machine, BOX, "bomb").processes > 10)
+        assert usage(machine, BOX).processes <= 40
+        await machine.put(OTHER, 2, nodes=(NodeSpec(tag="more", pkg="own", exe="talk.py"),))
+        await machine.log_holds(OTHER, "more", "hello")
+        await machine.drop(BOX)
+
+
+async def test_limits_change_while_it_runs(packages: Machine) -> None:
+    machine = packages
+    async with machine.engine():
+        nodes = (greedy("hog", "100"),)
+        await machine.put(BOX, 1, resources=Resources(memory=400 * MB), nodes=nodes)
+        await machine.log_holds(BOX, "hog", "has all")
+        before = machine.status(BOX)
+        await machine.put(BOX, 2, resources=Resources(memory=200 * MB, cpu=0.5), nodes=nodes)
+        await until(lambda: usage(machine, BOX) and usage(machine, BOX).memory_limit == 200 * MB)
+        assert usage(machine, BOX).cpu_limit == pytest.approx(0.5)
+        await machine.put(BOX, 3, resources=Resources(memory=64 * MB, cpu=0.25), nodes=nodes)
+        fault = await until(lambda: next((f for f in machine.faults if "cannot be limited" in f), None))
+        assert fault.startswith("container box: its memory cannot be limited to 64 MB: it needs ")
+        assert "stop some of its nodes first" in fault
+        assert "the limits stay as they were" in fault
+        count = len(machine.usage)
+        await until(lambda: len(machine.usage) > count + 1)
+        assert usage(machine, BOX).memory_limit == 200 * MB
+        assert usage(machine, BOX).cpu_limit == pytest.approx(0.5)
+        after = machine.status(BOX)
+        assert before is not None
+        assert after is not None
+        assert (after.incarnation, after.nodes[0].pid) == (before.incarnation, before.nodes[0].pid)
+        assert after.state in (EndpointState.RUNNING, EndpointState.DEGRADED)
+
+
+async def test_no_cgroup_is_left_by_a_container_that_ended(packages: Machine) -> None:
+    machine = packages
+    async with machine.engine():
+        await machine.put(BOX, nodes=(NodeSpec(tag="talk", pkg="own", exe="talk.py"),))
+        await machine.log_holds(BOX, "talk", "hello")
+        assert machine.cells()
+        await machine.drop(BOX)
+        assert not machine.cells()
+        assert machine.of(Gone)
+    assert not machine.cell_parents()
+
+
+async def test_the_next_manager_removes_the_cgroups_of_all_that_was_killed(packages: Machine) -> None:
+    machine = packages
+    async with machine.managed():
+        await machine.put(BOX, nodes=(NodeSpec(tag="talk", pkg="own", exe="talk.py"),))
+        await machine.log_holds(BOX, "talk", "hello")
+    for process in machine.processes():
+        proc.kill(process)
+    assert machine.cells()
+    async with machine.engine():
+        await until(lambda: not machine.cells(), what=machine.cells)
+
+
+async def test_the_next_manager_keeps_the_limits_of_what_it_adopts(packages: Machine) -> None:
+    machine = packages
+    async with machine.managed():
+        await machine.put(BOX, resources=SMALL, nodes=(greedy("hog", "10"),))
+        await machine.log_holds(BOX, "hog", "has all")
+        cells = machine.cells()
+    async with machine.engine():
+        assert machine.cells() == cells
+        seen = await until(lambda: usage(machine, BOX))
+        assert seen.memory_limit == 64 * MB
+        nodes = (greedy("hog", "200"),)
+        await machine.put(BOX, 2, resources=SMALL, nodes=nodes)
+        died = await machine.node_is(BOX, "hog", NodeState.FAILED)
+        assert died.detail.startswith("out of memory")
+
+
+async def test_cells_of_which_nothing_else_is_left_are_swept_with_their_processes(folder: Path) -> None:
+    with StateFolder(folder / "state", folder / "run") as state:
+        limiter = choose_limiter(state.token, state.cgroups)
+        limiter.sweep(())
+        cell = limiter.create("0123456789ab", Limits(memory=64 * MB))
+        script = 'for file; do echo $$ >"$file"; done; exec sleep 600'
+        lost = subprocess.Popen(["/bin/sh", "-c", script, "sh", *cell.join])
+        await until(cell.pids)
+        machine = Machine(folder, "process")
+    async with machine.engine():
+        assert lost.wait() == -signal.SIGKILL
+        assert not machine.cells()

@@ -1,0 +1,231 @@
+"""Limits by cgroups of version 2, on a tree of files like the kernel's."""
+
+from __future__ import annotations
+
+import os
+import resource
+from pathlib import Path
+
+import pytest
+from support.cgroup_trees import Tree2
+
+from rce_container.exceptions import LimitError, LimitsUnavailableError
+from rce_container.limits import Limits, choose_limiter
+from rce_container.limits.base import Troubles
+from rce_container.limits.cgroup2 import Cell2, Cgroup2
+
+MB = 1 << 20
+ALL = "cpuset cpu io memory hugetlb pids"
+LIMITS = Limits(cpu=0.5, memory=64 * MB, processes=32, weight=200)
+
+
+@pytest.fixture
+def tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Tree2:
+    return Tree2(tmp_path, monkeypatch, controllers=ALL, own="system.slice/rce.service")
+
+
+def limiter(tree: Tree2) -> Cgroup2:
+    made = Cgroup2("t0", tree.proc.parent / "ledger", tree.proc)
+    made.probe()
+    return made
+
+
+def text(path: Path, name: str) -> str:
+    return (path / name).read_text()
+
+
+def test_a_container_gets_a_cgroup_with_its_limits(tree: Tree2) -> None:
+    cell = limiter(tree).create("m1", LIMITS)
+    folder = tree.own / "rce-t0" / "m1"
+    assert cell.join == (str(folder / "cgroup.procs"),)
+    assert text(folder, "memory.max") == str(64 * MB)
+    assert text(folder, "memory.swap.max") == "0"
+    assert text(folder, "memory.oom.group") == "0\n", "the kernel kills one process, not the container"
+    assert text(folder, "pids.max") == "32"
+    assert text(folder, "cpu.max") == "50000 100000"
+    assert text(folder, "cpu.weight") == "200"
+    assert cell.rlimits == {}
+    assert text(tree.own, "cgroup.subtree_control").split() == ["memory", "pids", "cpu", "io"]
+
+
+def test_no_limit_is_written_as_such(tree: Tree2) -> None:
+    cell = limiter(tree).create("m1", LIMITS)
+    cell.apply(Limits())
+    folder = tree.own / "rce-t0" / "m1"
+    assert [text(folder, name) for name in ("memory.max", "memory.swap.max", "pids.max", "cpu.max")] == [
+        "max",
+        "max",
+        "max",
+        "max 100000",
+    ]
+
+
+def test_processes_of_the_own_cgroup_make_room(tree: Tree2) -> None:
+    tree.busy.add(tree.own)
+    (tree.own / "cgroup.procs").write_text("11\n12\n")
+    limiter(tree).create("m1", LIMITS)
+    assert text(tree.own / "rce-engine", "cgroup.procs") == "11\n12\n"
+
+
+def test_a_program_that_made_room_before_works_beside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tree = Tree2(tmp_path, monkeypatch, controllers=ALL, own="system.slice/rce.service/rce-engine")
+    cell = limiter(tree).create("m1", LIMITS)
+    assert cell.join == (str(tree.own.parent / "rce-t0" / "m1" / "cgroup.procs"),)
+
+
+def test_usage_and_troubles_are_read(tree: Tree2) -> None:
+    cell = limiter(tree).create("m1", LIMITS)
+    usage = cell.usage()
+    assert (usage.cpu_s, usage.throttled_s) == (2.5, 0.75)
+    assert usage.memory == 31457280 - 4194304, "files that are only cached do not count"
+    assert usage.memory_peak == 41943040
+    assert (usage.io_read, usage.io_written) == (4097, 8194)
+    assert cell.troubles() == Troubles(oom_kills=2, refused_forks=7)
+
+
+def test_memory_is_not_limited_to_less_than_is_needed(tree: Tree2) -> None:
+    cell = limiter(tree).create("m1", LIMITS)
+    with pytest.raises(LimitError, match=r"cannot be limited to 20 MB: it needs 24 MB now; stop some of its"):
+        cell.apply(LIMITS._replace(memory=20 * MB))
+    assert cell.limits == LIMITS
+    assert text(tree.own / "rce-t0" / "m1", "memory.max") == str(64 * MB)
+    cell.apply(LIMITS._replace(memory=25 * MB))
+    assert text(tree.own / "rce-t0" / "m1", "memory.max") == str(25 * MB)
+
+
+def test_a_refused_limit_leaves_the_old_ones(tree: Tree2) -> None:
+    cell = limiter(tree).create("m1", LIMITS)
+    folder = tree.own / "rce-t0" / "m1"
+    (folder / "cpu.weight").unlink()
+    with pytest.raises(LimitError, match=r"the kernel refuses its limits: .*cpu.weight"):
+        cell.apply(LIMITS._replace(cpu=1.0))
+    assert text(folder, "cpu.max") == "50000 100000"
+
+
+def test_the_kernel_kills(tree: Tree2) -> None:
+    cell = limiter(tree).create("m1", LIMITS)
+    folder = tree.own / "rce-t0" / "m1"
+    cell.kill()
+    assert text(folder, "cgroup.kill") == "", "nothing to kill"
+    (folder / "cgroup.procs").write_text(f"{os.getpid()}\n")
+    cell.kill()
+    assert text(folder, "cgroup.kill") == "", "never this program itself"
+
+
+def test_a_cell_is_removed_with_what_is_below_it(tree: Tree2) -> None:
+    made = limiter(tree)
+    cell = made.create("m1", LIMITS)
+    tree.make(tree.own / "rce-t0" / "m1" / "inner")
+    cell.remove()
+    assert not (tree.own / "rce-t0" / "m1").exists()
+    cell.remove()
+    made.close()
+    assert not (tree.own / "rce-t0").exists()
+
+
+def test_a_cell_with_a_process_is_not_removed(tree: Tree2, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rce_container.limits.cgroup._REMOVE_TIMEOUT_S", 0.0)
+    made = limiter(tree)
+    cell = made.create("m1", LIMITS)
+    (tree.own / "rce-t0" / "m1" / "cgroup.procs").write_text("1\n")
+    with pytest.raises(LimitError, match="cannot be removed"):
+        cell.remove()
+    made.close()
+    assert (tree.own / "rce-t0").is_dir()
+
+
+def test_the_next_manager_adopts_and_sweeps_wherever_it_is_started(tree: Tree2) -> None:
+    first = limiter(tree)
+    first.sweep(())
+    for mark in ("m1", "m2"):
+        first.create(mark, LIMITS)
+    tree.make(tree.own / "rce-other")
+    tree.make(tree.own / "rce-other" / "m3")
+    before = tree.own
+    elsewhere = tree.root / "user.slice"
+    elsewhere.mkdir()
+    tree.fill(elsewhere, ALL)
+    (tree.proc / "cgroup").write_text("0::/user.slice\n")
+    second = limiter(tree)
+    assert second.adopt("m1").limits == LIMITS
+    second.sweep({"m1"})
+    assert (before / "rce-t0" / "m1").is_dir()
+    assert not (before / "rce-t0" / "m2").exists()
+    assert (before / "rce-other" / "m3").is_dir(), "another task set's"
+    second.sweep(())
+    assert not (before / "rce-t0").exists()
+    assert (tree.proc.parent / "ledger").read_text() == f"{elsewhere}/rce-t0\n"
+
+
+def test_a_container_without_a_cgroup_cannot_be_resized(tree: Tree2) -> None:
+    cell = limiter(tree).adopt("unknown")
+    assert (cell.join, cell.pids()) == ((), [])
+    with pytest.raises(LimitError, match="destroy it and create it again"):
+        cell.apply(LIMITS)
+    cell.kill()
+    cell.remove()
+
+
+def test_a_parent_that_vanished_is_made_again(tree: Tree2) -> None:
+    made = limiter(tree)
+    tree.remove(tree.own / "rce-t0")
+    made.create("m1", LIMITS)
+    assert text(tree.own / "rce-t0" / "m1", "pids.max") == "32"
+
+
+def test_missing_controllers_are_said_and_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tree = Tree2(tmp_path, monkeypatch, controllers="cpu pids", own="user.slice")
+    made = limiter(tree)
+    assert made.missing == {"memory", "io"}
+    assert made.detail.startswith("of containers' io, memory no limit holds")
+    cell = made.create("m1", LIMITS)
+    assert cell.rlimits == {resource.RLIMIT_DATA: 64 * MB}
+    assert cell.usage().memory is None
+
+
+@pytest.mark.parametrize("controllers", ["", "cpuset hugetlb"])
+def test_a_cgroup_without_controllers_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, controllers: str
+) -> None:
+    tree = Tree2(tmp_path, monkeypatch, controllers=controllers, own="user.slice")
+    with pytest.raises(LimitsUnavailableError, match=r"has no controllers; .*Delegate=yes"):
+        limiter(tree)
+    chosen = choose_limiter("t0", tmp_path / "ledger", tree.proc)
+    assert chosen.name == "rlimit"
+    assert "no controllers" in chosen.detail
+
+
+def test_a_cgroup_of_somebody_else_is_refused(tree: Tree2, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(path: Path, value: object) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr("rce_container.limits.files.write", refuse)
+    with pytest.raises(LimitsUnavailableError, match="may not be used: Permission denied"):
+        limiter(tree)
+
+
+def test_the_engine_s_own_limits_are_the_ceiling(tree: Tree2) -> None:
+    (tree.own / "memory.max").write_text(str(512 * MB))
+    (tree.own.parent / "memory.max").write_text(str(256 * MB))
+    (tree.own / "cpu.max").write_text("150000 100000\n")
+    assert limiter(tree).ceiling() == Limits(cpu=1.5, memory=256 * MB)
+
+
+def test_the_best_way_is_chosen(tree: Tree2) -> None:
+    chosen = choose_limiter("t0", tree.proc.parent / "ledger", tree.proc)
+    assert isinstance(chosen, Cgroup2)
+    assert chosen.detail == ""
+
+
+def test_the_root_needs_no_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tree = Tree2(tmp_path, monkeypatch, controllers=ALL, own="")
+    limiter(tree).create("m1", LIMITS)
+    assert not (tree.root / "rce-engine").exists()
+    assert int(text(tree.root / "rce-t0", "cpu.weight")) == min(10_000, 400 * (os.cpu_count() or 1))
+
+
+def test_fractions_of_a_period_are_at_least_what_the_kernel_takes(tree: Tree2) -> None:
+    limiter(tree).create("m1", Limits(cpu=0.001))
+    assert Cell2([tree.own / "rce-t0" / "m1"]).limits.cpu == 0.01
