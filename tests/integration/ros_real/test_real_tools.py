@@ -1,10 +1,14 @@
-"""The command line tools of a real ROS at our core, with our nodes; and at a real core, with our nodes."""
+"""The command line tools of a real ROS with our nodes, at our core and at a real one."""
 
 from __future__ import annotations
 
 import asyncio
 import os
+import re
+import signal
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,6 +21,7 @@ pytestmark = [pytest.mark.needs("rospy", "rostopic"), pytest.mark.timeout(240)]
 
 MakeNode = Callable[..., Node]
 STRING = "std_msgs/String"
+RCE = str(Path(sys.executable).parent / "rce")
 
 
 async def test_rostopic(graph: Graph, make_node: MakeNode) -> None:
@@ -38,13 +43,13 @@ async def test_rostopic(graph: Graph, make_node: MakeNode) -> None:
         assert await asyncio.wait_for(said.get(), 30) == "hi"
 
 
-async def test_rostopic_measures(ours: Graph, make_node: MakeNode) -> None:
-    async with make_node(ours, "ours") as node:
+async def test_rostopic_measures(graph: Graph, make_node: MakeNode) -> None:
+    async with make_node(graph, "ours") as node:
         publisher = await node.advertise("t", STRING)
         node.timer(0.02, lambda _: publisher.publish(data="x" * 996))
-        rate = await ours.says("rostopic", "hz", "-w", "30", "/t", text="average rate", count=3)
+        rate = await graph.says("rostopic", "hz", "-w", "30", "/t", text="average rate", count=3)
         assert 20 < float(rate.rpartition("average rate: ")[2].split()[0]) < 60
-        bandwidth = await ours.says("rostopic", "bw", "/t", text="average:", count=2)
+        bandwidth = await graph.says("rostopic", "bw", "/t", text="average:", count=2)
         assert "mean: 1.00KB" in bandwidth
 
 
@@ -143,8 +148,8 @@ async def test_rosmsg_agrees_on_types(ours: Graph, make_node: MakeNode) -> None:
 
 
 @pytest.mark.needs("topic_tools")
-async def test_topic_tools(ours: Graph, make_node: MakeNode) -> None:
-    async with make_node(ours, "ours") as node:
+async def test_topic_tools(graph: Graph, make_node: MakeNode) -> None:
+    async with make_node(graph, "ours") as node:
         got: dict[str, asyncio.Queue[str]] = {}
 
         async def listen(topic: str) -> asyncio.Queue[str]:
@@ -155,10 +160,10 @@ async def test_topic_tools(ours: Graph, make_node: MakeNode) -> None:
         first, second = await node.advertise("first", STRING), await node.advertise("second", STRING)
         tools = "/usr/lib/topic_tools"
         async with (
-            ours.program(f"{tools}/relay", "/first", "/relayed", "__name:=relay"),
-            ours.program(f"{tools}/throttle", "messages", "/first", "1.0", "/slow", "__name:=slower"),
-            ours.program(f"{tools}/drop", "/first", "1", "2", "/half", "__name:=dropper"),
-            ours.program(f"{tools}/mux", "/chosen", "/first", "/second", "__name:=mux"),
+            graph.program(f"{tools}/relay", "/first", "/relayed", "__name:=relay"),
+            graph.program(f"{tools}/throttle", "messages", "/first", "1.0", "/slow", "__name:=slower"),
+            graph.program(f"{tools}/drop", "/first", "1", "2", "/half", "__name:=dropper"),
+            graph.program(f"{tools}/mux", "/chosen", "/first", "/second", "__name:=mux"),
         ):
             relayed, slow = await listen("relayed"), await listen("slow")
             half, chosen = await listen("half"), await listen("chosen")
@@ -171,26 +176,26 @@ async def test_topic_tools(ours: Graph, make_node: MakeNode) -> None:
                         first.publish(data=f"first {next(numbers)}")
                         await asyncio.sleep(0.05)
             assert relayed.qsize() > slow.qsize()
-            await ours.tool("rosservice", "call", "/mux/select", "/second")
+            await graph.tool("rosservice", "call", "/mux/select", "/second")
             async with asyncio.timeout(40):
                 while not (await chosen.get()).startswith("second"):
                     second.publish(data="second")
 
 
 @pytest.mark.needs("rosbag")
-async def test_rosbag(ours: Graph, make_node: MakeNode) -> None:
-    bag = ours.home / "test.bag"
-    async with make_node(ours, "ours") as node:
+async def test_rosbag(graph: Graph, make_node: MakeNode) -> None:
+    bag = graph.home / "test.bag"
+    async with make_node(graph, "ours") as node:
         pose = await node.advertise("pose", "geometry_msgs/PoseStamped", latch=True)
         text = await node.advertise("text", STRING)
-        async with ours.program("rosbag", "record", "-O", str(bag), "/pose", "/text") as recording:
+        async with graph.program("rosbag", "record", "-O", str(bag), "/pose", "/text") as recording:
             await pose.wait_for_subscribers(timeout=40)
             await text.wait_for_subscribers(timeout=40)
             pose.publish(header={"frame_id": "map"})
             for number in range(20):
                 text.publish(data=str(number))
             async with asyncio.timeout(40):
-                while not (ours.home / "test.bag.active").exists():
+                while not (graph.home / "test.bag.active").exists():
                     await asyncio.sleep(0.05)
                 await asyncio.sleep(1)  # the recorder tells nobody when it has taken a message
             recording.send_signal(2)
@@ -198,7 +203,7 @@ async def test_rosbag(ours: Graph, make_node: MakeNode) -> None:
             async with asyncio.timeout(40):
                 while not bag.exists():  # the command may end before the recorder that it started
                     await asyncio.sleep(0.05)
-        info = await ours.tool("rosbag", "info", str(bag))
+        info = await graph.tool("rosbag", "info", str(bag))
         assert f"geometry_msgs/PoseStamped [{pose.type.md5sum}]" in info
         assert f"std_msgs/String           [{text.type.md5sum}]" in info
         assert "20 msgs" in info
@@ -208,34 +213,34 @@ async def test_rosbag(ours: Graph, make_node: MakeNode) -> None:
             "for c in bag._get_connections():\n"
             "    if c.topic == '/pose': print(c.msg_def)\n"
         )
-        definition = await ours.tool("/usr/bin/python3", "-c", script, str(bag))
+        definition = await graph.tool("/usr/bin/python3", "-c", script, str(bag))
         assert definition.strip() == pose.type.definition.strip()
-    async with make_node(ours, "listener") as listener:
+    async with make_node(graph, "listener") as listener:
         heard = await listener.subscribe("text", STRING)
         frames = await listener.subscribe("pose", "geometry_msgs/PoseStamped")
-        await ours.tool("rosbag", "play", "--wait-for-subscribers", str(bag))
+        await graph.tool("rosbag", "play", "--wait-for-subscribers", str(bag))
         async with asyncio.timeout(20):
             assert [(await anext(aiter(heard))).data for _ in range(20)] == [str(n) for n in range(20)]
             assert (await anext(aiter(frames))).header.frame_id == "map"
 
 
 @pytest.mark.needs("rosbag")
-async def test_rosbag_plays_the_clock(ours: Graph, make_node: MakeNode) -> None:
-    async with make_node(ours, "setter") as setter:
+async def test_rosbag_plays_the_clock(graph: Graph, make_node: MakeNode) -> None:
+    async with make_node(graph, "setter") as setter:
         await setter.set_param("/use_sim_time", True)
-    bag = ours.home / "clock.bag"
+    bag = graph.home / "clock.bag"
     script = (
         "import genpy, rosbag, sys, std_msgs.msg\n"
         "bag = rosbag.Bag(sys.argv[1], 'w')\n"
         "for n in range(10): bag.write('/t', std_msgs.msg.String(str(n)), genpy.Time(1000 + n))\n"
         "bag.close()\n"
     )
-    await ours.tool("/usr/bin/python3", "-c", script, str(bag))
-    async with make_node(ours, "listener") as listener:
+    await graph.tool("/usr/bin/python3", "-c", script, str(bag))
+    async with make_node(graph, "listener") as listener:
         assert listener.is_time_simulated
         heard = await listener.subscribe("t", STRING)
         asleep = asyncio.create_task(listener.sleep(1005.0))
-        await ours.tool("rosbag", "play", "--clock", "-r", "10", "--wait-for-subscribers", str(bag))
+        await graph.tool("rosbag", "play", "--clock", "-r", "10", "--wait-for-subscribers", str(bag))
         assert await asyncio.wait_for(asleep, 20)
         assert 1005 < listener.time() < 1010
         assert (await asyncio.wait_for(anext(aiter(heard)), 20)).data == "0"
@@ -253,12 +258,12 @@ LAUNCH = """<launch>
 
 
 @pytest.mark.needs("roslaunch", "topic_tools")
-async def test_roslaunch(ours: Graph, make_node: MakeNode) -> None:
-    (ours.home / "a.launch").write_text(LAUNCH)
-    async with make_node(ours, "ours") as node:
+async def test_roslaunch(graph: Graph, make_node: MakeNode) -> None:
+    (graph.home / "a.launch").write_text(LAUNCH)
+    async with make_node(graph, "ours") as node:
         out = await node.subscribe("launched_out", STRING)
         publisher = await node.advertise("launched_in", STRING)
-        async with ours.program("roslaunch", "--wait", str(ours.home / "a.launch"), node="/robot/relay"):
+        async with graph.program("roslaunch", "--wait", str(graph.home / "a.launch"), node="/robot/relay"):
             await publisher.wait_for_subscribers(timeout=40)
             heard = asyncio.create_task(anext(aiter(out)))  # type: ignore[arg-type]
             async with asyncio.timeout(40):
@@ -268,11 +273,86 @@ async def test_roslaunch(ours: Graph, make_node: MakeNode) -> None:
             assert heard.result().data == "through it"
             assert await node.get_param("/from_launch") == "yes"
             assert await node.get_param("/tree") == {"a": 1, "b": ["x", "y"]}
-        await ours.until(lambda: is_gone(ours, "/robot/relay"), what="the launched node is gone")
+        await graph.until(lambda: is_gone(graph, "/robot/relay"), what="the launched node is gone")
 
 
 async def is_gone(graph: Graph, name: str) -> bool:
     return await graph.node(name) is None
+
+
+OUR_NODE = """#!{python}
+import asyncio
+from rce.ros.node import Node, run
+
+async def main():
+    async with Node("unnamed") as node:
+        said = await node.advertise("said", "std_msgs/String", latch=True)
+        said.publish(data=f"{{node.name}} {{await node.get_param('~word')}}")
+        node.log.warning("was launched")
+        await node.spin()
+
+run(main())
+"""
+
+OUR_LAUNCH = """<launch>
+  <node pkg="launched" type="ours.py" name="first" ns="robot" respawn="true">
+    <param name="word" value="hello"/>
+    <remap from="said" to="/told"/>
+  </node>
+</launch>
+"""
+
+
+@pytest.mark.needs("roslaunch")
+async def test_roslaunch_starts_our_node(graph: Graph, make_node: MakeNode) -> None:
+    package = graph.home / "launched"
+    package.mkdir()
+    (package / "package.xml").write_text("<package><name>launched</name></package>")
+    (package / "ours.py").write_text(OUR_NODE.format(python=sys.executable))
+    (package / "ours.py").chmod(0o755)
+    (package / "ours.launch").write_text(OUR_LAUNCH)
+    async with make_node(graph, "listener") as node:
+        told = await node.subscribe("/told", STRING)
+        launch = str(package / "ours.launch")
+        async with graph.program("roslaunch", "--wait", launch, node="/robot/first") as roslaunch:
+            async with asyncio.timeout(40):
+                assert (await anext(aiter(told))).data == "/robot/first hello"
+            listed = await graph.tool("rosnode", "info", "/robot/first")
+            (pid,) = re.findall(r"Pid: (\d+)", listed)
+            os.kill(int(pid), signal.SIGKILL)
+            async with asyncio.timeout(40):  # it is started again, and says so
+                assert (await anext(aiter(told))).data == "/robot/first hello"
+            roslaunch.send_signal(signal.SIGINT)
+            await asyncio.wait_for(roslaunch.wait(), 30)
+        assert await is_gone(graph, "/robot/first")
+    (log,) = graph.home.glob(".ros/log/*-*/robot-first-1.log")
+    assert log.read_text().count("[WARNING]") == 2
+
+
+@pytest.mark.parametrize("throttle", [(), ("--throttle", "0.01")], ids=["all", "throttled"])
+async def test_rce_relay(graph: Graph, make_node: MakeNode, throttle: tuple[str, ...]) -> None:
+    relay = (RCE, "relay", "/from", "/to", "--name", "relay", *throttle)
+    async with make_node(graph, "ours") as node, graph.program(*relay, node="/relay"):
+        heard: list[str] = []
+        await node.subscribe("/to", STRING, lambda message: heard.append(message.data))
+        await graph.tool("rostopic", "pub", "-1", "/from", STRING, "data: first")
+        await graph.until(lambda: _true(heard == ["first"]), what="a real publisher's message is relayed")
+        assert (await graph.tool("rostopic", "type", "/to")).strip() == STRING
+        publisher = await node.advertise("/from", STRING)
+        await publisher.wait_for_subscribers(timeout=20)
+        for number in range(5):
+            publisher.publish(data=str(number))
+        if throttle:
+            info = await graph.tool("rosnode", "info", "/relay")  # it had the time to pass them on
+            assert "* topic: /from" in info
+            assert heard == ["first"]
+        else:
+            await graph.until(lambda: _true(len(heard) == 6), what="all are relayed")
+            assert heard[1:] == [str(number) for number in range(5)]
+
+
+async def _true(value: bool) -> bool:
+    return value
 
 
 ROSTEST = """<launch>
