@@ -15,6 +15,7 @@ from rce.config.exceptions import RunDirError, SecretError
 from rce.config.secret import load_secret
 from rce.control.limits import MEGABYTE
 from rce_container.app import AUTO, RUNTIMES, App, package_path
+from rce_container.archive import LOG_DAYS, LOG_SPACE
 from rce_container.exceptions import ContainerError
 from rce_container.settings import ContainerSettings
 
@@ -62,6 +63,12 @@ def container(
     slot_processes: Annotated[
         int, typer.Option(help="Processes and threads of a container for each of its slots.", min=16)
     ] = 256,
+    log_days: Annotated[
+        float, typer.Option(help="Days for which the logs of containers that ended are kept.", min=0.0)
+    ] = LOG_DAYS,
+    log_space: Annotated[
+        int, typer.Option(metavar="MB", help="What those logs may take in all; the oldest go first.", min=0)
+    ] = LOG_SPACE // MEGABYTE,
     name: Annotated[str, typer.Option(help="Name of this task set [default: made up once, then kept]")] = "",
     machine: Annotated[str, typer.Option(help="Name of this machine [default: its host name]")] = "",
     secret_file: Annotated[Path | None, typer.Option(help="File with the engine's shared secret.")] = None,
@@ -82,6 +89,8 @@ def container(
         slots=slots,
         slot_memory=slot_memory * MEGABYTE,
         slot_processes=slot_processes,
+        log_days=log_days,
+        log_space=log_space * MEGABYTE,
     )
     try:
         program = App(

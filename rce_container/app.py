@@ -78,7 +78,8 @@ class App:
         runtime, detail = await asyncio.to_thread(choose_runtime, self.runtime, runtimes)
         await asyncio.to_thread(_compile_engine)
         state_dir = self.state_dir or default_state_dir() / "container"
-        with StateFolder(state_dir, run_dir()) as state:
+        keep = self.settings.log_days, self.settings.log_space
+        with StateFolder(state_dir, run_dir(), log_days=keep[0], log_space=keep[1]) as state:
             name = state.name(self.name)
             doorman = Doorman()
             async with contextlib.AsyncExitStack() as stack:

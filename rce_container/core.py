@@ -33,7 +33,7 @@ from rce_container.events import (
     Tell,
     Wait,
 )
-from rce_container.life import Happening, Phase, after
+from rce_container.life import ALIVE, Happening, Phase, after
 
 BACKOFF_S = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
 """Pauses before a container that ended is made again: the first, second, ... time."""
@@ -65,7 +65,7 @@ class Container:
     def status(self) -> EndpointStatus:
         """What the master is told."""
         base = self.reported
-        if base is None or self.phase not in (Phase.RUNNING, Phase.STOPPING):
+        if base is None or self.phase not in {*ALIVE, Phase.STOPPING}:
             base = EndpointStatus(id=self.id, revision=0, state=_STATES[self.phase])
         state = EndpointState.STOPPING if self.phase is Phase.STOPPING else base.state
         return msgspec.structs.replace(
@@ -82,6 +82,7 @@ class Container:
 _STATES = {
     Phase.STARTING: EndpointState.STARTING,
     Phase.RUNNING: EndpointState.RUNNING,
+    Phase.DEGRADED: EndpointState.DEGRADED,
     Phase.STOPPING: EndpointState.STOPPING,
     Phase.CLEANING: EndpointState.FAILED,
     Phase.WAITING: EndpointState.FAILED,
@@ -114,8 +115,8 @@ class ManagerCore:
         match event:
             case Put(spec=spec):
                 self._put(spec)
-            case Drop(id=id_, revision=revision):
-                self._drop(id_, revision)
+            case Drop(id=id_, revision=revision, reason=reason):
+                self._drop(id_, revision, reason)
             case Sync(specs=specs):
                 self._sync(specs)
             case Adopted():
@@ -147,7 +148,7 @@ class ManagerCore:
             assert container.phase is not Phase.GONE, f"{id_} is gone and not forgotten"
             if container.phase is Phase.WAITING:
                 assert not container.mark, f"{id_} waits although something of it is there"
-            if container.phase in (Phase.RUNNING, Phase.CLEANING):
+            if container.phase in {*ALIVE, Phase.CLEANING}:
                 assert container.mark, f"{id_} is {container.phase.value} without a life"
 
     # The master's wishes
@@ -165,24 +166,24 @@ class ManagerCore:
         container.phase = after(was, Happening.DESIRE)
         if was is Phase.GONE:
             self._start(container)
-        elif container.phase in (Phase.STARTING, Phase.RUNNING) and container.mark:
+        elif container.phase in {*ALIVE, Phase.STARTING} and container.mark:
             self._out.append(Apply(spec.id, container.mark, spec))
 
-    def _drop(self, id_: str, revision: int) -> None:
+    def _drop(self, id_: str, revision: int, reason: str) -> None:
         container = self.containers.get(id_)
         if container is None:
             self._out.append(Tell(Gone(id=id_, revision=revision)))
             return
         container.desired = None
         container.drop_revision = revision
-        self._release(container)
+        self._release(container, reason)
 
     def _sync(self, specs: Iterable[EndpointSpec]) -> None:
         desired = {spec.id: spec for spec in specs}
         for id_, container in list(self.containers.items()):
             if id_ not in desired:
                 known = container.desired or container.reported
-                self._drop(id_, known.revision if known else 0)
+                self._drop(id_, known.revision if known else 0, "it is not desired here any more")
         for spec in desired.values():
             self._put(spec)
 
@@ -190,16 +191,16 @@ class ManagerCore:
         self._quitting = True
         for container in list(self.containers.values()):
             container.desired = None
-            self._release(container)
+            self._release(container, "its manager was told to end")
 
-    def _release(self, container: Container) -> None:
+    def _release(self, container: Container, reason: str) -> None:
         was = container.phase
         container.phase = after(was, Happening.RELEASE)
         if container.phase is Phase.GONE:
             self._forget(container)
-        elif was in (Phase.STARTING, Phase.RUNNING):
+        elif was in {*ALIVE, Phase.STARTING}:
             if container.mark:
-                self._out.append(Stop(container.id, container.mark))
+                self._out.append(Stop(container.id, container.mark, reason))
             self._tell(container)
 
     # What happens to containers
@@ -207,9 +208,9 @@ class ManagerCore:
     def _adopt(self, event: Adopted) -> None:
         id_ = event.status.id
         assert id_ not in self.containers, "containers are adopted before anything else happens"
-        container = self.containers[id_] = Container(
-            id_, Phase.RUNNING, mark=event.mark, address=event.address
-        )
+        is_ill = event.status.state is EndpointState.DEGRADED
+        phase = Phase.DEGRADED if is_ill else Phase.RUNNING
+        container = self.containers[id_] = Container(id_, phase, mark=event.mark, address=event.address)
         container.reported = event.status
         container.running_since = self._now
 
@@ -236,19 +237,20 @@ class ManagerCore:
         container.mark = event.mark
         container.address = event.address
         if container.phase is not Phase.STARTING or container.desired is None:
-            self._out.append(Stop(container.id, event.mark))
+            self._out.append(Stop(container.id, event.mark, "it is not desired any more"))
             return
         self._out.append(Apply(container.id, event.mark, container.desired))
         self._tell(container)
 
     def _report(self, container: Container, status: EndpointStatus) -> None:
         was = container.phase
-        container.phase = after(was, Happening.REPORT)
+        is_ill = status.state is EndpointState.DEGRADED
+        container.phase = after(was, Happening.ILLNESS if is_ill else Happening.REPORT)
         container.reported = status
         if was is Phase.STARTING:
             container.running_since = self._now
             container.detail = ""
-        if container.phase in (Phase.RUNNING, Phase.STOPPING):
+        if container.phase in {*ALIVE, Phase.STOPPING}:
             self._tell(container)
 
     def _lost(self, container: Container, reason: str) -> None:

@@ -21,6 +21,7 @@ class Drop:
 
     id: str
     revision: int
+    reason: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +122,8 @@ class Stop:
 
     id: str
     mark: str
+    reason: str = ""
+    """Why, for the record of that life."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,9 @@
 """Where a container task set keeps what it needs on disk.
 
-``STATE/name`` and one folder per life of a container, ``STATE/containers/MARK`` (record, logs, private
-home), are in the state directory; the container's sockets are in a short path, ``RUN/MARK``. Everything
-belongs to one task set at a time: the state directory is locked while it runs.
+``STATE/name``, one folder per life of a container, ``STATE/containers/MARK`` (record, private home), and its
+logs, which outlive it (:mod:`rce_container.archive`), are in the state directory; the container's sockets are
+in a short path, ``RUN/MARK``. Everything belongs to one task set at a time: the state directory is locked
+while it runs.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import re
 import secrets
 import shutil
 import socket
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Self
@@ -21,6 +23,7 @@ from typing import Self
 import msgspec
 from msgspec import Struct
 
+from rce_container.archive import LOG_DAYS, LOG_SPACE, LogArchive
 from rce_container.exceptions import StateError
 
 _MARK = re.compile(r"[0-9a-f]{12}")
@@ -50,14 +53,21 @@ class Record(Struct, frozen=True, kw_only=True):
 
 
 class ContainerFolder:
-    """The paths of one life of one container."""
+    """The paths of one life of one container.
 
-    def __init__(self, root: Path, run: Path, mark: str) -> None:
+    Args:
+        root: Holds the folders of all lives.
+        run: Holds those for sockets.
+        mark: Names the life.
+        logs: Where its logs are; by default in its own folder.
+    """
+
+    def __init__(self, root: Path, run: Path, mark: str, logs: Path | None = None) -> None:
         self.mark = mark
         self.path = root / mark
         self.run = run / mark
         self.home = self.path / "home"
-        self.logs = self.path / "logs"
+        self.logs = logs or self.path / "logs"
         self.etc = self.path / "etc"
         self.hosts = self.etc / "hosts"
         self.control_socket = self.run / "control.sock"
@@ -70,8 +80,9 @@ class ContainerFolder:
             StateError: They cannot be made.
         """
         try:
-            for path in (self.path, self.run, self.home, self.logs, self.etc):
+            for path in (self.path, self.run, self.home, self.etc):
                 path.mkdir(mode=0o700, parents=True)
+            self.logs.mkdir(mode=0o700, exist_ok=True)
         except OSError as error:
             raise StateError(f"cannot make {error.filename}: {error.strerror}") from error
 
@@ -137,11 +148,19 @@ class StateFolder:
     Args:
         state: Path of the state directory.
         run: A short path for sockets; one folder per state directory is made in it.
+        log_days: How long the logs of a container are kept after its end.
+        log_space: How many bytes those logs may take in all.
+
+    Attributes:
+        archive: The containers' logs.
     """
 
-    def __init__(self, state: Path, run: Path) -> None:
+    def __init__(
+        self, state: Path, run: Path, *, log_days: float = LOG_DAYS, log_space: int = LOG_SPACE
+    ) -> None:
         self._state = state.absolute()
         self._containers = self._state / "containers"
+        self.archive = LogArchive(self._state / "logs", days=log_days, space=log_space)
         self._run_base = run
         self._run = run
         self._lock = -1
@@ -198,19 +217,26 @@ class StateFolder:
         """A file that says where the containers' cgroups are."""
         return self._state / "cgroups"
 
-    def create(self) -> ContainerFolder:
+    def create(self, id_: str) -> ContainerFolder:
         """Make the folder of a new life of a container.
 
         Raises:
             StateError: It cannot be made.
         """
-        folder = self.open(secrets.token_hex(6))
-        folder.make()
+        mark = secrets.token_hex(6)
+        logs = self.archive.begin(id_, mark, time.time())
+        folder = ContainerFolder(self._containers, self._run, mark, logs)
+        try:
+            folder.make()
+        except StateError as error:
+            self.archive.end(id_, mark, str(error), time.time())
+            raise
         return folder
 
     def open(self, mark: str) -> ContainerFolder:
         """The folder of one life of a container, whether it is there or not."""
-        return ContainerFolder(self._containers, self._run, mark)
+        kept = self.archive.find(mark)
+        return ContainerFolder(self._containers, self._run, mark, kept.folder if kept else None)
 
     def existing(self) -> Iterator[ContainerFolder]:
         """All folders that are there, in no order."""

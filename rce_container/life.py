@@ -1,4 +1,7 @@
-"""The life of a container as its manager sees it: phases, what may happen in each, and what follows."""
+"""The life of a container as its manager sees it: phases, what may happen in each, and what follows.
+
+What the master calls requested, placed and lost is before and between the lives that a manager sees.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,9 @@ class Phase(Enum):
     STARTING = "starting"
     """Its processes are being made, or its environment has not reported yet."""
     RUNNING = "running"
-    """Its environment reports."""
+    """Its environment reports that all is well."""
+    DEGRADED = "degraded"
+    """Its environment reports a node that failed, is stuck, or pauses after a failure."""
     STOPPING = "stopping"
     """It was told to end, because it is not desired any more; nothing of it may be left."""
     CLEANING = "cleaning"
@@ -26,7 +31,9 @@ class Happening(Enum):
     """What can happen to a container."""
 
     REPORT = "report"
-    """Its environment reported."""
+    """Its environment reported that all is well."""
+    ILLNESS = "illness"
+    """Its environment reported that not all is well."""
     LOSS = "loss"
     """Its environment is gone, or could not be started."""
     REMOVED = "removed"
@@ -42,18 +49,28 @@ class Happening(Enum):
 NEXT: dict[Phase, dict[Happening, Phase]] = {
     Phase.STARTING: {
         Happening.REPORT: Phase.RUNNING,
+        Happening.ILLNESS: Phase.DEGRADED,
         Happening.LOSS: Phase.CLEANING,
         Happening.RELEASE: Phase.STOPPING,
         Happening.DESIRE: Phase.STARTING,
     },
     Phase.RUNNING: {
         Happening.REPORT: Phase.RUNNING,
+        Happening.ILLNESS: Phase.DEGRADED,
         Happening.LOSS: Phase.CLEANING,
         Happening.RELEASE: Phase.STOPPING,
         Happening.DESIRE: Phase.RUNNING,
     },
+    Phase.DEGRADED: {
+        Happening.REPORT: Phase.RUNNING,
+        Happening.ILLNESS: Phase.DEGRADED,
+        Happening.LOSS: Phase.CLEANING,
+        Happening.RELEASE: Phase.STOPPING,
+        Happening.DESIRE: Phase.DEGRADED,
+    },
     Phase.STOPPING: {
         Happening.REPORT: Phase.STOPPING,
+        Happening.ILLNESS: Phase.STOPPING,
         Happening.LOSS: Phase.STOPPING,
         Happening.REMOVED: Phase.GONE,
         Happening.RELEASE: Phase.STOPPING,
@@ -61,6 +78,7 @@ NEXT: dict[Phase, dict[Happening, Phase]] = {
     },
     Phase.CLEANING: {
         Happening.REPORT: Phase.CLEANING,
+        Happening.ILLNESS: Phase.CLEANING,
         Happening.REMOVED: Phase.WAITING,
         Happening.RELEASE: Phase.STOPPING,
         Happening.DESIRE: Phase.CLEANING,
@@ -75,6 +93,9 @@ NEXT: dict[Phase, dict[Happening, Phase]] = {
         Happening.RELEASE: Phase.GONE,
     },
 }
+
+ALIVE = frozenset({Phase.RUNNING, Phase.DEGRADED})
+"""The phases in which a container's environment reports, and is to go on."""
 
 
 def after(phase: Phase, happening: Happening) -> Phase:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import resource
+import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import psutil
 
-from rce.control.logs import LogStream
 from rce.control.messages import (
     CONTROL_VERSION,
     Drop,
@@ -28,22 +28,20 @@ from rce.control.messages import (
     Usage,
 )
 from rce.control.model import EndpointStatus, LinkAddress, Network
-from rce.protocol.names import EndpointId, is_name
+from rce.protocol.names import EndpointId
 from rce_container import core, events
 from rce_container.environment import messages as m
 from rce_container.environment import proc
 from rce_container.environment.channel import connect
 from rce_container.environment.exceptions import ChannelError
-from rce_container.environment.logs import ENVIRONMENT_LOG, ROSOUT_LOG
 from rce_container.environment.process import strike_all
-from rce_container.environment.streams import letters_of
 from rce_container.exceptions import ContainerError, NetworkError, StartError, StateError
 from rce_container.folder import ContainerFolder, Record
 from rce_container.life import Phase
 from rce_container.limits import Cell, limits_of
 from rce_container.limits.warden import Warden
-from rce_container.logs import Chunk, read_log, read_node_log
 from rce_container.network import Networks
+from rce_container.reading import read_for
 from rce_container.runtimes.base import Handle, Order
 from rce_container.unit import Office, Unit
 from rce_container.usage import Subject, UsageMeter
@@ -105,7 +103,13 @@ class Manager:
         self.send: Callable[[ToMaster], None] = lambda _: None
         self._core = core.ManagerCore()
         self._networks = Networks()
-        self._office = Office(settings=settings, doorman=doorman, feed=self._feed, networks=self._networks)
+        self._office = Office(
+            settings=settings,
+            doorman=doorman,
+            feed=self._feed,
+            networks=self._networks,
+            archive=state.archive,
+        )
         self._units: dict[str, Unit] = {}
         """All lives of which something may be left, by mark."""
         self._queue: deque[str] = deque()
@@ -133,8 +137,8 @@ class Manager:
         match message:
             case Put(endpoint=spec):
                 self._feed(events.Put(spec))
-            case Drop(id=id_, revision=revision):
-                self._feed(events.Drop(id_, revision))
+            case Drop(id=id_, revision=revision, reason=reason):
+                self._feed(events.Drop(id_, revision, reason))
             case Sync(endpoints=specs):
                 self._feed(events.Sync(specs))
             case ReadLog():
@@ -163,12 +167,14 @@ class Manager:
                 await self._deal_with_the_past()
                 ready()
                 usage = self._tasks.create_task(self._report_usage(), name="usage")
+                pruning = self._tasks.create_task(self._prune_logs(), name="old logs")
                 await quit_.wait()
                 self._feed(events.Quit())
                 self._start_waiting()
                 if self._units:
                     await self._empty.wait()
                 usage.cancel()
+                pruning.cancel()
 
     def kill_all(self) -> None:
         """End all containers at once; for a quit that takes too long."""
@@ -178,6 +184,8 @@ class Manager:
     async def _deal_with_the_past(self) -> None:
         folders = list(self._state.existing())
         await self._sweep_cells({folder.mark for folder in folders})
+        marks = {folder.mark for folder in folders}
+        await asyncio.to_thread(self._state.archive.settle, marks, time.time())
         async with asyncio.TaskGroup() as tasks:
             for folder in folders:
                 tasks.create_task(self._adopt_or_prune(folder))
@@ -222,6 +230,13 @@ class Manager:
         await strike_all(folder.mark)
         await self._remove_cell(folder.mark)
         await asyncio.to_thread(folder.remove)
+        await asyncio.to_thread(self._state.archive.settle_one, folder.mark, time.time())
+
+    async def _prune_logs(self) -> None:
+        """Remove the logs of containers that ended long ago, now and then."""
+        while True:
+            await asyncio.to_thread(self._state.archive.prune, time.time())
+            await asyncio.sleep(self._settings.prune_interval)
 
     async def _sweep_cells(self, keep: set[str]) -> None:
         """Remove the cells of containers of which nothing else is left."""
@@ -254,8 +269,8 @@ class Manager:
                 self._start_waiting()
             case events.Apply(mark=mark, spec=spec):
                 self._units[mark].apply(spec)
-            case events.Stop(mark=mark):
-                self._units[mark].stop()
+            case events.Stop(mark=mark, reason=reason):
+                self._units[mark].stop(reason)
             case events.Wait(id=id_, ticket=ticket, delay=delay):
                 asyncio.get_running_loop().call_later(delay, self._feed, events.Due(id_, ticket))
 
@@ -273,7 +288,7 @@ class Manager:
 
     def _start(self, id_: str) -> None:
         try:
-            folder = self._state.create()
+            folder = self._state.create(id_)
         except StateError as error:
             self._feed(events.Lost(id_, "", str(error)))
             return
@@ -286,6 +301,7 @@ class Manager:
             self._tasks.create_task(self._remove_cell(folder.mark), name=f"cell of {id_}")
             self._tasks.create_task(self._networks.detach(folder.mark), name=f"network of {id_}")
             folder.remove()
+            self._state.archive.end(id_, folder.mark, f"cannot be started: {error}", time.time())
             self._feed(events.Lost(id_, "", str(error)))
             return
         unit = self._own(id_, folder, handle, cell, isolated=runtime.isolated)
@@ -308,9 +324,7 @@ class Manager:
         runtime = self._runtime
         if resources.image and runtime.name != PODMAN:
             if PODMAN not in self._info.runtimes:
-                raise StartError(
-                    f"its image needs the runtime {PODMAN}, which does not work on this machine"
-                )
+                raise StartError(f"its image needs the runtime {PODMAN}, which does not work on this machine")
             runtime = self._runtimes[PODMAN]
         if resources.network is Network.GROUP and not runtime.isolated:
             raise StartError(f"the runtime {runtime.name} has no networks of groups")
@@ -335,6 +349,7 @@ class Manager:
             ros_port=ROS_PORT if runtime.isolated and not host_network else 0,
             isolated=runtime.isolated,
             address=str(seat.address.ip) if seat else LOOPBACK,
+            rlimits=_rlimits(cell, isolated=runtime.isolated),
             packages=tuple(map(str, settings.packages)),
             grace=settings.grace,
             interrupt_timeout=settings.interrupt_timeout,
@@ -393,24 +408,11 @@ class Manager:
 
     def _read_log(self, message: ReadLog) -> LogChunk:
         container = self._core.containers.get(message.id)
-        unit = self._units.get(container.mark) if container is not None else None
-        if unit is None or (message.node and not is_name(message.node)):
-            return LogChunk(
-                request=message.request, offset=message.offset, error=f"there is no log of {message.node!r}"
-            )
+        mark = container.mark if container is not None else ""
         try:
-            chunk = self._read_piece(unit.folder.logs, message)
+            return read_for(self._state.archive, message, mark)
         except OSError as error:
             return LogChunk(request=message.request, offset=message.offset, error=str(error))
-        return LogChunk(request=message.request, offset=chunk.offset, text=chunk.text)
-
-    @staticmethod
-    def _read_piece(folder: Path, message: ReadLog) -> Chunk:
-        if message.node:
-            letters = letters_of(message.streams, message.level)
-            return read_node_log(folder, message.node, message.offset, message.limit, letters)
-        name = ROSOUT_LOG if LogStream.ROSOUT in message.streams else ENVIRONMENT_LOG
-        return read_log(folder, name, message.offset, message.limit)
 
     async def _report_usage(self) -> None:
         while True:
@@ -425,3 +427,11 @@ class Manager:
             times = self._process.cpu_times()
             memory = self._process.memory_info().rss
             self.send(Usage(cpu_s=times.user + times.system, memory=memory, endpoints=usage))
+
+
+def _rlimits(cell: Cell, *, isolated: bool) -> dict[int, int]:
+    """What the container's processes limit themselves."""
+    rlimits = dict(cell.rlimits)
+    if not isolated:
+        rlimits.pop(resource.RLIMIT_NPROC, None)  # would count all processes of this user
+    return rlimits

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rce.control.limits import MEGABYTE
+from rce_container.archive import LOG_DAYS, LOG_SPACE
 from rce_container.uids import FIRST_UID, UIDS
 
 
@@ -36,6 +37,12 @@ class ContainerSettings:
     cleanup_timeout: float = 10.0
     """What a container has on top of its nodes' times to end by itself, before it is killed."""
     usage_interval: float = 2.0
+    log_days: float = LOG_DAYS
+    """How long the logs of a container are kept after its end."""
+    log_space: int = LOG_SPACE
+    """How many bytes the logs of containers that ended may take in all; the oldest go first."""
+    prune_interval: float = 60.0
+    """How often is looked for logs to remove."""
     home_bytes: int = 256 * MEGABYTE
     """Size of a container's home, which lives in memory."""
     first_uid: int = FIRST_UID

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import logging
 import socket
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -15,6 +16,7 @@ from rce.control.model import EndpointSpec, EndpointStatus, InterfaceUsage, Link
 from rce.link.handover import Doorman, HandoverSender
 from rce.link.tasks import TaskScope
 from rce_container import events
+from rce_container.archive import LogArchive
 from rce_container.dial import dial
 from rce_container.environment import messages as m
 from rce_container.environment import proc
@@ -44,6 +46,7 @@ class Office:
     doorman: Doorman
     feed: Callable[[events.Event], None]
     networks: Networks
+    archive: LogArchive
 
 
 class Unit:
@@ -86,6 +89,7 @@ class Unit:
         self._pids: dict[int, int] = {}
         self._deadline: asyncio.Timeout | None = None
         self._stopping = False
+        self._stop_reason = ""
         self._hurry = False
         self._errands = TaskScope()
 
@@ -116,9 +120,14 @@ class Unit:
         for text in self.warden.review():
             self._office.feed(events.Faulted(self.id, self.mark, text))
 
-    def stop(self) -> None:
-        """Tell the environment to end; if it does not, it is killed."""
+    def stop(self, reason: str = "") -> None:
+        """Tell the environment to end; if it does not, it is killed.
+
+        Args:
+            reason: For the record of this life.
+        """
         self._stopping = True
+        self._stop_reason = reason or self._stop_reason
         if self._channel is not None:
             self._channel.send(m.encode(m.Stop()))
             self._limit(self._office.settings.stop_timeout)
@@ -137,6 +146,7 @@ class Unit:
                 reason += await asyncio.to_thread(self._last_words)
                 log.warning("container %s: %s", self.id, reason)
             self._office.feed(events.Lost(self.id, self.mark, reason))
+            await asyncio.to_thread(self._note_end, reason)
             await self._clean(_SHIM_TIMEOUT_S if self._stopping and not self._hurry else 0.0)
         except asyncio.CancelledError:
             self.handle.abandon()
@@ -274,6 +284,11 @@ class Unit:
             channel.send(m.encode(m.Dialed(request=request.request)), sock.fileno())
 
     # The end
+
+    def _note_end(self, reason: str) -> None:
+        if self._stopping:
+            reason = "; ".join(filter(None, (self._stop_reason, reason if self._hurry else "")))
+        self._office.archive.end(self.id, self.mark, reason, time.time())
 
     def _last_words(self) -> str:
         words = last_line(self.folder.logs)[:_LAST_WORDS_LENGTH]

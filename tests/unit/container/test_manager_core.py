@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -54,8 +55,8 @@ def test_put_of_an_older_revision_is_ignored() -> None:
 
 def test_drop_stops_and_says_gone_when_nothing_is_left() -> None:
     manager = running()
-    out = manager.handle(events.Drop(ID, 7), 1.0)
-    assert events.Stop(ID, "one") in out
+    out = manager.handle(events.Drop(ID, 7, "destroyed"), 1.0)
+    assert events.Stop(ID, "one", "destroyed") in out
     assert told(out, Status)[0].status.state is EndpointState.STOPPING
     assert not told(out, Gone)
     manager.handle(events.Lost(ID, "one", "its environment ended"), 1.1)
@@ -137,16 +138,33 @@ def test_sync_removes_what_is_not_desired_and_keeps_adopted_ones() -> None:
     for tag in ("kept", "other"):
         manager.handle(events.Adopted(tag, status(4, f"user/{tag}"), ADDRESS), 0.0)
     out = manager.handle(events.Sync((spec(5, "user/kept"), spec(1, "user/new"))), 1.0)
-    assert events.Stop("user/other", "other") in out
+    assert events.Stop("user/other", "other", "it is not desired here any more") in out
     assert events.Apply("user/kept", "kept", spec(5, "user/kept")) in out
     assert events.Start("user/new") in out
     out = manager.handle(events.Removed("user/other", "other"), 1.0)
     assert told(out, Gone) == [Gone(id="user/other", revision=4)]
 
 
+def test_a_container_is_degraded_while_a_node_is_not_well() -> None:
+    manager = running()
+    ill = msgspec.structs.replace(status(), state=EndpointState.DEGRADED)
+    (reported,) = told(manager.handle(events.Reported(ID, "one", ill), 1.0), Status)
+    assert reported.status.state is EndpointState.DEGRADED
+    assert manager.containers[ID].phase is Phase.DEGRADED
+    assert manager.handle(events.Put(spec(2)), 1.5) == [events.Apply(ID, "one", spec(2))]
+    (reported,) = told(manager.handle(events.Reported(ID, "one", status()), 2.0), Status)
+    assert reported.status.state is EndpointState.RUNNING
+    manager.handle(events.Reported(ID, "one", ill), 3.0)
+    out = manager.handle(events.Drop(ID, 9), 4.0)
+    assert events.Stop(ID, "one") in out
+    adopting = ManagerCore()
+    adopting.handle(events.Adopted("one", ill, ADDRESS), 0.0)
+    assert adopting.statuses[0].state is EndpointState.DEGRADED
+
+
 def test_quit_stops_all_starts_nothing_and_drops_nothing() -> None:
     manager = running()
-    assert events.Stop(ID, "one") in manager.handle(events.Quit(), 1.0)
+    assert events.Stop(ID, "one", "its manager was told to end") in manager.handle(events.Quit(), 1.0)
     assert manager.handle(events.Put(spec(9)), 1.0) == []
     assert told(manager.handle(events.Removed(ID, "one"), 1.0), Gone) == []
     assert not manager.containers
@@ -165,7 +183,9 @@ def test_every_phase_can_end() -> None:
 
 EVENTS = st.one_of(
     st.builds(lambda r: ("put", r), st.integers(1, 5)),
-    st.sampled_from([("drop", 9), ("sync", 0), ("sync", 3), ("report", 0), ("lost", 0), ("removed", 0)]),
+    st.sampled_from(
+        [("drop", 9), ("sync", 0), ("sync", 3), ("report", 0), ("ill", 0), ("lost", 0), ("removed", 0)]
+    ),
     st.sampled_from([("due", 0), ("fail", 0)]),
 )
 
@@ -188,8 +208,9 @@ def test_any_order_of_events_keeps_the_invariants(  # noqa: C901, PLR0912 - a sm
                 event = events.Drop(ID, number)
             case "sync":
                 event = events.Sync((spec(number),) if number else ())
-            case "report" if alive and not ended:
-                event = events.Reported(ID, alive, status())
+            case "report" | "ill" if alive and not ended:
+                state = EndpointState.RUNNING if name == "report" else EndpointState.DEGRADED
+                event = events.Reported(ID, alive, msgspec.structs.replace(status(), state=state))
             case "lost" if alive and not ended:
                 event, ended = events.Lost(ID, alive, "killed"), True
             case "removed" if alive and ended:

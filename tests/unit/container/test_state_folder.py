@@ -41,7 +41,7 @@ def test_a_run_folder_that_is_too_long(tmp_path: Path) -> None:
 
 def test_records_and_removal(tmp_path: Path) -> None:
     with StateFolder(tmp_path / "state", tmp_path / "run") as state:
-        folder = state.create()
+        folder = state.create("user/box")
         assert folder.read_record() is None
         record = Record(id="user/box", mark=folder.mark, runtime="process", pid=1, start=2)
         folder.write_record(record)

@@ -1,0 +1,191 @@
+"""The logs of containers, of those that live and, for a while, of those that ended.
+
+``STATE/logs/USER/TAG/MARK`` holds the logs of one life of a container from its first moment on, so that
+nothing has to be saved when it ends, however that happens. ``MARK.json`` beside it, out of the container's
+reach, says when the life began and how it ended.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import shutil
+import threading
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+from msgspec import Struct
+
+from rce.protocol.names import EndpointId
+from rce_container.exceptions import StateError
+from rce_container.logs import last_line
+
+log = logging.getLogger(__name__)
+
+LOG_DAYS = 3.0
+LOG_SPACE = 1 << 30
+MAX_LIVES = 20
+"""How many ended lives of one container are kept at most."""
+_DAY_S = 86400.0
+
+
+class Life(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One life of a container, as its record says."""
+
+    id: str
+    mark: str
+    began: float
+    """Seconds since the epoch, as all times here."""
+    ended: float = 0.0
+    """0 as long as nobody saw it end."""
+    reason: str = ""
+    """Why it ended."""
+
+
+class Kept(NamedTuple):
+    """A life whose logs are there."""
+
+    life: Life
+    folder: Path
+
+
+class LogArchive:
+    """The logs of one container task set.
+
+    Args:
+        root: ``STATE/logs``.
+        days: How long the logs of a life are kept after its end.
+        space: How many bytes the logs of ended lives may take in all; the oldest go first.
+    """
+
+    def __init__(self, root: Path, *, days: float, space: int) -> None:
+        self._root = root
+        self._days = days
+        self._space = space
+        self._lock = threading.Lock()
+        """Held while empty folders are removed or filled: lives are pruned in a thread of their own."""
+
+    def begin(self, id_: str, mark: str, now: float) -> Path:
+        """Make the folder for the logs of a new life.
+
+        Raises:
+            StateError: It cannot be made.
+        """
+        folder = self._folder(id_) / mark
+        try:
+            with self._lock:
+                for path in (self._root, folder.parent.parent, folder.parent):
+                    path.mkdir(mode=0o700, parents=True, exist_ok=True)
+                _write(folder, Life(id=id_, mark=mark, began=now))
+                folder.mkdir(mode=0o700)
+        except OSError as error:
+            raise StateError(f"cannot make {error.filename}: {error.strerror}") from error
+        return folder
+
+    def end(self, id_: str, mark: str, reason: str, now: float) -> None:
+        """Note how a life ended; done once, the first word counts."""
+        folder = self._folder(id_) / mark
+        life = _read(folder)
+        if life is None or life.ended:
+            return
+        try:
+            _write(folder, msgspec.structs.replace(life, ended=now, reason=reason))
+        except OSError as error:
+            log.warning("how container %s ended cannot be noted: %s", id_, error)
+
+    def find(self, mark: str) -> Kept | None:
+        """The life of a mark, whosever it is."""
+        return next((kept for kept in self._all(f"*/*/{mark}.json")), None)
+
+    def ended(self, id_: str) -> list[Kept]:
+        """The ended lives of a container, the newest first."""
+        user_and_tag = EndpointId.parse(id_)
+        found = [kept for kept in self._all(f"{user_and_tag}/*.json") if kept.life.ended]
+        return sorted(found, key=_age)
+
+    def settle(self, living: Collection[str], now: float) -> None:
+        """Note the end of lives that nobody saw end.
+
+        Args:
+            living: The marks of lives of which something may be there.
+            now: The time.
+        """
+        for kept in list(self._all("*/*/*.json")):
+            if not kept.life.ended and kept.life.mark not in living:
+                self._settle(kept, now)
+
+    def settle_one(self, mark: str, now: float) -> None:
+        """Note the end of a life that nobody saw end."""
+        kept = self.find(mark)
+        if kept is not None:
+            self._settle(kept, now)
+
+    def _settle(self, kept: Kept, now: float) -> None:
+        words = last_line(kept.folder)
+        reason = "no manager saw it end" + (f"; its last words: {words}" if words else "")
+        self.end(kept.life.id, kept.life.mark, reason, now)
+
+    def prune(self, now: float) -> None:
+        """Remove what is too old or too much, the oldest first."""
+        ended = sorted((kept for kept in self._all("*/*/*.json") if kept.life.ended), key=_age)
+        space = self._space
+        lives: dict[str, int] = {}
+        for kept in ended:
+            space -= _size(kept.folder)
+            lives[kept.life.id] = lives.get(kept.life.id, 0) + 1
+            is_old = now - kept.life.ended > self._days * _DAY_S
+            if is_old or space < 0 or lives[kept.life.id] > MAX_LIVES:
+                self._remove(kept.folder)
+
+    def _remove(self, folder: Path) -> None:
+        shutil.rmtree(folder, ignore_errors=True)
+        with self._lock, contextlib.suppress(OSError):
+            _record(folder).unlink()
+            folder.parent.rmdir()
+            folder.parent.parent.rmdir()
+
+    def _folder(self, id_: str) -> Path:
+        endpoint = EndpointId.parse(id_)
+        return self._root / endpoint.user / endpoint.tag
+
+    def _all(self, pattern: str) -> Iterator[Kept]:
+        for path in self._root.glob(pattern):
+            folder = path.with_suffix("")
+            life = _read(folder)
+            if life is not None and life.mark == folder.name:
+                yield Kept(life, folder)
+
+
+def _age(kept: Kept) -> float:
+    return -kept.life.ended
+
+
+def _record(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}.json")
+
+
+def _read(folder: Path) -> Life | None:
+    try:
+        return msgspec.json.decode(_record(folder).read_bytes(), type=Life)
+    except (OSError, msgspec.DecodeError):
+        return None
+
+
+def _write(folder: Path, life: Life) -> None:
+    """Write a life's record, atomically."""
+    temporary = folder.with_name(f"{folder.name}.new")
+    temporary.write_bytes(msgspec.json.encode(life))
+    temporary.replace(_record(folder))
+
+
+def _size(folder: Path) -> int:
+    """Bytes that a folder's files take; follows no links."""
+    total = 0
+    for parent, _, files in os.walk(folder):
+        for name in files:
+            with contextlib.suppress(OSError):
+                total += Path(parent, name).lstat().st_size
+    return total

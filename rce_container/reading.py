@@ -1,0 +1,62 @@
+"""Answers requests to read logs: finds the life of the container that is meant, and the log in it."""
+
+from __future__ import annotations
+
+from rce.control.logs import LogStream
+from rce.control.messages import LogChunk, ReadLog
+from rce.protocol.names import EndpointId, is_name
+from rce_container.archive import Kept, LogArchive
+from rce_container.environment.logs import ENVIRONMENT_LOG, ROSOUT_LOG
+from rce_container.environment.streams import letters_of
+from rce_container.logs import Chunk, read_log, read_node_log
+
+
+def read_for(archive: LogArchive, message: ReadLog, living: str) -> LogChunk:
+    """Read what a message asks for. Blocks.
+
+    Args:
+        archive: All logs.
+        message: What is asked.
+        living: The mark of the container's life, if it has one now; else empty.
+
+    Raises:
+        OSError: It cannot be read; ``FileNotFoundError`` if there is no such log.
+    """
+    if message.node and not is_name(message.node):
+        raise FileNotFoundError(f"there is no log of {message.node!r}")
+    kept = _find(archive, message, living)
+    chunk = _read(kept, message)
+    life = kept.life
+    return LogChunk(
+        request=message.request,
+        offset=chunk.offset,
+        text=chunk.text,
+        life=life.mark,
+        ended=life.ended,
+        reason=life.reason,
+    )
+
+
+def _find(archive: LogArchive, message: ReadLog, living: str) -> Kept:
+    current = archive.find(living) if living else None
+    tag = EndpointId.parse(message.id).tag
+    if message.life:
+        ended = [kept for kept in archive.ended(message.id) if kept.life.mark == message.life]
+        found = current if current and living == message.life else next(iter(ended), None)
+        missing = f"the logs of that life of container {tag} are not kept any more"
+    elif current is not None and not message.previous:
+        return current
+    else:
+        found = next((kept for kept in archive.ended(message.id) if kept.life.mark != living), None)
+        missing = f"no logs of an earlier life of container {tag} are kept here"
+    if found is None or 0 < found.life.ended < message.since:
+        raise FileNotFoundError(missing)
+    return found
+
+
+def _read(kept: Kept, message: ReadLog) -> Chunk:
+    if message.node:
+        letters = letters_of(message.streams, message.level)
+        return read_node_log(kept.folder, message.node, message.offset, message.limit, letters)
+    name = ROSOUT_LOG if LogStream.ROSOUT in message.streams else ENVIRONMENT_LOG
+    return read_log(kept.folder, name, message.offset, message.limit)
