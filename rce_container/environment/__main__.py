@@ -7,7 +7,12 @@ import socket
 import sys
 
 from rce_container.environment.messages import decode_boot
-from rce_container.environment.process import keep_to_oneself, take_in_orphans
+from rce_container.environment.process import (
+    OF_ENVIRONMENT,
+    die_before_others,
+    keep_to_oneself,
+    take_in_orphans,
+)
 from rce_container.environment.running import run_environment
 
 
@@ -17,6 +22,7 @@ def main() -> None:
     control, links = (socket.socket(fileno=os.dup(fd)) for fd in (0, 1))
     with open(os.devnull, "rb") as nothing:  # noqa: PTH123
         os.dup2(nothing.fileno(), 0)
+    die_before_others(OF_ENVIRONMENT)
     if boot.isolated:
         keep_to_oneself()
     else:

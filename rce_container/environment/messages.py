@@ -32,6 +32,8 @@ class Boot(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Whether the environment is process 1 of its own pid namespace."""
     address: str = "127.0.0.1"
     """Where the container's nodes are reached by others of its group; loopback if it has none."""
+    rlimits: dict[int, int] = {}
+    """What each of its processes limits for itself, by the numbers of :mod:`resource`."""
     packages: tuple[str, ...] = ()
     grace: float = 30.0
     """Seconds without a manager after which the environment ends itself."""

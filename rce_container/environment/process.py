@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import ctypes
+import resource
 import signal
 import sys
+from collections.abc import Mapping
+from pathlib import Path
 
 from rce_container.environment import proc
+
+OF_ENVIRONMENT = 300
+"""When memory has run out, containers die before the engine, of which a process has the score 0."""
+OF_NODES = 600
+"""And nodes die before the environment that would have to tell of it."""
 
 _PR_SET_PDEATHSIG = 1
 _PR_SET_DUMPABLE = 4
@@ -22,6 +31,29 @@ def keep_to_oneself() -> None:
     It holds the sockets of the container's control and links and the links' tokens.
     """
     _prctl(_PR_SET_DUMPABLE, 0)
+
+
+def die_before_others(score: int, pid: int | None = None) -> None:
+    """Offer this process, or another one, to the kernel for the time when memory has run out.
+
+    Args:
+        score: How much it is offered, and what it starts from then on; see :data:`OF_ENVIRONMENT`.
+        pid: Another process of the same user.
+    """
+    with contextlib.suppress(OSError):  # not Linux, or the process is gone
+        Path(f"/proc/{pid or 'self'}/oom_score_adj").write_text(str(score))
+
+
+def limit_oneself(rlimits: Mapping[int, int]) -> None:
+    """Limit this process and each one that it starts, as far as it is not limited further already.
+
+    Args:
+        rlimits: Limits by the numbers of :mod:`resource`.
+    """
+    for number, limit in rlimits.items():
+        _, hard = resource.getrlimit(number)
+        if hard == resource.RLIM_INFINITY or limit < hard:
+            resource.setrlimit(number, (limit, limit))
 
 
 def take_in_orphans() -> None:

@@ -9,6 +9,8 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
+from rce_container.environment.process import OF_NODES, die_before_others
+
 
 class Child:
     """A process that was started here, in a session of its own."""
@@ -75,6 +77,7 @@ class Reaper:
             stderr=stderr,
             start_new_session=True,
         )
+        die_before_others(OF_NODES, process.pid)
         child = Child(process, asyncio.get_running_loop().create_future())
         self._children[child.pid] = child
         return child

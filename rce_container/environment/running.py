@@ -11,6 +11,7 @@ from pathlib import Path
 from rce_container.environment.environment import Environment
 from rce_container.environment.logs import ENVIRONMENT_LOG, LogWriter
 from rce_container.environment.messages import Boot
+from rce_container.environment.process import limit_oneself
 
 
 class _Handler(logging.Handler):
@@ -34,6 +35,7 @@ def run_environment(boot: Boot, control: socket.socket, links: socket.socket) ->
         control: A listening unix socket for managers.
         links: A listening unix socket for peers' links.
     """
+    limit_oneself(boot.rlimits)
     writer = LogWriter(Path(boot.logs), ENVIRONMENT_LOG, mirror=(1, 2))
     logging.basicConfig(level=logging.INFO, handlers=[_Handler(writer)])
     try:

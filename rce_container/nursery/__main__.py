@@ -19,6 +19,7 @@ from collections.abc import Sequence
 import msgspec
 
 from rce_container.environment.messages import Boot
+from rce_container.environment.process import OF_ENVIRONMENT, die_before_others
 from rce_container.environment.running import run_environment
 from rce_container.nursery import kernel
 from rce_container.nursery.confine import confine
@@ -42,6 +43,7 @@ _GIFTS = len(Gifts._fields)
 
 def main() -> None:
     """Serve a manager; in a forked child, be what was ordered."""
+    die_before_others(OF_ENVIRONMENT)
     orders = socket.socket(fileno=os.dup(0))
     program = orders.recv(MAX_PACKET)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)

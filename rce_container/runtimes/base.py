@@ -15,7 +15,6 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import ClassVar, NamedTuple
 
 import msgspec
@@ -74,8 +73,6 @@ class Order(NamedTuple):
     """Descriptor of the listening link socket."""
     join: tuple[str, ...] = ()
     """Files into which a process of the container writes its pid before it does anything else."""
-    rlimits: Mapping[int, int] = MappingProxyType({})
-    """Limits of each node's process by the numbers of :mod:`resource`, soft and hard alike."""
     host_network: bool = False
     """Whether the container sees the machine's own network."""
     image: str = ""
