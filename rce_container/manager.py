@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import logging
 import resource
-import resource
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -351,7 +350,6 @@ class Manager:
             isolated=runtime.isolated,
             address=str(seat.address.ip) if seat else LOOPBACK,
             rlimits=_rlimits(cell, isolated=runtime.isolated),
-            rlimits=_rlimits(cell, isolated=runtime.isolated),
             packages=tuple(map(str, settings.packages)),
             grace=settings.grace,
             interrupt_timeout=settings.interrupt_timeout,
@@ -429,14 +427,6 @@ class Manager:
             times = self._process.cpu_times()
             memory = self._process.memory_info().rss
             self.send(Usage(cpu_s=times.user + times.system, memory=memory, endpoints=usage))
-
-
-def _rlimits(cell: Cell, *, isolated: bool) -> dict[int, int]:
-    """What the container's processes limit themselves."""
-    rlimits = dict(cell.rlimits)
-    if not isolated:
-        rlimits.pop(resource.RLIMIT_NPROC, None)  # would count all processes of this user
-    return rlimits
 
 
 def _rlimits(cell: Cell, *, isolated: bool) -> dict[int, int]:
