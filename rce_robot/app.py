@@ -85,14 +85,21 @@ class App:
             port: int = listener.getsockname()[1]
             url = settings.public_url or f"ws://{in_url(reach)}:{port}/"
             info = MachineInfo(name=machine, cores=os.cpu_count() or 0, memory=psutil.virtual_memory().total)
+            lobby = Lobby("robots", per_address=settings.strangers_per_address, in_all=settings.strangers)
             task_set = RobotTaskSet(
-                hub, FormFactory(types), settings, name=name, machine=info, url=url, address=address
+                hub,
+                FormFactory(types),
+                settings,
+                name=name,
+                machine=info,
+                url=url,
+                address=address,
+                lobby=lobby,
             )
             control = f"ws://{in_url(self.master)}:{self.control_port}"
             channel = TaskSetChannel(control, self.secret, task_set.hello, task_set.handle)
             task_set.use(channel)
             gate = Gate(task_set, settings.session, settings.origins)
-            lobby = Lobby("robots", per_address=settings.strangers_per_address, in_all=settings.strangers)
             async with asyncio.TaskGroup() as tasks:
                 running = [tasks.create_task(channel.run())]
                 async with serve_robots(gate, settings, listener, lobby):

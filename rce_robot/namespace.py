@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Coroutine
 
     from rce.control.model import EndpointSpec, InterfaceSpec, LinkAddress
+    from rce.guard.budget import Ledger
     from rce.link import Interface, LinkHub, Port
     from rce.protocol.messages import DataMessage, Request
     from rce_robot.forms import Form
@@ -54,7 +55,10 @@ class Headquarters(Protocol):
 
 
 class Namespace:
-    """A robot. Implements :class:`rce_robot.interface.RobotSide` and :class:`rce_robot.session.Owner`.
+    """A robot.
+
+    Implements :class:`rce_robot.interface.RobotSide`, :class:`rce_robot.session.Owner` and
+    :class:`rce.guard.budget.Holder`.
 
     Invariants: at most one session; ``_interfaces`` holds exactly what the endpoint has made and not closed.
     """
@@ -68,6 +72,7 @@ class Namespace:
         address: LinkAddress,
         *,
         call_timeout: float,
+        ledger: Ledger,
     ) -> None:
         self.id = id
         self.revision = 0
@@ -81,7 +86,10 @@ class Namespace:
         self._call_timeout = call_timeout
         self._interfaces: dict[str, RobotInterface] = {}
         self._applying = asyncio.Lock()
-        self._endpoint = Endpoint(id, self._make, hub, on_change=self._changed, on_fault=self._failed)
+        self._account = ledger.open(id.user, self)
+        self._endpoint = Endpoint(
+            id, self._make, hub, on_change=self._changed, on_fault=self._failed, on_growth=self._account.note
+        )
 
     async def apply(self, spec: EndpointSpec) -> None:
         """Make interfaces and connections as desired; an older revision than the applied one is ignored."""
@@ -97,6 +105,7 @@ class Namespace:
             await self.session.close(reason)
         async with self._applying:
             await self._endpoint.close()
+        self._account.close()
 
     def status(self) -> EndpointStatus:
         """Return what the master is told."""
@@ -123,7 +132,31 @@ class Namespace:
         if self._live is not None:
             self._live.tick()
 
+    # rce.guard.budget.Holder
+
+    @property
+    def held(self) -> int:
+        """Bytes that wait on the way from the robot and to it."""
+        return self._endpoint.waiting_bytes + (self.session.held if self.session is not None else 0)
+
+    def shed(self, size: int) -> None:
+        """Drop the oldest of what waits, on the robot's side first."""
+        goal = self.held - size
+        if self.session is not None:
+            self.session.shed(size)
+        if self.held > goal:
+            self._endpoint.shed(self.held - goal)
+
+    def fail(self, reason: str) -> None:
+        """Drop the robot's connection."""
+        if self.session is not None:
+            self.session.fail(reason)
+
     # rce_robot.session.Owner
+
+    def grew(self) -> None:
+        """Count what waits."""
+        self._account.note()
 
     def take(self, message: DataMessage) -> None:
         """Give a data message of the robot to its interface.

@@ -187,6 +187,22 @@ class Outbox:
             self._ring.remove(flow)
             self._data_bytes -= flow.bytes
 
+    def shed(self, size: int) -> None:
+        """Forget the oldest messages of the topics that hold most, until ``size`` bytes are free."""
+        goal = self._data_bytes - size
+        while self._data_bytes > goal and self._drop_of_largest_topic():
+            pass
+
+    def clear(self) -> None:
+        """Forget everything."""
+        for flow in self._ring:
+            self.dropped[flow.tag] += len(flow.messages)
+        self._flows.clear()
+        self._ring.clear()
+        self._control.clear()
+        self._states.clear()
+        self._data_bytes = self._control_bytes = 0
+
     def _over(self, flow: _Flow, size: int) -> bool:
         limits = self._limits
         return bool(flow.messages) and (
@@ -195,11 +211,14 @@ class Outbox:
 
     def _make_room(self, size: int) -> None:
         """Drop from whichever topic holds most, until ``size`` more bytes fit or no topic holds anything."""
-        while self._data_bytes + size > self._limits.total_bytes:
-            topics = [flow for flow in self._ring if flow.overflow is Overflow.DROP_OLDEST]
-            if not topics:
-                return
+        while self._data_bytes + size > self._limits.total_bytes and self._drop_of_largest_topic():
+            pass
+
+    def _drop_of_largest_topic(self) -> bool:
+        topics = [flow for flow in self._ring if flow.overflow is Overflow.DROP_OLDEST]
+        if topics:
             self._drop(max(topics, key=lambda flow: flow.bytes))
+        return bool(topics)
 
     def _drop(self, flow: _Flow) -> None:
         _, size = flow.pop()

@@ -41,6 +41,9 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+MAX_REASON = 100
+"""Characters of a reason that a close frame has room for."""
+
 
 class Owner(Protocol):
     """What a session needs of the robot it belongs to."""
@@ -56,6 +59,9 @@ class Owner(Protocol):
 
     def leaving(self, session: Session) -> None:
         """The session's connection ended; nothing can be sent any more."""
+
+    def grew(self) -> None:
+        """The session holds more bytes than before. May make it :meth:`Session.shed`."""
 
     def left(self, session: Session, reason: str) -> None:
         """Everything that the session received was handled. Its last word."""
@@ -79,12 +85,17 @@ class Session:
         self._stream = ProtocolStream.for_engine(limits)
         self._outbox = Outbox(settings.outbox, dropped)
         self._requests: asyncio.Queue[tuple[Request, int] | None] = asyncio.Queue()
+        self._pending_bytes = 0
+        """Of incomplete messages, when they were last looked at."""
         self._waiting_bytes = 0
         """Text bytes of the requests that wait or are being carried out."""
         self._tasks: asyncio.TaskGroup | None = None
         self._calls: set[asyncio.Task[None]] = set()
-        self._now = asyncio.get_running_loop().time
+        self._loop = asyncio.get_running_loop()
+        self._now = self._loop.time
         self._reason = ""
+        self._abort: asyncio.TimerHandle | None = None
+        """A robot that was dropped has a moment to hear why."""
         self.lost = False
         """Whether the connection ended."""
         self.ended = asyncio.Event()
@@ -109,7 +120,7 @@ class Session:
     async def close(self, reason: str, code: int = CloseCode.POLICY_VIOLATION) -> None:
         """Close the connection, forget the robot's requests and wait until the session has ended."""
         self._drain_timeout = 0.0
-        await self._socket.close(code, reason[:100])
+        await self._socket.close(code, reason[:MAX_REASON])
         await self.ended.wait()
 
     async def probe(self) -> bool:
@@ -130,6 +141,28 @@ class Session:
         for event in self._stream.expire(self._now()):
             self._handle(event)
 
+    # Memory
+
+    @property
+    def held(self) -> int:
+        """Bytes that wait: to be sent, to become complete, to be carried out."""
+        return self._socket.held + self._stream.pending_bytes + self._outbox.bytes + self._waiting_bytes
+
+    def shed(self, size: int) -> None:
+        """Drop what is incomplete, then what waits to be sent, oldest first: about ``size`` bytes."""
+        goal = self.held - size
+        for event in self._stream.drop_oldest(size):
+            self._handle(event)
+        self._outbox.shed(max(0, self.held - goal))
+
+    def fail(self, reason: str) -> None:
+        """Drop the connection, and all that waits, because of the robot's use of it."""
+        self._socket.fail(CloseCode.TRY_AGAIN_LATER, reason[:MAX_REASON])
+        self._outbox.clear()
+        self._stream.drop_oldest(self._stream.pending_bytes)
+        if self._abort is None:
+            self._abort = self._loop.call_later(self._settings.close_timeout, self._socket.abort)
+
     # To the robot
 
     def send_data(self, tag: str, message: Queued, overflow: Overflow) -> bool:
@@ -137,14 +170,18 @@ class Session:
         if self._socket.writable and not self._outbox:
             self._write(message)
             return True
-        return not self.lost and self._outbox.put_data(tag, message, overflow)
+        taken = not self.lost and self._outbox.put_data(tag, message, overflow)
+        self._owner.grew()
+        return taken
 
     def send_urgent(self, message: Queued) -> bool:
         """Send in the control lane; False if that is full or the connection ended."""
         if self._socket.writable and not self._outbox:
             self._write(message)
             return True
-        return not self.lost and self._outbox.put_control(message)
+        taken = not self.lost and self._outbox.put_control(message)
+        self._owner.grew()
+        return taken
 
     def report(self, text: str) -> None:
         """Send an ``ER``; one that finds the lane full is dropped, the log has it."""
@@ -182,11 +219,17 @@ class Session:
                 self._socket.fail(CloseCode.INVALID_DATA, "a text frame is not UTF-8")
                 return
             self._handle(event, len(text))
+        self._look_at_pending()
 
     def on_binary(self, data: bytes) -> None:
         """Handle a binary frame."""
         for event in self._stream.feed_binary(data, self._now()):
             self._handle(event)
+        self._look_at_pending()
+
+    def on_part(self) -> None:
+        """Count a large message that is still on its way."""
+        self._owner.grew()
 
     def on_writable(self) -> None:
         """Send what waits, as far as the connection takes it."""
@@ -200,6 +243,8 @@ class Session:
         """Stop sending, and let :meth:`run` come to its end."""
         self.lost = True
         self._reason = reason
+        if self._abort is not None:
+            self._abort.cancel()
         self._owner.leaving(self)
         self._requests.put_nowait(None)
         if self._tasks is None:
@@ -211,6 +256,12 @@ class Session:
         if not self.ended.is_set():
             self.ended.set()
             self._owner.left(self, self._reason)
+
+    def _look_at_pending(self) -> None:
+        pending = self._stream.pending_bytes
+        if pending > self._pending_bytes:
+            self._owner.grew()
+        self._pending_bytes = pending
 
     def _write(self, message: Queued) -> None:
         rendered = message.render()

@@ -52,6 +52,10 @@ class RobotSettings:
     """How long a robot at the door waits for a master that is away."""
     open_timeout: float = 20.0
     """The whole handshake; more than ``login_timeout``."""
+    user_memory: int = 512 << 20
+    """Bytes of messages that wait for all robots of one user, or are incomplete; over it the oldest go."""
+    memory: int = 0
+    """The same for all users; 0 is half of the machine's memory."""
     strangers: int = 1024
     """Connections whose robot has not logged in yet."""
     strangers_per_address: int = 256

@@ -29,6 +29,7 @@ from rce.control.messages import (
     TaskSetKind,
     Usage,
 )
+from rce.guard.budget import Ledger
 from rce.protocol.exceptions import HandshakeError
 from rce.protocol.messages import type_of
 from rce.protocol.names import EndpointId
@@ -37,6 +38,7 @@ from rce_robot.namespace import Namespace
 if TYPE_CHECKING:
     from rce.control.messages import ClientReply, LoginReply, ToMaster, ToTaskSet
     from rce.control.model import EndpointSpec, LinkAddress
+    from rce.guard.lobby import Lobby
     from rce.link import LinkHub
     from rce.protocol.http import Credentials
     from rce.protocol.messages import Request
@@ -74,6 +76,7 @@ class RobotTaskSet:
         machine: What it runs on.
         url: Where clients are sent.
         address: Where links to any of the robots are accepted.
+        lobby: Where robots wait until they have logged in.
     """
 
     def __init__(
@@ -86,6 +89,7 @@ class RobotTaskSet:
         machine: MachineInfo,
         url: str,
         address: LinkAddress,
+        lobby: Lobby,
     ) -> None:
         self._hub = hub
         self._forms = forms
@@ -98,6 +102,11 @@ class RobotTaskSet:
         self._namespaces: dict[EndpointId, Namespace] = {}
         self._closing: dict[EndpointId, asyncio.Event] = {}
         self._changed: set[Namespace] = set()
+        self._lobby = lobby
+        self._ledger = Ledger(
+            per_user=settings.user_memory,
+            in_all=settings.memory or psutil.virtual_memory().total // 2,
+        )
         self._tasks: asyncio.TaskGroup | None = None
         self._process = psutil.Process()
 
@@ -178,7 +187,13 @@ class RobotTaskSet:
         namespace = self._namespaces.get(id_)
         if namespace is None:
             namespace = self._namespaces[id_] = Namespace(
-                id_, self._hub, self._forms, self, self._address, call_timeout=self._settings.call_timeout
+                id_,
+                self._hub,
+                self._forms,
+                self,
+                self._address,
+                call_timeout=self._settings.call_timeout,
+                ledger=self._ledger,
             )
         await namespace.apply(spec)
         return namespace
@@ -229,6 +244,9 @@ class RobotTaskSet:
                 cpu_s=times.user + times.system,
                 memory=self._process.memory_info().rss,
                 endpoints={str(id_): namespace.usage() for id_, namespace in self._namespaces.items()},
+                held=self._ledger.total,
+                shed=self._ledger.shed,
+                turned_away=self._lobby.turned_away + self._hub.lobby.turned_away,
             )
         )
 

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
     from rce_robot.outbox import Buffer, Outgoing
 
+LARGE_PART = 64 << 10
+"""Bytes of an incomplete message from which on the receiver is told of every part."""
+
 MAX_FRAGMENTS = 4096
 """Frames that one message may be split into."""
 
@@ -56,6 +59,9 @@ class Receiver(Protocol):
     def on_binary(self, data: bytes) -> None:
         """A binary message came."""
 
+    def on_part(self) -> None:
+        """A part of a large message came; :attr:`RobotSocket.held` grew."""
+
     def on_writable(self) -> None:
         """The connection takes messages again."""
 
@@ -68,6 +74,11 @@ class RobotSocket(GuardedConnection):
 
     receiver: Receiver | None = None
     """Gets what arrives. Set while the handshake is answered."""
+
+    @property
+    def held(self) -> int:
+        """Bytes of a message that is not complete, about."""
+        return self._part_bytes + self._fragment_bytes
 
     @property
     def writable(self) -> bool:
@@ -89,6 +100,8 @@ class RobotSocket(GuardedConnection):
     def fail(self, code: int, reason: str) -> None:
         """Close the connection because of what the robot sent."""
         self._failed = True
+        self._fragments.clear()
+        self._part_bytes = self._fragment_bytes = 0
         if self.protocol.state is State.OPEN:
             self.protocol.fail(code, reason)
             self.send_data()
@@ -102,7 +115,10 @@ class RobotSocket(GuardedConnection):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Prepare the socket for small and timely messages."""
         super().connection_made(transport)
+        self._part_bytes = 0
+        """Received since the last frame was complete."""
         self._fragments: list[bytes | bytearray] = []
+        self._fragment_bytes = 0
         self._opcode = Opcode.TEXT
         self._failed = False
         sock = transport.get_extra_info("socket")
@@ -111,8 +127,16 @@ class RobotSocket(GuardedConnection):
             with contextlib.suppress(OSError):
                 sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_LOW_WATER)
 
+    def data_received(self, data: bytes) -> None:
+        """Count what comes."""
+        self._part_bytes += len(data)
+        super().data_received(data)
+        if self._part_bytes > LARGE_PART and self.receiver is not None and not self._failed:
+            self.receiver.on_part()
+
     def process_event(self, event: Event) -> None:
         """Take complete data messages out of the base class's hands."""
+        self._part_bytes = 0
         if type(event) is not Frame or event.opcode > Opcode.BINARY:
             super().process_event(event)
         elif event.fin and event.opcode is not Opcode.CONT:
@@ -138,11 +162,13 @@ class RobotSocket(GuardedConnection):
         if frame.opcode is not Opcode.CONT:
             self._opcode = frame.opcode
         self._fragments.append(bytes(frame.data))
+        self._fragment_bytes += len(frame.data)
         if len(self._fragments) > MAX_FRAGMENTS:
             self.fail(CloseCode.MESSAGE_TOO_BIG, "too many fragments")
         elif frame.fin:
             data = b"".join(self._fragments)
             self._fragments.clear()
+            self._fragment_bytes = 0
             self._deliver(self._opcode, data)
 
     def _deliver(self, opcode: Opcode, data: Buffer) -> None:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from rce.control.model import ConnectionSpec
     from rce.link.interface import Buffer
     from rce.link.link import Link
+    from rce.link.queues import Backlog
     from rce.link.slot import InterfaceSlot
 
 log = logging.getLogger(__name__)
@@ -43,14 +44,24 @@ class Channel:
         established: Whether messages can be sent.
     """
 
-    def __init__(self, spec: ConnectionSpec, slot: InterfaceSlot, link: Link) -> None:
+    def __init__(self, spec: ConnectionSpec, slot: InterfaceSlot, link: Link, backlog: Backlog) -> None:
         self.spec = spec
         self.slot = slot
         self.established = False
         self.link = link
         self._limits = link.limits
         self._calls = PendingCalls(link.limits.max_calls)
+        self._backlog = backlog
         self._queue = self._new_queue()
+
+    @property
+    def waiting_bytes(self) -> int:
+        """Payload bytes that wait to be sent."""
+        return self._queue.waiting_bytes
+
+    def shed(self, size: int) -> None:
+        """Drop the oldest messages of a topic, until ``size`` bytes are free."""
+        self._queue.shed(size)
 
     @property
     def number(self) -> int:
@@ -102,6 +113,7 @@ class Channel:
             OverflowPolicy.REFUSE if service else OverflowPolicy.DROP_OLDEST,
             max_messages=limits.max_calls if service else limits.queue_messages,
             max_bytes=max(limits.queue_bytes, limits.max_message) if service else limits.queue_bytes,
+            backlog=self._backlog,
         )
 
     # Sending

@@ -10,6 +10,7 @@ from rce.link.channel import Channel
 from rce.link.dialer import keep_dialed
 from rce.link.link import Link, add_traffic
 from rce.link.pacing import Pacer
+from rce.link.queues import Backlog
 from rce.link.slot import InterfaceSlot
 from rce.link.tasks import TaskScope
 
@@ -35,6 +36,7 @@ class Endpoint:
         on_change: Called when :attr:`interfaces` or :attr:`connections` changed; once for changes that come
             together.
         on_fault: Called with a text for the user when an interface cannot do its work.
+        on_growth: Called when :attr:`waiting_bytes` grew.
     """
 
     def __init__(
@@ -45,6 +47,7 @@ class Endpoint:
         *,
         on_change: Callable[[], None],
         on_fault: Callable[[str], None],
+        on_growth: Callable[[], None] = lambda: None,
     ) -> None:
         self.id = id
         self._factory = factory
@@ -54,6 +57,7 @@ class Endpoint:
         self._slots: dict[str, InterfaceSlot] = {}
         self._links: dict[str, Link] = {}
         self._channels: dict[int, Channel] = {}
+        self._backlog = Backlog(on_growth)
         self._pacer: Pacer | None = None
         self._former_traffic = (0, 0)
         self._refused: set[InterfaceSpec | ConnectionSpec] = set()
@@ -85,6 +89,19 @@ class Endpoint:
         for link in self._links.values():
             total = add_traffic(total, link.traffic)
         return total
+
+    @property
+    def waiting_bytes(self) -> int:
+        """Payload bytes that wait to be sent to peers."""
+        return self._backlog.bytes
+
+    def shed(self, size: int) -> None:
+        """Drop the oldest messages of the topics where most waits, until ``size`` bytes are free."""
+        goal = self._backlog.bytes - size
+        for channel in sorted(self._channels.values(), key=lambda channel: -channel.waiting_bytes):
+            if self._backlog.bytes <= goal:
+                return
+            channel.shed(self._backlog.bytes - goal)
 
     async def apply(self, spec: EndpointSpec) -> None:
         """Make up the difference between ``spec`` and what is there.
@@ -259,7 +276,7 @@ class Endpoint:
             missing = f"interface {spec.interface}" if slot is None else f"link {spec.link}"
             self._refuse(spec, f"connection {spec.id}: there is no {missing}")
             return
-        channel = self._channels[spec.id] = Channel(spec, slot, link)
+        channel = self._channels[spec.id] = Channel(spec, slot, link, self._backlog)
         slot.add(channel)
         link.add(channel)
 

@@ -13,6 +13,8 @@ from rce.link.frames import FRAGMENT_SIZE
 from rce.link.settings import KIB
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rce.link.frames import Frame
 
 SMALL_MESSAGE = 4 * KIB
@@ -63,6 +65,21 @@ class Counters:
         )
 
 
+class Backlog:
+    """What waits on all channels of one endpoint.
+
+    Args:
+        on_growth: Called after something was added.
+
+    Attributes:
+        bytes: Of payload.
+    """
+
+    def __init__(self, on_growth: Callable[[], None] = lambda: None) -> None:
+        self.bytes = 0
+        self.on_growth = on_growth
+
+
 class Lane(Enum):
     """Where a channel's queue stands in line."""
 
@@ -84,7 +101,14 @@ class OutgoingQueue:
     """
 
     def __init__(
-        self, channel: int, counters: Counters, policy: OverflowPolicy, *, max_messages: int, max_bytes: int
+        self,
+        channel: int,
+        counters: Counters,
+        policy: OverflowPolicy,
+        *,
+        max_messages: int,
+        max_bytes: int,
+        backlog: Backlog | None = None,
     ) -> None:
         self.channel = channel
         self.counters = counters
@@ -95,6 +119,7 @@ class OutgoingQueue:
         self._max_bytes = max_bytes
         self._frames: deque[Frame] = deque()
         self._bytes = 0
+        self._backlog = backlog or Backlog()
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -126,7 +151,8 @@ class OutgoingQueue:
                 raise Overloaded(f"{len(self._frames)} messages wait to be sent")
             self._drop_oldest()
         self._frames.append(frame)
-        self._bytes += size
+        self._count(size)
+        self._backlog.on_growth()
 
     def take(self, limit: int = FRAGMENT_SIZE) -> tuple[Frame, int, int]:
         """Take the next part of the oldest message.
@@ -152,9 +178,19 @@ class OutgoingQueue:
         for index, frame in enumerate(self._frames):
             if frame.id == call_id and not (index == 0 and self.sent):
                 del self._frames[index]
-                self._bytes -= len(frame.payload)
+                self._count(-len(frame.payload))
                 return True
         return False
+
+    def shed(self, size: int) -> None:
+        """Drop the oldest messages of a topic that have not begun, until ``size`` bytes are free."""
+        goal = self._bytes - size
+        while (
+            self._policy is OverflowPolicy.DROP_OLDEST
+            and len(self._frames) > (1 if self.sent else 0)
+            and self._bytes > goal
+        ):
+            self._drop_oldest()
 
     def clear(self) -> int:
         """Throw everything away.
@@ -165,7 +201,8 @@ class OutgoingQueue:
         begun = len(self._frames[0].payload) if self.sent else 0
         self.counters.dropped += len(self._frames)
         self._frames.clear()
-        self._bytes = self.sent = 0
+        self._count(-self._bytes)
+        self.sent = 0
         return begun
 
     def _is_full(self, size: int) -> bool:
@@ -177,10 +214,14 @@ class OutgoingQueue:
 
     def _drop_oldest(self) -> None:
         index = 1 if self.sent else 0
-        self._bytes -= len(self._frames[index].payload)
+        self._count(-len(self._frames[index].payload))
         del self._frames[index]
         self.counters.dropped += 1
 
     def _remove_head(self) -> None:
-        self._bytes -= len(self._frames.popleft().payload)
+        self._count(-len(self._frames.popleft().payload))
         self.sent = 0
+
+    def _count(self, change: int) -> None:
+        self._bytes += change
+        self._backlog.bytes += change

@@ -176,6 +176,16 @@ class Assembler:
             dropped.append(f"{_describe(oldest)} within {self._limits.expiry:g} s; dropped")
         return dropped
 
+    def drop_oldest(self, size: int) -> list[str]:
+        """Drop what is incomplete, oldest first, until ``size`` bytes are free; return a text for each."""
+        goal = self.pending_bytes - size
+        dropped = []
+        while self._entries and self.pending_bytes > goal:
+            oldest = next(iter(self._entries.values()))
+            self._forget(oldest)
+            dropped.append(f"{_describe(oldest)} and memory is short; dropped")
+        return dropped
+
     def _claim_places(self, value: Any) -> dict[str, tuple[Any, Any]]:
         """Replace the starred keys by empty places; check everything before anything is changed."""
         references = list(_references(value))

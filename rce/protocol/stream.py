@@ -158,6 +158,10 @@ class ProtocolStream:
         """Drop what has been incomplete for too long."""
         return [Fault(reason) for reason in self._assembler.expire(now)]
 
+    def drop_oldest(self, size: int) -> list[Event]:
+        """Drop what is incomplete, oldest first, until ``size`` bytes are free."""
+        return [Fault(reason) for reason in self._assembler.drop_oldest(size)]
+
     def _events(self, value: Any, dropped: list[str]) -> list[Event]:
         """Make the events of a complete message, if there is one, and of what had to be dropped for it."""
         events: list[Event] = [Fault(reason) for reason in dropped] if dropped else []

@@ -76,12 +76,13 @@ class Signal:
 
 
 class FakeMaster:
-    """Lets user testUser in; one spec per robot, which the test changes."""
+    """Lets its users in, testUser if nobody else is named; one spec per robot, which the test changes."""
 
     def __init__(self) -> None:
         self.changed = Signal()
         self.specs: dict[str, EndpointSpec] = {}
         self.statuses: dict[str, EndpointStatus] = {}
+        self.users = {"testUser"}
         self.inside: set[str] = set()
         self.left: list[str] = []
         self.gone: list[str] = []
@@ -132,7 +133,7 @@ class FakeMaster:
 
     def _login(self, message: Login) -> LoginReply:
         id_ = f"{message.user}/{message.robot}"
-        if message.user != "testUser" or message.password != DIGEST:
+        if message.user not in self.users or message.password != DIGEST:
             return LoginReply(request=message.request, status=401, reason="Wrong user or password.")
         if id_ in self.inside:
             return LoginReply(request=message.request, status=409, reason=f"{id_} is already connected.")

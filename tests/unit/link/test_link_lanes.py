@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import defaultdict
 
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from rce.link.exceptions import Overloaded, ProtocolError
 from rce.link.frames import FRAGMENT_SIZE, Frame, FrameReader, FrameType
 from rce.link.lanes import MAX_CONTROL_FRAMES, URGENT_BURST, Lanes
-from rce.link.queues import SMALL_MESSAGE, Counters, OutgoingQueue, OverflowPolicy
+from rce.link.queues import SMALL_MESSAGE, Backlog, Counters, OutgoingQueue, OverflowPolicy
 from rce.link.settings import LinkLimits
 
 LIMITS = LinkLimits()
@@ -44,6 +45,52 @@ def drain(lanes: Lanes) -> list[tuple[FrameType, int, int]]:
 
 
 # Queues
+
+
+@given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5000)), max_size=60))
+def test_backlog_is_the_sum_of_what_waits(steps: list[tuple[int, int]]) -> None:
+    grown: list[int] = []
+    backlog = Backlog()
+    backlog.on_growth = lambda: grown.append(backlog.bytes)
+    queues = [
+        OutgoingQueue(
+            n,
+            Counters(),
+            OverflowPolicy.DROP_OLDEST if n else OverflowPolicy.REFUSE,
+            max_messages=5,
+            max_bytes=9000,
+            backlog=backlog,
+        )
+        for n in range(2)
+    ]
+    for what, size in steps:
+        queue = queues[size % 2]
+        if what < 3:
+            with contextlib.suppress(Overloaded):
+                queue.push(data(1, size))
+                assert grown.pop() == backlog.bytes
+        elif what == 3 and len(queue):
+            queue.take(1000)
+        elif what == 4:
+            before = backlog.bytes
+            queue.shed(size)
+            assert queue is queues[1] or backlog.bytes == before, "what a service waits for is not dropped"
+        elif what == 5:
+            queue.clear()
+        assert backlog.bytes == sum(queue.waiting_bytes for queue in queues)
+
+
+def test_shedding_leaves_what_has_begun() -> None:
+    queue = topic()
+    for n in range(4):
+        queue.push(data(1, 1000, n))
+    queue.take(10)
+    queue.shed(1500)
+    assert len(queue) == 2
+    assert queue.counters.dropped == 2
+    queue.shed(10_000)
+    assert len(queue) == 1
+    assert queue.sent == 10
 
 
 def test_oldest_are_dropped_and_counted() -> None:

@@ -1,0 +1,130 @@
+"""Users that flood the engine lose their own, in the end their connection; others notice nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from contextlib import AsyncExitStack, asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from support.cloud import DIGEST, Cloud, running_cloud
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed
+
+from rce_robot.settings import SessionSettings
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+MIB = 1 << 20
+STRING = "std_msgs/String"
+PATIENT = SessionSettings(ping_interval=None, drain_timeout=1.0)
+
+
+def dial(cloud: Cloud, user: str, robot: str) -> connect:
+    query = f"userID={user}&robotID={robot}&password={DIGEST}"
+    return connect(f"{cloud.ws_url}?{query}", proxy=None, compression=None)
+
+
+@asynccontextmanager
+async def small_cloud(**settings: Any) -> AsyncIterator[tuple[Cloud, ClientConnection, AsyncExitStack]]:
+    """A cloud with little memory, and the robot of a user who does nothing wrong."""
+    async with running_cloud(PATIENT, **settings) as cloud, AsyncExitStack() as stack:
+        cloud.master.users.add("flood")
+        good = await stack.enter_async_context(dial(cloud, "testUser", "good"))
+        yield cloud, good, stack
+
+
+async def still_served(good: ClientConnection) -> None:
+    async with asyncio.timeout(5):
+        await (await good.ping())
+    assert good.close_code is None
+
+
+async def close_of(socket: ClientConnection) -> tuple[int, str]:
+    """Read on until a connection ends; return how."""
+    with pytest.raises(ConnectionClosed) as ended:  # noqa: PT012 - whatever comes before
+        async with asyncio.timeout(10):
+            while True:
+                await socket.recv()
+    assert ended.value.rcvd is not None
+    return ended.value.rcvd.code, ended.value.rcvd.reason
+
+
+async def test_unclaimed_values_are_dropped_oldest_first(robot_of: Any) -> None:
+    async with small_cloud(user_memory=4 * MIB) as (cloud, good, stack):
+        sockets = [await stack.enter_async_context(dial(cloud, "flood", f"f{n}")) for n in range(3)]
+        for number in range(4):
+            for socket in sockets:
+                await socket.send(b"%032x" % number + bytes(MIB))
+        texts = [await robot_of(socket).get("ER") for socket in sockets[:2]]
+        assert all("memory is short" in text for text in texts)
+        await still_served(good)
+        await cloud.master.changed.until(lambda: cloud.master.usage and cloud.master.usage.shed)
+        assert cloud.master.usage is not None
+        assert cloud.master.usage.held <= 5 * MIB
+
+
+async def test_endless_messages_end_the_connection(robot_of: Any) -> None:
+    async with small_cloud(user_memory=4 * MIB) as (cloud, good, stack):
+        sockets = [await stack.enter_async_context(dial(cloud, "flood", f"f{n}")) for n in range(2)]
+
+        async def chunks() -> AsyncIterator[bytes]:
+            while True:
+                yield bytes(MIB // 2)
+
+        async def flood(socket: ClientConnection) -> tuple[int, str]:
+            sending = asyncio.create_task(socket.send(chunks()))
+            try:
+                return await close_of(socket)
+            finally:
+                sending.cancel()
+                await asyncio.wait([sending])
+
+        code, reason = await flood(sockets[0])
+        assert (code, reason) == (
+            1013,
+            "the robots of user flood hold more memory of the engine than they may",
+        )
+        await still_served(good)
+        await still_served(sockets[1])
+        again = await stack.enter_async_context(dial(cloud, "flood", "f0"))
+        await still_served(again)
+
+
+async def test_robots_that_do_not_read_lose_their_own_messages(robot_of: Any) -> None:
+    async with small_cloud(user_memory=6 * MIB) as (cloud, good, stack):
+        stalled = [await stack.enter_async_context(dial(cloud, "testUser", f"s{n}")) for n in range(3)]
+        ends = [await cloud.joined("image", "PublisherForwarder", STRING, robot=f"s{n}") for n in range(3)]
+        for socket in stalled:
+            socket.transport.pause_reading()
+        for _ in range(16):
+            for end in ends:
+                end.port.send(bytes(MIB))
+            await still_served(good)
+
+        def dropped() -> int:
+            usage = cloud.master.usage
+            found = usage.endpoints if usage else {}
+            return sum(e.interfaces["image"].dropped for e in found.values() if "image" in e.interfaces)
+
+        await cloud.master.changed.until(lambda: dropped() >= 20)
+        assert cloud.master.usage is not None
+        assert cloud.master.usage.held <= 6 * MIB
+        for socket in stalled:
+            socket.transport.resume_reading()
+            assert await robot_of(socket).get("DM")
+
+
+async def test_all_users_together_have_a_bound_too(robot_of: Any) -> None:
+    async with small_cloud(memory=4 * MIB) as (cloud, good, stack):
+        flood = await stack.enter_async_context(dial(cloud, "flood", "f"))
+        await good.send(b"%032x" % 1 + bytes(MIB))
+        for number in range(8):
+            await flood.send(b"%032x" % number + bytes(MIB))
+        assert "memory is short" in (await robot_of(flood).get("ER"))
+        await still_served(good)
+        data = {"iTag": "none", "type": STRING, "msgID": "m", "msg*": f"{1:032x}"}
+        await good.send(json.dumps({"type": "DM", "data": data}))
+        assert "none" in (await robot_of(good).get("ER")), "what the other user sent first is still there"
