@@ -4,7 +4,7 @@ A package is a folder with a ``package.yaml`` (ours) or a ``package.xml`` (ROS's
 or ``srv`` folders only, as distributions install them. Its executables are files in the folder itself or in
 ``nodes``, ``scripts``, ``bin`` or ``lib`` below it; those of a package that is installed as
 ``PREFIX/share/PKG`` are also in ``PREFIX/lib/PKG``. An installed Python distribution adds nodes by entry
-points of the group ``rce.nodes``, named ``PKG:EXE``.
+points of the group ``rce.nodes``, named ``PKG:EXE``; a file of the same name goes before.
 
 ``package.yaml`` holds::
 
@@ -68,8 +68,6 @@ class Package(NamedTuple):
     """``engine``: .py files run with the engine's Python; ``system``: as their first line says."""
     version: str = ""
     """As the manifest says it; empty if it does not."""
-    scripts: tuple[tuple[str, str], ...] = ()
-    """Executables that are Python functions: name and ``module:function``."""
 
     def executable(self, exe: str) -> list[str]:
         """Return what to execute to start a node: the first words of its command line.
@@ -81,15 +79,15 @@ class Package(NamedTuple):
             ExecutableNotFound: There is no such file, it may not be executed, or the name leads out of the
             package.
         """
-        for name, target in self.scripts:
-            if name == exe:
-                return [sys.executable, "-c", _call_of(target)]
         if not exe or exe.startswith("/") or "\0" in exe or ".." in PurePosixPath(exe).parts:
             raise ExecutableNotFound(f"{exe!r} is not a file inside package {self.name}")
         candidates = [folder / exe for folder in self._folders()]
         for file in candidates:
             if file.is_file():
                 return self._command(file)
+        for name, target in _scripts(self.name):  # last, because all that is installed must be looked through
+            if name == exe:
+                return [sys.executable, "-c", _call_of(target)]
         where = ", ".join(str(folder) for folder in self._folders() if folder.is_dir())
         raise ExecutableNotFound(
             f"package {self.name} has no executable {exe!r} (looked in {where or self.path})"
@@ -137,10 +135,10 @@ class PackageIndex:
         """
         folder = self.locate(name)
         if folder is not None:
-            return _read_package(folder, name)._replace(scripts=_scripts(name))
+            return _read_package(folder, name)
         scripts = _scripts(name)
         if scripts:
-            return Package(name, _folder_of(scripts[0][1]), python="engine", scripts=scripts)
+            return Package(name, _folder_of(scripts[0][1]), python="engine")
         raise PackageNotFound(f"no package {name!r} on the package path ({self.describe_path()})")
 
     def locate(self, name: str) -> Path | None:
@@ -279,6 +277,7 @@ def _parse_xml(manifest: Path, text: bytes, name: str) -> Package:
 
 
 def _scripts(package: str) -> tuple[tuple[str, str], ...]:
+    """Read the executables of a package that are Python functions: name and ``module:function``."""
     from importlib.metadata import entry_points
 
     points = ((*point.name.partition(":"), point.value) for point in entry_points(group=ENTRY_POINTS))

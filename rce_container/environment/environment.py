@@ -30,6 +30,7 @@ from rce.ros.xmlrpc import RpcClient
 from rce_container.environment import messages as m
 from rce_container.environment.causes import Causes
 from rce_container.environment.channel import Channel, accept
+from rce_container.environment.cradle import Cradle
 from rce_container.environment.exceptions import ChannelError
 from rce_container.environment.heartbeats import Heartbeats
 from rce_container.environment.interfaces import InterfaceMaker, Readiness
@@ -58,12 +59,16 @@ class Environment:
         boot: What the manager says of the container.
         control: A listening unix socket; managers connect to it.
         links: A listening unix socket; peers' links come in on it.
+        cradle: Starts nodes that are Python scripts; None for none.
     """
 
-    def __init__(self, boot: m.Boot, control: socket.socket, links: socket.socket) -> None:
+    def __init__(
+        self, boot: m.Boot, control: socket.socket, links: socket.socket, cradle: Cradle | None = None
+    ) -> None:
         self._boot = boot
         self._control = control
         self._links = links
+        self._cradle = cradle
         self._loop = asyncio.get_running_loop()
         self._ending = asyncio.Event()
         self._desired = EndpointSpec(id=boot.id, kind=EndpointKind.CONTAINER, revision=-1)
@@ -84,7 +89,7 @@ class Environment:
     async def run(self) -> None:
         """Live; returns when every process, socket and task of the container has ended."""
         async with contextlib.AsyncExitStack() as stack:
-            reaper = stack.enter_context(Reaper())
+            reaper = stack.enter_context(Reaper(self._cradle))
             self._core = await stack.enter_async_context(self._make_core())
             types = TypeRegistry(self._packages)
             node = await stack.enter_async_context(

@@ -9,21 +9,21 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
+from rce_container.environment.cradle import Cradle
 from rce_container.environment.process import OF_NODES, die_before_others
 
 
 class Child:
     """A process that was started here, in a session of its own."""
 
-    def __init__(self, process: subprocess.Popen[bytes], ended: asyncio.Future[int]) -> None:
-        self._process = process
+    def __init__(
+        self, pid: int, ended: asyncio.Future[int], process: subprocess.Popen[bytes] | None = None
+    ) -> None:
+        self.pid = pid
+        """The process id, which is also its group's and its session's."""
         self.ended = ended
         """Its exit code; negative for a signal."""
-
-    @property
-    def pid(self) -> int:
-        """The process id, which is also its group's and its session's."""
-        return self._process.pid
+        self._process = process
 
     def signal_group(self, number: signal.Signals) -> None:
         """Send a signal to all processes of its group."""
@@ -34,7 +34,8 @@ class Child:
 
     def finish(self, code: int) -> None:
         """Note the exit code that the reaper read."""
-        self._process.returncode = code
+        if self._process is not None:
+            self._process.returncode = code
         if not self.ended.done():
             self.ended.set_result(code)
 
@@ -44,9 +45,13 @@ class Reaper:
 
     Use as a context manager in the main thread, one per process, and start processes by :meth:`spawn` only:
     it collects exit codes that nobody else will see then.
+
+    Args:
+        cradle: Starts the processes that it can; None for none.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, cradle: Cradle | None = None) -> None:
+        self._cradle = cradle
         self._children: dict[int, Child] = {}
         self._before: Any = None
 
@@ -68,6 +73,11 @@ class Reaper:
         Raises:
             OSError: It cannot be started.
         """
+        ended: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+        if self._cradle is not None:
+            pid = self._cradle.spawn(argv, env=env, cwd=cwd, stdout=stdout, stderr=stderr)
+            if pid:
+                return self._keep(Child(pid, ended))
         process = subprocess.Popen(  # noqa: S603 - what a user's package offers is what runs here
             argv,
             env=env,
@@ -78,7 +88,9 @@ class Reaper:
             start_new_session=True,
         )
         die_before_others(OF_NODES, process.pid)
-        child = Child(process, asyncio.get_running_loop().create_future())
+        return self._keep(Child(process.pid, ended, process))
+
+    def _keep(self, child: Child) -> Child:
         self._children[child.pid] = child
         return child
 

@@ -8,6 +8,7 @@ import signal
 import socket
 from pathlib import Path
 
+from rce_container.environment.cradle import Cradle
 from rce_container.environment.environment import Environment
 from rce_container.environment.logs import ENVIRONMENT_LOG, LogWriter
 from rce_container.environment.messages import Boot
@@ -27,13 +28,16 @@ class _Handler(logging.Handler):
         self._writer.write(self.format(record).encode(errors="replace") + b"\n")
 
 
-def run_environment(boot: Boot, control: socket.socket, links: socket.socket) -> None:
+def run_environment(
+    boot: Boot, control: socket.socket, links: socket.socket, cradle: Cradle | None = None
+) -> None:
     """Live as a container's environment; returns when the container has ended properly.
 
     Args:
         boot: What the manager says of the container.
         control: A listening unix socket for managers.
         links: A listening unix socket for peers' links.
+        cradle: See :class:`Environment`.
     """
     limit_oneself(boot.rlimits)
     writer = LogWriter(Path(boot.logs), ENVIRONMENT_LOG, mirror=(1, 2))
@@ -41,14 +45,14 @@ def run_environment(boot: Boot, control: socket.socket, links: socket.socket) ->
     try:
         import uvloop
     except ImportError:
-        asyncio.run(_live(boot, control, links))
+        asyncio.run(_live(boot, control, links, cradle))
     else:
-        uvloop.run(_live(boot, control, links))
+        uvloop.run(_live(boot, control, links, cradle))
 
 
-async def _live(boot: Boot, control: socket.socket, links: socket.socket) -> None:
+async def _live(boot: Boot, control: socket.socket, links: socket.socket, cradle: Cradle | None) -> None:
     loop = asyncio.get_running_loop()
-    environment = Environment(boot, control, links)
+    environment = Environment(boot, control, links, cradle)
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, environment.end, number.name)
     await environment.run()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import importlib
 import itertools
 import os
 import signal
@@ -18,11 +19,13 @@ from collections.abc import Sequence
 
 import msgspec
 
+from rce_container.environment.cradle import Cradle
 from rce_container.environment.messages import Boot
 from rce_container.environment.process import OF_ENVIRONMENT, die_before_others
 from rce_container.environment.running import run_environment
 from rce_container.nursery import kernel
 from rce_container.nursery.confine import confine
+from rce_container.nursery.cradle import rock
 from rce_container.nursery.messages import (
     FAREWELL,
     MAX_PACKET,
@@ -33,10 +36,11 @@ from rce_container.nursery.messages import (
     encode,
 )
 from rce_container.nursery.mounts import HOME
-from rce_container.nursery.title import set_title
+from rce_container.nursery.title import set_title, show_variables
 
-with contextlib.suppress(ImportError):
-    import uvloop  # noqa: F401 - for the children
+for _module in ("encodings.idna", "importlib.metadata", "uvloop", "yaml", "xml.etree.ElementTree"):
+    with contextlib.suppress(ImportError):  # what environments and nodes would import when they need it
+        importlib.import_module(_module)
 
 _GIFTS = len(Gifts._fields)
 
@@ -80,11 +84,34 @@ def _live(birth: Birth, gifts: Gifts, program: bytes) -> None:
     except Exception as error:  # noqa: BLE001 - whatever it is, the manager is told
         answer.send(encode(Answer(error=f"{type(error).__name__}: {error}")))
         os._exit(1)
+    cradle = _fork_cradle(answer)
+    if cradle is None:
+        return
     answer.send(encode(Answer()))
     answer.close()
-    run_environment(boot, socket.socket(fileno=gifts.control), socket.socket(fileno=gifts.links))
+    control, links = socket.socket(fileno=gifts.control), socket.socket(fileno=gifts.links)
+    run_environment(boot, control, links, Cradle(cradle))
     with contextlib.suppress(OSError):
         os.write(gifts.tether, FAREWELL)
+
+
+def _fork_cradle(answer: socket.socket) -> socket.socket | None:
+    """Fork the cradle, while nothing is known that nodes must not know.
+
+    Returns:
+        In the environment its end of a socket that leads to the cradle; None in the cradle, and in each node
+        that it forked, when they are to end.
+    """
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    if os.fork():
+        theirs.close()
+        return ours
+    ours.close()
+    answer.detach()  # closed with all others, and its number may be taken by a node later
+    _close_all_but({0, 1, 2, theirs.fileno()})
+    set_title((sys.executable, "-m", "rce_container.nursery.cradle"), "rce-cradle")
+    rock(theirs)
+    return None
 
 
 def _settle(birth: Birth, gifts: Gifts, logs: int) -> Boot:
@@ -98,6 +125,7 @@ def _settle(birth: Birth, gifts: Gifts, logs: int) -> Boot:
         os.set_inheritable(fd, False)
     os.environ.clear()
     os.environ.update(birth.environ)
+    show_variables(birth.environ)
     os.chdir(HOME)
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     return msgspec.structs.replace(birth.boot, home=HOME, logs=f"/proc/self/fd/{logs}")

@@ -15,7 +15,7 @@ import msgspec
 
 from rce_container.exceptions import StartError
 from rce_container.nursery.messages import MAX_PACKET, Answer, Birth, Gifts, decode_answer, encode
-from rce_container.nursery.title import padding
+from rce_container.nursery.title import ROOM_VARIABLE, padding
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +34,7 @@ class Nursery:
 
     def __init__(self, program: bytes, environ: Mapping[str, str]) -> None:
         self._program = program
-        self._environ = dict(environ)
+        self._environ = {**environ, ROOM_VARIABLE: padding()}
         self._process: subprocess.Popen[bytes] | None = None
         self._orders: socket.socket | None = None
 
@@ -66,7 +66,9 @@ class Nursery:
             if answer.error:
                 raise StartError(f"its environment cannot be confined: {answer.error}")
             return pid
-        raise StartError("its environment dies whenever it is made; is there enough memory?")
+        raise StartError(
+            "its environment, or the nursery that makes it, dies each time; see this program's log for why"
+        )
 
     def start(self) -> None:
         """Start the process if it is not there, to be ready for the first order. Does not wait for it.

@@ -1,22 +1,24 @@
-"""What a forked process is called in lists of processes."""
+"""What a forked process shows of itself in ``/proc``: its command line, its variables, its name."""
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from rce_container.nursery import kernel
 
-ROOM = 512
-"""Bytes that a program must leave in its arguments for titles of its children."""
+ROOM = 4096
+"""Bytes that a program leaves in its arguments, and in its variables, for its children's."""
+ROOM_VARIABLE = "RCE_ROOM"
 
-_ARGUMENTS_START, _ARGUMENTS_END = 45, 46
-"""Fields of ``/proc/PID/stat`` after the program's name."""
+_ARGUMENTS = (45, 46)
+"""Fields of ``/proc/PID/stat`` after the program's name: where the memory begins and ends."""
+_VARIABLES = (47, 48)
 
 
 def padding() -> str:
-    """An argument that does nothing but leave room for titles."""
+    """An argument, or a variable's value, that does nothing but leave room."""
     return "-" * ROOM
 
 
@@ -27,10 +29,22 @@ def set_title(words: Sequence[str], name: str) -> None:
         words: The command line to show.
         name: The program's name; 15 bytes of it are shown.
     """
+    _show(_ARGUMENTS, words)
+    kernel.set_name(name)
+
+
+def show_variables(environ: Mapping[str, str]) -> None:
+    """Show other variables as those that this process was started with, as far as there is room.
+
+    Those that it was started with must not be in use any more.
+    """
+    _show(_VARIABLES, (f"{name}={value}" for name, value in environ.items()))
+
+
+def _show(place: tuple[int, int], words: Iterable[str]) -> None:
     stat = Path("/proc/self/stat").read_bytes()
     fields = stat[stat.rindex(b")") + 2 :].split()
-    start, end = int(fields[_ARGUMENTS_START]), int(fields[_ARGUMENTS_END])
+    start, end = (int(fields[number]) for number in place)
     text = b"".join(word.encode(errors="replace") + b"\0" for word in words)
     # The last byte stays zero: else the kernel takes what follows for a part of it.
     ctypes.memmove(start, text[: end - start - 1].ljust(end - start, b"\0"), end - start)
-    kernel.set_name(name)

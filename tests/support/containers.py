@@ -14,6 +14,8 @@ import msgspec
 import pytest
 
 from rce.config.resources import examples_dir
+from rce.control.contents import Piece
+from rce.control.exceptions import ContentError
 from rce.control.messages import (
     Drop,
     Fault,
@@ -39,6 +41,8 @@ from rce.control.model import (
 from rce.link import Buffer, Endpoint, Interface, LinkHub, Port
 from rce.link.handover import Doorman
 from rce.protocol.names import EndpointId
+from rce_container.bundles.cache import BundleCache
+from rce_container.bundles.supply import Library
 from rce_container.environment import proc
 from rce_container.folder import Record, StateFolder
 from rce_container.limits import choose_limiter
@@ -132,12 +136,22 @@ class Machine:
         (self.packages / "own" / "package.yaml").write_text("name: own\n")
         for name, text in NODES.items():
             (nodes / name).write_text(text)
+        self.library = Library(cache=BundleCache(folder / "bundles", self._fetch, space=1 << 30))
+        self.library.open()
+        self.contents: dict[str, bytes] = {}
+        """What its master hands out, by hash."""
         self.told: list[ToMaster] = []
         self.manager: Manager
         self.marks: set[str] = set()
         self.pids: dict[int, int] = {}
         self.cgroups = folder / "none"
         """The file that says where the cgroups of this machine's containers are."""
+
+    async def _fetch(self, sha256: str, offset: int) -> Piece:
+        if sha256 not in self.contents:
+            raise ContentError("the master does not have it", missing=True)
+        found = self.contents[sha256]
+        return Piece(found[offset : offset + 1000], len(found))
 
     @contextlib.asynccontextmanager
     async def managed(self, **options: Any) -> AsyncIterator[Manager]:
@@ -164,6 +178,7 @@ class Machine:
                 doorman=doorman,
                 links=("127.0.0.1", port),
                 limiter=limiter,
+                library=self.library,
             )
             self.manager.send = self._tell
             ready, self.quit = asyncio.Event(), asyncio.Event()

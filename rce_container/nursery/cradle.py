@@ -1,0 +1,78 @@
+"""The cradle: a child of the environment, confined like it, that forks nodes which are Python scripts.
+
+It was forked before the environment knew anything, holds nothing but its socket, and has all imported that
+nodes of the engine need: such a node starts without an interpreter's start and without imports.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sys
+
+import msgspec
+from msgspec import Struct
+
+from rce_container.nursery import kernel
+from rce_container.nursery.script import open_streams, run_script
+from rce_container.nursery.title import set_title, show_variables
+
+MAX_PACKET = 1 << 18
+"""Bytes."""
+STREAMS = 2
+"""Descriptors that come with a script: its standard output and error."""
+
+
+class Script(Struct, frozen=True, kw_only=True):
+    """A node that is to be started. Answered by its pid."""
+
+    path: str
+    arguments: tuple[str, ...]
+    environ: dict[str, str]
+    folder: str
+
+
+encode_script = msgspec.json.Encoder().encode
+decode_script = msgspec.json.Decoder(Script).decode
+
+
+def rock(orders: socket.socket) -> None:
+    """Fork a node for each order. Returns in each node when it ends, else when the environment is gone."""
+    while True:
+        packet, fds, _, _ = socket.recv_fds(orders, MAX_PACKET, STREAMS)
+        if not packet:
+            return
+        between = os.fork()
+        if between == 0:
+            _leave_to_environment(orders)
+            orders.close()
+            _be(decode_script(packet), fds)
+            return
+        for fd in fds:
+            os.close(fd)
+        os.waitpid(between, 0)
+
+
+def _leave_to_environment(orders: socket.socket) -> None:
+    """Go on as a child whose parent ends at once: the environment takes in orphans."""
+    child = os.fork()
+    if child:
+        orders.send(b"%d" % child)
+        os._exit(0)
+
+
+def _be(script: Script, fds: list[int]) -> None:
+    os.setsid()
+    for number, fd in enumerate(fds, 1):
+        os.dup2(fd, number)
+        os.close(fd)
+    os.environ.clear()
+    os.environ.update(script.environ)
+    show_variables(script.environ)
+    set_title((sys.executable, script.path, *script.arguments), os.path.basename(sys.executable))  # noqa: PTH119
+    kernel.set_dumpable(True)
+    os.chdir(script.folder)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    open_streams(unbuffered=bool(script.environ.get("PYTHONUNBUFFERED")))
+    run_script(script.path, script.arguments)
