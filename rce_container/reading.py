@@ -40,23 +40,23 @@ def read_for(archive: LogArchive, message: ReadLog, living: str) -> LogChunk:
 def _find(archive: LogArchive, message: ReadLog, living: str) -> Kept:
     current = archive.find(living) if living else None
     tag = EndpointId.parse(message.id).tag
-    if message.life:
-        ended = [kept for kept in archive.ended(message.id) if kept.life.mark == message.life]
-        found = current if current and living == message.life else next(iter(ended), None)
+    if message.wish.life:
+        ended = [kept for kept in archive.ended(message.id) if kept.life.mark == message.wish.life]
+        found = current if current and living == message.wish.life else next(iter(ended), None)
         missing = f"the logs of that life of container {tag} are not kept any more"
-    elif current is not None and not message.previous:
+    elif current is not None and not message.wish.previous:
         return current
     else:
         found = next((kept for kept in archive.ended(message.id) if kept.life.mark != living), None)
         missing = f"no logs of an earlier life of container {tag} are kept here"
-    if found is None or 0 < found.life.ended < message.since:
+    if found is None or 0 < found.life.ended < message.wish.since:
         raise FileNotFoundError(missing)
     return found
 
 
 def _read(kept: Kept, message: ReadLog) -> Chunk:
     if message.node:
-        letters = letters_of(message.streams, message.level)
+        letters = letters_of(message.wish.streams, message.wish.level)
         return read_node_log(kept.folder, message.node, message.offset, message.limit, letters)
-    name = ROSOUT_LOG if LogStream.ROSOUT in message.streams else ENVIRONMENT_LOG
+    name = ROSOUT_LOG if LogStream.ROSOUT in message.wish.streams else ENVIRONMENT_LOG
     return read_log(kept.folder, name, message.offset, message.limit)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Protocol
 
-from rce.control.exceptions import ControlError, PeerRefusedError
+from rce.control.exceptions import PeerRefusedError
+from rce.control.logs import LogWish
 from rce.control.messages import (
     Drop,
     Fault,
@@ -21,7 +22,8 @@ from rce.control.messages import (
     ToTaskSet,
     Usage,
 )
-from rce_master.exceptions import NotFound, Refused, TaskSetAway
+from rce_master.exceptions import Refused
+from rce_master.logs import LogReader, LogRequest, read_log
 from rce_master.state import commands
 from rce_master.state.lifecycle import RobotSession
 
@@ -32,7 +34,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-class Peer(Protocol):
+class Peer(LogReader, Protocol):
     """A connected task set; in a running master an :class:`rce.control.peer.Peer`."""
 
     @property
@@ -41,9 +43,6 @@ class Peer(Protocol):
 
     def send(self, message: ToTaskSet) -> None:
         """Send a message; one that does not get through is made up for by the next ``Sync``."""
-
-    async def read_log(self, id: str, node: str, offset: int = 0, limit: int = 65536) -> LogChunk:  # noqa: A002
-        """Read a node's log."""
 
 
 class Reconciler:
@@ -107,28 +106,22 @@ class Reconciler:
             self.usage.pop(peer.process, None)
             await self._realm.submit(commands.TaskSetLeft(process=peer.process))
 
-    async def read_log(self, id_: str, node: str, offset: int, limit: int) -> LogChunk:
-        """Read the log of a container's node where it is.
+    async def read_log(
+        self,
+        id_: str,
+        node: str,
+        offset: int,
+        limit: int,
+        wish: LogWish = LogWish(),  # noqa: B008 - it is frozen
+    ) -> LogChunk:
+        """Read the log of a container's node where it is (:func:`rce_master.logs.read_log`).
 
         Raises:
-            NotFound: There is no such container or node.
+            NotFound: There is no such container, node or log.
             TaskSetAway: Its task set is not connected or does not answer.
         """
-        container = self._realm.tables.container(id_)
-        if container is None:
-            raise NotFound(f"there is no container {id_.partition('/')[2]!r}")
-        if node and node not in container.nodes:
-            raise NotFound(f"container {container.tag!r} has no node {node!r}")
-        peer = self._peers.get(container.task_set)
-        if peer is None:
-            raise TaskSetAway(f"container {container.tag!r} cannot be reached now")
-        try:
-            chunk = await peer.read_log(id_, node, offset=offset, limit=limit)
-        except ControlError as error:
-            raise TaskSetAway(f"container {container.tag!r} cannot be reached: {error}") from error
-        if chunk.error:
-            raise NotFound(chunk.error)
-        return chunk
+        request = LogRequest(id_, node, offset, limit, wish)
+        return await read_log(self._realm.tables, self._peers, request)
 
     # To the task sets
 

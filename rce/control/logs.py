@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from enum import Enum
 
+from msgspec import Struct
+
 
 class LogStream(Enum):
     """Where a line of a node's log comes from."""
@@ -24,3 +26,18 @@ class LogLevel(Enum):
     WARN = "warn"
     ERROR = "error"
     FATAL = "fatal"
+
+
+class LogWish(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What of the logs of a container's node is to be read."""
+
+    streams: tuple[LogStream, ...] = ()
+    """Only these; all if empty. The environment's log knows ``rosout`` only, which is another log there."""
+    level: LogLevel = LogLevel.DEBUG
+    """Of log records in ROS only those that are at least as serious."""
+    life: str = ""
+    """Of which life of the container, as an answer said; empty: of the one it lives, or else the last."""
+    previous: bool = False
+    """Of the last life that ended, though the container may live another one; goes without ``life``."""
+    since: float = 0.0
+    """Not of lives that ended before this time (seconds since the epoch): they were another user's."""

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
-from rce.control.logs import LogLevel, LogStream
+from rce.control.logs import LogWish
 from rce.control.model import (
     EndpointSpec,
     EndpointStatus,
@@ -108,6 +108,12 @@ class Usage(_Message, frozen=True, kw_only=True, omit_defaults=True):
     cpu_s: float
     memory: int
     endpoints: dict[str, EndpointUsage]
+    held: int = 0
+    """Bytes of messages that wait or are incomplete."""
+    shed: int = 0
+    """How often a user held too much, and lost the oldest of it."""
+    turned_away: int = 0
+    """Connections that were closed because too many did not say who they are."""
 
 
 class Login(_Message, frozen=True, kw_only=True, omit_defaults=True):
@@ -224,16 +230,7 @@ class ReadLog(_Message, frozen=True, kw_only=True, omit_defaults=True):
     offset: int = 0
     """Negative: that many bytes before the end."""
     limit: int = 65536
-    streams: tuple[LogStream, ...] = ()
-    """Only these; all if empty. The environment's log knows ``rosout`` only, which is another log there."""
-    level: LogLevel = LogLevel.DEBUG
-    """Of records in ROS only those that are at least as serious."""
-    life: str = ""
-    """Of which life, as :attr:`LogChunk.life` said; empty: of the one that lives, or else the last one."""
-    previous: bool = False
-    """Of the last life that ended, even if the container lives; goes without ``life``."""
-    since: float = 0.0
-    """Not of lives that ended before that, in seconds since the epoch: they were another user's."""
+    wish: LogWish = LogWish()
 
 
 ToMaster = Hello | Status | Gone | Fault | Usage | Login | Left | ClientRequest | LogChunk

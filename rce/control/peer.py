@@ -8,6 +8,7 @@ import logging
 from typing import TYPE_CHECKING
 
 from rce.control.exceptions import PeerGoneError, PeerTimeoutError
+from rce.control.logs import LogWish
 from rce.control.messages import ReadLog, encode
 from rce.control.timeouts import MAX_QUEUED, ControlTimeouts
 
@@ -67,6 +68,7 @@ class Peer:
         node: str,
         offset: int = 0,
         limit: int = 65536,
+        wish: LogWish = LogWish(),  # noqa: B008 - it is frozen
     ) -> LogChunk:
         """Read a piece of a node's log.
 
@@ -75,6 +77,7 @@ class Peer:
             node: Node tag; empty for the environment's own log.
             offset: Where to start, in bytes; negative: that many before the end.
             limit: At most so many bytes.
+            wish: Of which life of the container, and what of it.
 
         Raises:
             PeerGoneError: The task set left.
@@ -85,7 +88,7 @@ class Peer:
         number = next(self._numbers)
         reply: asyncio.Future[LogChunk] = asyncio.get_running_loop().create_future()
         self._reads[number] = reply
-        self.send(ReadLog(request=number, id=id, node=node, offset=offset, limit=limit))
+        self.send(ReadLog(request=number, id=id, node=node, offset=offset, limit=limit, wish=wish))
         try:
             async with asyncio.timeout(self._timeouts.log):
                 return await reply

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rce.control.logs import LogLevel
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
 from rce_master.cli.exceptions import ApiError
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 POLL_S = 0.3
 CHUNK = 65536
 _UNAVAILABLE = 503
+_NOT_FOUND = 404
 
 
 def logs(
@@ -26,27 +28,74 @@ def logs(
     ],
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what comes.")] = False,
     bytes_: Annotated[int, typer.Option("--bytes", help="Begin that many bytes before the end; 0: all.")] = 0,
+    stdout: Annotated[bool, typer.Option("--stdout", help="What the node prints.")] = False,
+    stderr: Annotated[bool, typer.Option("--stderr", help="What it prints as errors.")] = False,
+    rosout: Annotated[
+        bool, typer.Option("--rosout", help="Its log records in ROS; without a node: all nodes'.")
+    ] = False,
+    engine: Annotated[bool, typer.Option("--engine", help="What became of it.")] = False,
+    level: Annotated[
+        LogLevel | None, typer.Option(help="Of log records in ROS those from this level on; means --rosout.")
+    ] = None,
+    previous: Annotated[
+        bool, typer.Option("--previous", "-p", help="Of the container's last life that ended.")
+    ] = False,
     user: Annotated[str, typer.Option(help="Whose container; administrators only.")] = "",
 ) -> None:
-    """Print the log of a node."""
-    run(_logs(node, follow, -bytes_, user))
+    """Print the log of a node. Several of --stdout, --stderr, --rosout and --engine may be given; else all.
+
+    The logs of a container that is gone are kept for a while, and are read in the same way.
+    """
+    chosen = {"stdout": stdout, "stderr": stderr, "rosout": rosout or level is not None, "engine": engine}
+    query = {
+        "stream": ",".join(name for name, wanted in chosen.items() if wanted),
+        "level": level.value if level else "",
+        "previous": "true" if previous else "",
+        "user": user,
+    }
+    run(_logs(node, follow, -bytes_, {name: value for name, value in query.items() if value}))
 
 
-async def _logs(path: str, follow: bool, offset: int, user: str) -> None:
+async def _logs(path: str, follow: bool, offset: int, query: dict[str, str]) -> None:
     container, _, node = path.partition("/")
     url = f"/containers/{container}/nodes/{node}/log" if node else f"/containers/{container}/log"
-    query: dict[str, str | int] = {"limit": CHUNK, **({"user": user} if user else {})}
+    life, told = "", ""
     async with ApiClient.of(credentials.load()) as client:
         while True:
-            chunk = await _read(client, url, {**query, "offset": offset}, patient=follow)
+            place = {"limit": CHUNK, "offset": offset}
+            of_life = {"life": life} if life else {}
+            chunk = await _read(client, url, {**query, **place, **of_life}, patient=follow)
             if chunk is not None:
+                if chunk["ended"] and told != chunk["life"]:
+                    told = chunk["life"]
+                    typer.echo(_obituary(chunk), err=True)
                 typer.echo(chunk["text"], nl=False)
-                offset = chunk["offset"]
-                if chunk["text"]:
+                life, before, offset = chunk["life"], offset, chunk["offset"]
+                if offset != before:
                     continue
             if not follow:
                 return
             await asyncio.sleep(POLL_S)
+            if chunk is not None and chunk["ended"] and await _lives_again(client, url, query, life):
+                life, offset = "", 0
+                query.pop("previous", None)
+
+
+async def _lives_again(client: ApiClient, url: str, query: dict[str, str], life: str) -> bool:
+    """Whether the container has another life than the one that was read to its end."""
+    now = {name: value for name, value in query.items() if name == "user"}
+    try:
+        chunk = await _read(client, url, {**now, "limit": 1}, patient=True)
+    except ApiError as error:
+        if error.status == _NOT_FOUND:
+            return False
+        raise
+    return chunk is not None and chunk["life"] != life
+
+
+def _obituary(chunk: dict[str, Any]) -> str:
+    when = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(chunk["ended"]))
+    return f"-- the container's life {chunk['life']} ended {when}: {chunk['reason'] or 'unknown reason'} --"
 
 
 async def _read(

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from enum import Enum
+from typing import TYPE_CHECKING, TypeVar
 
 import msgspec
 from aiohttp import web
 
+from rce.control.logs import LogLevel, LogStream, LogWish
 from rce.web.openapi import Query
 from rce_master.exceptions import Invalid
 from rce_master.http import models
@@ -20,12 +23,22 @@ routes = RouteTable("stream")
 
 MAX_LOG = 1 << 20
 HEARTBEAT_S = 15.0
+E = TypeVar("E", bound=Enum)
 _EVENT_ID = re.compile(r"[0-9]{1,18}")
+
+
+def _words(words: type[Enum]) -> str:
+    return ", ".join(word.value for word in words)
+
 
 _LOG_QUERY = (
     OF_USER,
     Query(name="offset", description="First byte; negative: that many before the end.", type="integer"),
     Query(name="limit", description=f"At most so many bytes, up to {MAX_LOG}.", type="integer"),
+    Query(name="stream", description=f"Only these, with commas: {_words(LogStream)}."),
+    Query(name="level", description=f"Only log records in ROS from this level on: {_words(LogLevel)}."),
+    Query(name="previous", description="true: of the last life of the container that ended."),
+    Query(name="life", description="Of that life of the container, as an answer named it."),
 )
 
 
@@ -58,8 +71,31 @@ async def _read_log(call: Call, node: str) -> models.LogOut:
     if not 0 < limit <= MAX_LOG:
         raise Invalid(f"query parameter 'limit' must be 1 to {MAX_LOG}")
     id_ = f"{call.owner}/{call.path('container')}"
-    chunk = await call.services.reconciler.read_log(id_, node, offset, limit)
-    return models.LogOut(text=chunk.text, offset=chunk.offset)
+    chunk = await call.services.reconciler.read_log(id_, node, offset, limit, _wish(call.request.query))
+    return models.LogOut(
+        text=chunk.text,
+        offset=chunk.offset,
+        life=chunk.life,
+        ended=chunk.ended or None,
+        reason=chunk.reason,
+    )
+
+
+def _wish(query: Mapping[str, str]) -> LogWish:
+    streams = [word for word in query.get("stream", "").split(",") if word]
+    return LogWish(
+        streams=tuple(_one_of(LogStream, "stream", word) for word in streams),
+        level=_one_of(LogLevel, "level", query.get("level", LogLevel.DEBUG.value)),
+        previous=query.get("previous") == "true",
+        life=query.get("life", ""),
+    )
+
+
+def _one_of(words: type[E], name: str, word: str) -> E:
+    try:
+        return words(word)
+    except ValueError:
+        raise Invalid(f"query parameter {name!r} must be one of {_words(words)}") from None
 
 
 @routes.route(

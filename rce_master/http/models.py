@@ -287,3 +287,9 @@ class LogOut(BaseModel):
     text: str
     offset: int
     """Where the next read goes on."""
+    life: str = ""
+    """The container's life of which this is the log; reads of the same log name it."""
+    ended: float | None = None
+    """When that life ended, in seconds since 1970; null if it goes on."""
+    reason: str = ""
+    """Why it ended."""

@@ -43,6 +43,7 @@ class TaskSet:
         self.endpoints: tuple[EndpointStatus, ...] = ()
         self.inbox: asyncio.Queue[ToTaskSet] = asyncio.Queue()
         self.log = b""
+        self.asked: list[ReadLog] = []
         url = f"ws://{LOOPBACK}:{master.control_port}/"
         self.channel = TaskSetChannel(url, SECRET, self.hello, self.handle)
 
@@ -58,6 +59,7 @@ class TaskSet:
 
     async def handle(self, message: ToTaskSet) -> None:
         if isinstance(message, ReadLog):
+            self.asked.append(message)
             text = self.log[message.offset :][: message.limit].decode()
             offset = message.offset + len(text)
             self.channel.send(LogChunk(request=message.request, offset=offset, text=text))

@@ -7,6 +7,7 @@ import io
 import json
 from typing import TYPE_CHECKING, Any
 
+from rce.control.logs import LogLevel, LogStream, LogWish
 from rce.control.messages import Drop, Put
 from rce.control.model import (
     EndpointState,
@@ -166,14 +167,25 @@ async def test_logs_are_followed_by_offset(site: Site) -> None:
         await site.api("POST", "/containers", {"tag": "c"}, status=204)
         await site.api("POST", "/containers/c/nodes", {"tag": "n", "pkg": "Test", "exe": "x"}, status=204)
         chunk = await site.api("GET", "/containers/c/nodes/n/log", limit=5)
-        assert chunk == {"text": "hello", "offset": 5}
-        assert await site.api("GET", "/containers/c/nodes/n/log", offset=5) == {
-            "text": " world",
-            "offset": 11,
-        }
+        assert (chunk["text"], chunk["offset"], chunk["ended"]) == ("hello", 5, None)
+        chunk = await site.api("GET", "/containers/c/nodes/n/log", offset=5)
+        assert (chunk["text"], chunk["offset"]) == (" world", 11)
         assert (await site.api("GET", "/containers/c/log"))["text"] == "hello world"
         await site.api("GET", "/containers/c/nodes/none/log", status=404)
         await site.api("GET", "/containers/c/log", status=422, limit=0)
+        for wrong in ({"stream": "stdout,nothing"}, {"level": "loud"}):
+            reply = await site.api("GET", "/containers/c/log", status=422, **wrong)
+            assert "must be one of" in reply["error"]
+        await site.api("GET", "/containers/c/log", stream="rosout,stderr", level="warn", life="abc")
+        assert containers.asked[-1].wish == LogWish(
+            streams=(LogStream.ROSOUT, LogStream.STDERR),
+            level=LogLevel.WARN,
+            life="abc",
+            since=containers.asked[-1].wish.since,
+        )
+        assert containers.asked[-1].wish.since > 0
+        await site.api("GET", "/containers/gone/nodes/n/log", previous="true")
+        assert (containers.asked[-1].id, containers.asked[-1].wish.previous) == ("testUser/gone", True)
         for offset in ("x", "9" * 40, "-" + "9" * 40, "9" * 5000):
             await site.api("GET", "/containers/c/log", status=422, offset=offset)
     while (await site.api("GET", "/machines"))["machines"][0]["connected"]:

@@ -79,7 +79,7 @@ class FakePeer:
     def send(self, message: ToTaskSet) -> None:
         self.inbox.put_nowait(message)
 
-    async def read_log(self, id: str, node: str, offset: int = 0, limit: int = 65536) -> LogChunk:  # noqa: A002
+    async def read_log(self, id: str, node: str, offset: int = 0, limit: int = 65536, **_: Any) -> LogChunk:  # noqa: A002
         if self.log.text == "away":
             raise PeerTimeoutError(self.process, 1.0)
         return self.log
@@ -435,6 +435,7 @@ async def test_logs_are_read_where_the_container_is(cloud: Cloud) -> None:
     assert (await cloud.reconciler.read_log("anna/c", "n", 0, 10)).text == "hello"
     with pytest.raises(NotFound, match="has no node 'x'"):
         await cloud.reconciler.read_log("anna/c", "x", 0, 10)
+    containers.log = LogChunk(request=0, offset=0, error="no logs of an earlier life")
     with pytest.raises(NotFound, match="no container 'd'"):
         await cloud.reconciler.read_log("anna/d", "x", 0, 10)
     containers.log = LogChunk(request=0, offset=0, error="no such log")

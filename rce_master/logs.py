@@ -1,0 +1,127 @@
+"""Finds logs where they are: at the machine of a container, or wherever it lived before."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple, Protocol
+
+import msgspec
+
+from rce.control.exceptions import ControlError
+from rce.control.logs import LogWish
+from rce.control.messages import LogChunk, TaskSetKind
+from rce.protocol.names import EndpointId
+from rce_master.exceptions import NotFound, TaskSetAway
+from rce_master.state.records import Container
+from rce_master.state.tables import Tables
+
+
+class LogReader(Protocol):
+    """A connected task set, as far as its logs go."""
+
+    async def read_log(
+        self,
+        id: str,  # noqa: A002 - wire name
+        node: str,
+        offset: int = 0,
+        limit: int = 65536,
+        wish: LogWish = LogWish(),  # noqa: B008 - it is frozen
+    ) -> LogChunk:
+        """Read a piece of a log."""
+
+
+class LogRequest(NamedTuple):
+    """What is to be read."""
+
+    id: str
+    """Endpoint id of the container."""
+    node: str
+    """Node tag; empty for the environment's own log."""
+    offset: int = 0
+    limit: int = 65536
+    wish: LogWish = LogWish()
+
+
+async def read_log(tables: Tables, peers: Mapping[str, LogReader], request: LogRequest) -> LogChunk:
+    """Read a log of a container that lives, or of an earlier life of it that some machine still knows.
+
+    Args:
+        tables: The state.
+        peers: The connected task sets by name.
+        request: What is to be read.
+
+    Raises:
+        NotFound: There is no such container, node or log.
+        TaskSetAway: Its task set is not connected or does not answer.
+    """
+    wish = msgspec.structs.replace(request.wish, since=_owner_since(tables, request.id))
+    request = request._replace(wish=wish)
+    container = tables.container(request.id)
+    if container is None:
+        return await _read_anywhere(tables, peers, request)
+    if wish.previous or wish.life:
+        return await _read_earlier(tables, peers, request, container)
+    if request.node and request.node not in container.nodes:
+        raise NotFound(f"container {container.tag!r} has no node {request.node!r}")
+    chunk = await _ask(peers.get(container.task_set), request)
+    if chunk.error:
+        raise NotFound(chunk.error)
+    return chunk
+
+
+async def _read_earlier(
+    tables: Tables, peers: Mapping[str, LogReader], request: LogRequest, container: Container
+) -> LogChunk:
+    """Read of an earlier life: where the container is, or else where it was before."""
+    if container.task_set in peers:
+        chunk = await _ask(peers[container.task_set], request)
+        if not chunk.error:
+            return chunk
+    return await _read_anywhere(tables, peers, request)
+
+
+async def _read_anywhere(tables: Tables, peers: Mapping[str, LogReader], request: LogRequest) -> LogChunk:
+    """Ask all machines; of several answers that of the life that ended last counts."""
+    asked = [
+        peer
+        for process, peer in peers.items()
+        if (task_set := tables.task_sets.get(process)) is not None and task_set.kind is TaskSetKind.CONTAINER
+    ]
+    answers = await asyncio.gather(*(_ask(peer, request) for peer in asked), return_exceptions=True)
+    found = _chunks(answers)
+    if not found:
+        tag = EndpointId.parse(request.id).tag
+        reasons = {answer.error for answer in answers if isinstance(answer, LogChunk)}
+        text = next(iter(sorted(reasons)), "no machine is connected that could have its logs")
+        raise NotFound(f"there is no container {tag!r}" if tables.container(request.id) is None else text)
+    return max(found, key=lambda chunk: chunk.ended or float("inf"))
+
+
+def _chunks(answers: Iterable[LogChunk | BaseException]) -> list[LogChunk]:
+    found = []
+    for answer in answers:
+        if isinstance(answer, LogChunk):
+            if not answer.error:
+                found.append(answer)
+        elif not isinstance(answer, TaskSetAway):
+            raise answer
+    return found
+
+
+async def _ask(peer: LogReader | None, request: LogRequest) -> LogChunk:
+    tag = EndpointId.parse(request.id).tag
+    if peer is None:
+        raise TaskSetAway(f"container {tag!r} cannot be reached now")
+    try:
+        return await peer.read_log(
+            request.id, request.node, offset=request.offset, limit=request.limit, wish=request.wish
+        )
+    except ControlError as error:
+        raise TaskSetAway(f"container {tag!r} cannot be reached: {error}") from error
+
+
+def _owner_since(tables: Tables, id_: str) -> float:
+    """When the owner came to be: what a user of the same name left behind is not theirs."""
+    user = tables.users.get(EndpointId.parse(id_).user)
+    return user.created if user is not None else 0.0
