@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import socket
 from enum import Enum
 from pathlib import Path
@@ -16,6 +17,7 @@ from rce.config.secret import load_secret
 from rce.control.limits import MEGABYTE
 from rce_container.app import AUTO, RUNTIMES, App, package_path
 from rce_container.archive import LOG_DAYS, LOG_SPACE
+from rce_container.bundles.requirements import InstallerSettings
 from rce_container.exceptions import ContainerError
 from rce_container.settings import ContainerSettings
 
@@ -69,6 +71,13 @@ def container(
     log_space: Annotated[
         int, typer.Option(metavar="MB", help="What those logs may take in all; the oldest go first.", min=0)
     ] = LOG_SPACE // MEGABYTE,
+    allow_requirements: Annotated[
+        bool,
+        typer.Option("--allow-requirements", help="Install what users' packages ask for (requirements.txt)."),
+    ] = False,
+    pip_args: Annotated[
+        str, typer.Option(help="More arguments for pip, such as '--index-url URL'; split as a shell does.")
+    ] = "",
     name: Annotated[str, typer.Option(help="Name of this task set [default: made up once, then kept]")] = "",
     machine: Annotated[str, typer.Option(help="Name of this machine [default: its host name]")] = "",
     secret_file: Annotated[Path | None, typer.Option(help="File with the engine's shared secret.")] = None,
@@ -91,6 +100,7 @@ def container(
         slot_processes=slot_processes,
         log_days=log_days,
         log_space=log_space * MEGABYTE,
+        requirements=InstallerSettings(pip_args=tuple(shlex.split(pip_args))) if allow_requirements else None,
     )
     try:
         program = App(

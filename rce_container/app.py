@@ -21,11 +21,15 @@ from rce.config.folders import default_state_dir, run_dir
 from rce.config.resources import examples_dir
 from rce.config.secret import Secret
 from rce.control.channel import TaskSetChannel
+from rce.control.contents import ContentClient
 from rce.control.limits import MEMORY_PER_SLOT
 from rce.control.messages import MachineInfo
 from rce.link.address import in_url, is_any, own_address
 from rce.link.handover import Doorman
 from rce.ros.packages import PackageIndex, installed_shares
+from rce_container.bundles.cache import BundleCache
+from rce_container.bundles.requirements import Installer
+from rce_container.bundles.supply import Library
 from rce_container.exceptions import RuntimeUnavailableError
 from rce_container.folder import StateFolder
 from rce_container.limits import Limiter, choose_limiter
@@ -89,6 +93,7 @@ class App:
                 stack.callback(limiter.close)
                 for one in runtimes.values():
                     stack.callback(one.close)
+                library = await asyncio.to_thread(self._library, state)
                 reach = own_address(self.master, self.control_port) if is_any(self.host) else self.host
                 manager = Manager(
                     name=name,
@@ -100,8 +105,18 @@ class App:
                     doorman=doorman,
                     links=(reach, port),
                     limiter=limiter,
+                    library=library,
                 )
                 await self._manage(manager, lambda: ready(name, runtime.name))
+
+    def _library(self, state: StateFolder) -> Library:
+        """Where packages that users bring come from. Blocks."""
+        client = ContentClient(self.master, self.control_port, self.secret)
+        cache = BundleCache(state.library, client.piece, space=self.settings.bundle_space)
+        wish = self.settings.requirements
+        library = Library(cache=cache, installer=Installer(state.requirements, wish) if wish else None)
+        library.open()
+        return library
 
     async def _manage(self, manager: Manager, ready: Callable[[], None]) -> None:
         url = f"ws://{in_url(self.master)}:{self.control_port}"
@@ -200,6 +215,7 @@ def _machine(settings: ContainerSettings, runtime: str, limiter: Limiter, detail
         memory=memory,
         runtime=runtime,
         labels=settings.labels,
+        requirements=settings.requirements is not None,
         slots=settings.slots or memory // MEMORY_PER_SLOT,
         limits=limiter.name,
         detail="; ".join(filter(None, (detail, limiter.detail))),

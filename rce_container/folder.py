@@ -69,6 +69,7 @@ class ContainerFolder:
         self.home = self.path / "home"
         self.logs = logs or self.path / "logs"
         self.etc = self.path / "etc"
+        self.bundles = self.path / "bundles"
         self.hosts = self.etc / "hosts"
         self.control_socket = self.run / "control.sock"
         self.link_socket = self.run / "link.sock"
@@ -83,6 +84,8 @@ class ContainerFolder:
             for path in (self.path, self.run, self.home, self.etc):
                 path.mkdir(mode=0o700, parents=True)
             self.logs.mkdir(mode=0o700, exist_ok=True)
+            self.bundles.mkdir()
+            self.bundles.chmod(0o755)  # for whomever the container runs as; nobody else comes by
         except OSError as error:
             raise StateError(f"cannot make {error.filename}: {error.strerror}") from error
 
@@ -211,6 +214,16 @@ class StateFolder:
     def token(self) -> str:
         """Names this state directory on its machine, for ever."""
         return self._word("run", secrets.token_hex(4))
+
+    @property
+    def library(self) -> Path:
+        """Where packages that users bring are kept."""
+        return self._state / "bundles"
+
+    @property
+    def requirements(self) -> Path:
+        """Where is kept what those packages asked for."""
+        return self._state / "requirements"
 
     @property
     def cgroups(self) -> Path:

@@ -30,6 +30,7 @@ from rce.control.messages import (
 from rce.control.model import EndpointStatus, LinkAddress, Network
 from rce.protocol.names import EndpointId
 from rce_container import core, events
+from rce_container.bundles.supply import Library
 from rce_container.environment import messages as m
 from rce_container.environment import proc
 from rce_container.environment.channel import connect
@@ -74,6 +75,7 @@ class Manager:
         doorman: Accepts links by TCP.
         links: Host and port where it does.
         limiter: Enforces the containers' limits.
+        library: Gives packages that users bring.
 
     Attributes:
         send: Sends a message to the master, or drops it while there is none.
@@ -91,6 +93,7 @@ class Manager:
         doorman: Doorman,
         links: tuple[str, int],
         limiter: Limiter,
+        library: Library,
     ) -> None:
         self._name = name
         self._info = info
@@ -109,6 +112,7 @@ class Manager:
             feed=self._feed,
             networks=self._networks,
             archive=state.archive,
+            library=library,
         )
         self._units: dict[str, Unit] = {}
         """All lives of which something may be left, by mark."""
@@ -351,6 +355,7 @@ class Manager:
             address=str(seat.address.ip) if seat else LOOPBACK,
             rlimits=_rlimits(cell, isolated=runtime.isolated),
             packages=tuple(map(str, settings.packages)),
+            bundles=runtime.bundles(folder),
             grace=settings.grace,
             interrupt_timeout=settings.interrupt_timeout,
             terminate_timeout=settings.terminate_timeout,

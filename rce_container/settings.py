@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rce.control.limits import MEGABYTE
 from rce_container.archive import LOG_DAYS, LOG_SPACE
+from rce_container.bundles.requirements import InstallerSettings
 from rce_container.uids import FIRST_UID, UIDS
 
 
@@ -43,6 +44,10 @@ class ContainerSettings:
     """How many bytes the logs of containers that ended may take in all; the oldest go first."""
     prune_interval: float = 60.0
     """How often is looked for logs to remove."""
+    bundle_space: int = 4096 * MEGABYTE
+    """How many bytes of packages that users brought are kept, unless more are in use."""
+    requirements: InstallerSettings | None = None
+    """How what these packages ask for in a ``requirements.txt`` is installed; None: it is not."""
     home_bytes: int = 256 * MEGABYTE
     """Size of a container's home, which lives in memory."""
     first_uid: int = FIRST_UID

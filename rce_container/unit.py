@@ -15,8 +15,11 @@ import msgspec
 from rce.control.model import EndpointSpec, EndpointStatus, InterfaceUsage, LinkAddress, NodeStatus
 from rce.link.handover import Doorman, HandoverSender
 from rce.link.tasks import TaskScope
+from rce.protocol.names import EndpointId
 from rce_container import events
 from rce_container.archive import LogArchive
+from rce_container.bundles.shelf import Shelf
+from rce_container.bundles.supply import Library, Supply
 from rce_container.dial import dial
 from rce_container.environment import messages as m
 from rce_container.environment import proc
@@ -47,6 +50,7 @@ class Office:
     feed: Callable[[events.Event], None]
     networks: Networks
     archive: LogArchive
+    library: Library
 
 
 class Unit:
@@ -92,6 +96,14 @@ class Unit:
         self._stop_reason = ""
         self._hurry = False
         self._errands = TaskScope()
+        self._supply = Supply(
+            self.mark,
+            EndpointId.parse(id).user,
+            office.library,
+            Shelf(folder.bundles, link=isolated),
+            tell=lambda text: office.feed(events.Faulted(id, folder.mark, text)),
+            on_arrival=self._tell_of_arrival,
+        )
 
     @property
     def mark(self) -> str:
@@ -106,11 +118,16 @@ class Unit:
     def apply(self, spec: EndpointSpec) -> None:
         """Give the environment what is desired."""
         self._spec = spec
+        self._supply.want(spec.bundles)
         if self._channel is not None:
             self._channel.send(m.encode(m.Apply(spec=spec)))
         if self._sender is not None:
             self._errands.spawn(self._route(self._sender, spec), f"links of {self.id}")
             self._errands.spawn(self._resize(spec), f"limits of {self.id}")
+
+    def _tell_of_arrival(self) -> None:
+        if self._channel is not None:
+            self._channel.send(m.encode(m.Shelved()))
 
     def poll(self) -> None:
         """Ask for new :attr:`counters`, and tell of limits that struck."""
@@ -208,6 +225,7 @@ class Unit:
         self._deadline = None
         sender, self._sender = self._sender, None
         await self._errands.close()
+        await self._supply.close()
         if self._channel is not None:
             self._channel.close()
             self._channel = None

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import msgspec
 
-from rce.control.model import EndpointKind, EndpointSpec, EndpointState, EndpointStatus
+from rce.control.model import EndpointKind, EndpointSpec, EndpointState, EndpointStatus, InterfaceSpec
 from rce.link import Endpoint, LinkHub
 from rce.link.handover import HandoverReceiver
 from rce.protocol.names import EndpointId
@@ -24,10 +24,10 @@ from rce.ros.logrecord import KIND, MD5SUM
 from rce.ros.node import Node
 from rce.ros.node.runtime import TypeName
 from rce.ros.node.settings import is_loopback
-from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce.ros.xmlrpc import RpcClient
 from rce_container.environment import messages as m
+from rce_container.environment.bundles import Bundles
 from rce_container.environment.causes import Causes
 from rce_container.environment.channel import Channel, accept
 from rce_container.environment.cradle import Cradle
@@ -76,13 +76,15 @@ class Environment:
         self._news = asyncio.Event()
         self._parameters: Values = {}
         self._faulty: set[str] = set()
+        self._interfaces: tuple[InterfaceSpec, ...] = ()
         self._channel: Channel | None = None
         self._grace: asyncio.TimerHandle | None = None
         self._untold: deque[str] = deque(maxlen=_MAX_UNTOLD)
         self._told: EndpointStatus | None = None
         self._report_due: asyncio.Handle | None = None
         self._handover: HandoverReceiver | None = None
-        self._packages = PackageIndex(boot.packages)
+        self._bundles = Bundles(boot.bundles, boot.packages)
+        self._packages = self._bundles.index
         self._operator = Operator(self._ask)
         self._causes = Causes(self._ask)
 
@@ -155,8 +157,7 @@ class Environment:
     def _workshop(self, reaper: Reaper) -> Workshop:
         return Workshop(
             reaper=reaper,
-            packages=self._packages,
-            environ=self._environ(),
+            outfit=lambda node: self._bundles.outfit(node, self._environ()),
             mark=self._boot.mark,
             home=self._boot.home,
             logs=Path(self._boot.logs),
@@ -168,7 +169,7 @@ class Environment:
         )
 
     def _environ(self) -> dict[str, str]:
-        packages = os.pathsep.join(self._boot.packages)
+        packages = os.pathsep.join(map(str, self._packages.path))
         return {
             **os.environ,
             "ROS_MASTER_URI": self._core.uri,
@@ -184,8 +185,17 @@ class Environment:
         if spec.revision < self._desired.revision or self._ending.is_set():
             return
         self._desired = spec
+        self._bundles.apply(spec.bundles)
         self._set_parameters(spec)
+        self._nodes.lack(self._bundles.lacking(spec.nodes))
         self._nodes.apply(spec.nodes)
+        self._news.set()
+
+    def _take_bundles(self) -> None:
+        """Go on with what waited for packages that have come."""
+        self._bundles.look()
+        self._set_parameters(self._desired)
+        self._nodes.lack(self._bundles.lacking(self._desired.nodes))
         self._news.set()
 
     def _set_parameters(self, spec: EndpointSpec) -> None:
@@ -196,6 +206,8 @@ class Environment:
         for name, value in change.set.items():
             self._core.set_param(name, value)
         self._parameters = desired
+        if self._bundles.is_waiting:  # they may name a package that is still to come
+            return
         texts = {str(fault) for fault in faults}
         for text in sorted(texts - self._faulty):
             self._fault(text)
@@ -207,7 +219,9 @@ class Environment:
             self._news.clear()
             spec = self._desired
             await self._heartbeats.follow(spec.nodes)
-            await self._endpoint.apply(spec)
+            possible = self._bundles.hold_back(spec, self._interfaces)
+            self._interfaces = possible.interfaces
+            await self._endpoint.apply(possible)
             self._applied_revision = spec.revision
             self._changed()
 
@@ -308,6 +322,8 @@ class Environment:
         match message:
             case m.Apply(spec=spec):
                 self._apply(spec)
+            case m.Shelved():
+                self._take_bundles()
             case m.Poll():
                 channel.send(m.encode(m.Counters(interfaces=self._endpoint.usage())))
             case m.Dialed(request=request, error=error):

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from rce.control.model import NodeSpec
-from rce.ros.packages import PackageIndex
 from rce.ros.substitution import split_arguments
+from rce_container.environment.bundles import Outfit
 from rce_container.environment.exceptions import NodeError
 from rce_container.environment.system import system_environ
 
@@ -28,18 +28,18 @@ class Launch(NamedTuple):
     """The global ROS name that it was told to take; empty if it chooses by itself."""
 
 
-def prepare(spec: NodeSpec, packages: PackageIndex, environ: Mapping[str, str], mark: str) -> Launch:
+def prepare(outfit: Outfit, mark: str) -> Launch:
     """Work out how to start a node.
 
     Args:
-        spec: The node.
-        packages: Where packages are found.
-        environ: The environment of all nodes.
+        outfit: What it is started with.
         mark: The value of :data:`NODE_MARK`.
 
     Raises:
         NodeError: It cannot be started; the text says what to do.
     """
+    spec, packages = outfit.spec, outfit.packages
+    environ: Mapping[str, str] = outfit.environ
     try:
         package = packages.find(spec.pkg)
         executable = package.executable(spec.exe)
@@ -50,6 +50,8 @@ def prepare(spec: NodeSpec, packages: PackageIndex, environ: Mapping[str, str], 
     if package.python == "system":
         environ = system_environ(environ, package.path)
     env = {**environ, NODE_MARK: mark}
+    if outfit.python_path:
+        env["PYTHONPATH"] = os.pathsep.join(filter(None, (outfit.python_path, env.get("PYTHONPATH", ""))))
     if spec.name:
         arguments.append(f"__name:={spec.name}")
     if namespace:

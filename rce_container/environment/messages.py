@@ -35,6 +35,8 @@ class Boot(Struct, frozen=True, kw_only=True, omit_defaults=True):
     rlimits: dict[int, int] = {}
     """What each of its processes limits for itself, by the numbers of :mod:`resource`."""
     packages: tuple[str, ...] = ()
+    bundles: str = ""
+    """Folder in which packages that the user brought appear; see :mod:`rce_container.environment.bundles`."""
     grace: float = 30.0
     """Seconds without a manager after which the environment ends itself."""
     interrupt_timeout: float = 15.0
@@ -54,6 +56,10 @@ class Apply(_Message):
     """The container is desired like this."""
 
     spec: EndpointSpec
+
+
+class Shelved(_Message):
+    """Packages that the user brought have appeared."""
 
 
 class Handover(_Message):
@@ -118,7 +124,7 @@ class Killed(_Message):
     request: int
 
 
-ToEnvironment = Apply | Handover | Dialed | Cause | Poll | Stop
+ToEnvironment = Apply | Shelved | Handover | Dialed | Cause | Poll | Stop
 ToManager = Report | Fault | Counters | Dial | Killed
 
 encode = msgspec.json.Encoder().encode

@@ -7,7 +7,7 @@ has two processes: the next life is launched when all of the last one has ended.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import count
 
@@ -21,6 +21,7 @@ from rce_container.environment.nodeevents import (
     Forget,
     Halt,
     Instruction,
+    Lack,
     Launch,
     Made,
     Note,
@@ -125,6 +126,8 @@ class NodesCore:
         self._order = StartOrder()
         self._impossible: dict[str, str] = {}
         """Nodes that can never start as things are, with the reason."""
+        self._lacking: Mapping[str, str] = {}
+        """Nodes that lack what they are launched with, with the reason."""
         self._lives = count(1)
         self._out: list[Instruction] = []
         self._now = 0.0
@@ -140,6 +143,8 @@ class NodesCore:
         match event:
             case Desire(specs=specs):
                 self._desire({spec.tag: spec for spec in specs})
+            case Lack(texts=texts):
+                self._lacking = texts
             case Beat(tag=tag):
                 if not self._beat(tag):
                     return []
@@ -348,9 +353,12 @@ class NodesCore:
         waiting = [node for node in self._nodes.values() if node.state is NodeState.WAITING]
         due = [node for node in waiting if not node.pausing or node.due <= self._now]
         blocked = [node for node in due if self._is_impossible(node) or self._awaited(node)]
+        lacking = [node for node in due if node.spec.tag in self._lacking and node not in blocked]
         for node in due:
-            if node not in blocked and node.desired is not None:
+            if node not in blocked and node not in lacking and node.desired is not None:
                 self._launch(node, node.desired)
+        for node in lacking:
+            node.detail = self._lacking[node.spec.tag]
         for node in blocked:
             node.detail = self._impossible.get(node.spec.tag) or "waits for " + ", ".join(
                 f"{tag} ({self._why(tag)})" for tag in self._awaited(node)

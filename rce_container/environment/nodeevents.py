@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from rce.control.model import NodeSpec
@@ -43,6 +44,13 @@ class Registered:
 
 
 @dataclass(frozen=True, slots=True)
+class Lack:
+    """Exactly these nodes cannot be launched yet, with the reason in words, by tag."""
+
+    texts: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
 class Beat:
     """A message came on a node's heartbeat topic."""
 
@@ -66,7 +74,7 @@ class Tick:
     """Time passed."""
 
 
-Event = Desire | Made | Refused | Registered | Beat | Ended | Tick
+Event = Desire | Lack | Made | Refused | Registered | Beat | Ended | Tick
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,13 +6,13 @@ import asyncio
 import errno
 import os
 import signal
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
 from rce.control.model import NodeSpec
-from rce.ros.packages import PackageIndex
+from rce_container.environment.bundles import Outfit
 from rce_container.environment.exceptions import NodeError
 from rce_container.environment.launch import NODE_MARK, Launch, prepare
 from rce_container.environment.nodeevents import Ended, Event, Made, Refused
@@ -30,8 +30,8 @@ class Workshop:
     """What nodes are made with."""
 
     reaper: Reaper
-    packages: PackageIndex
-    environ: Mapping[str, str]
+    outfit: Callable[[NodeSpec], Outfit]
+    """Says what a node is started with."""
     mark: str
     home: str
     logs: Path
@@ -79,7 +79,7 @@ class NodeLife:
         """Live. Tells of the beginning when it is known, and of the end when nothing is left."""
         mark = f"{self._workshop.mark}.{self._spec.tag}.{self.life}"
         try:
-            launch = prepare(self._spec, self._workshop.packages, self._workshop.environ, mark)
+            launch = prepare(self._workshop.outfit(self._spec), mark)
             event = await self._live(launch)
         except NodeError as error:
             event = Refused(self._spec.tag, self.life, str(error), hopeless=True)

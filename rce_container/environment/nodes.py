@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 from rce.control.model import NodeSpec, NodeStatus
 from rce_container.environment import nodeevents as e
@@ -39,6 +39,14 @@ class NodeSet:
     def apply(self, specs: Iterable[NodeSpec]) -> None:
         """Start nodes that are missing, stop those that are too many, restart those that changed."""
         self._feed(e.Desire(tuple(specs)))
+
+    def lack(self, texts: Mapping[str, str]) -> None:
+        """Hold nodes back that cannot start yet, and let all others go that were held back.
+
+        Args:
+            texts: Why not, in words, by tag.
+        """
+        self._feed(e.Lack(texts))
 
     @property
     def statuses(self) -> tuple[NodeStatus, ...]:

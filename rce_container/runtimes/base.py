@@ -204,6 +204,10 @@ class Runtime(ABC):
     def close(self) -> None:  # noqa: B027 - most keep nothing
         """End what the runtime keeps running for itself; containers live on."""
 
+    def bundles(self, folder: ContainerFolder) -> str:
+        """Where the container sees the packages that its user brought; it cannot write there if isolated."""
+        return str(folder.bundles)
+
     def adopt(self, process: proc.Process, record: Record) -> Handle:
         """Take over a container that an earlier manager started.
 

@@ -33,6 +33,8 @@ from rce_container.seccomp.library import FilterUnavailableError, make_filter
 from rce_container.uids import FIRST_UID, UIDS, UidPool
 
 USER = "rce"
+BUNDLES = "/opt/rce/bundles"
+"""Where a container sees the packages that its user brought."""
 HOME_BYTES = 256 << 20
 TMP_BYTES = 256 << 20
 
@@ -88,6 +90,10 @@ class NamespaceRuntime(Runtime):
         if failures:
             self.close()
             raise RuntimeUnavailableError(self.name, str(failures[0])) from failures[0]
+
+    def bundles(self, folder: ContainerFolder) -> str:  # noqa: ARG002
+        """The same in every container."""
+        return BUNDLES
 
     def close(self) -> None:
         """End the nursery; the containers live on."""
@@ -189,20 +195,21 @@ def _mounts(order: Order) -> list[str]:
     """The container's tree of files; the rest is done from inside (:mod:`rce_container.nursery.mounts`)."""
     folder = order.folder
     return [
-        *_system(),
+        *system_mounts(),
         *("--proc", "/proc", "--dev", "/dev"),
         *(word for path in (*TEMPORARY, HOME) for word in ("--tmpfs", path)),
         *("--remount-ro", "/dev"),
         *("--ro-bind", str(folder.etc), "/etc"),
         *(word for name in _ETC for word in ("--ro-bind-try", f"/etc/{name}", f"/etc/{name}")),
         *("--bind", str(folder.logs), LOGS),
-        *_read_only([*interpreter_paths(), *order.packages]),
+        *("--dir", "/opt", "--dir", "/opt/rce", "--ro-bind", str(folder.bundles), BUNDLES),
+        *read_only_mounts([*interpreter_paths(), *order.packages]),
         *("--dir", "/run", "--symlink", "../run", "/var/run"),
         *("--symlink", "../tmp", "/var/tmp", "--remount-ro", "/"),  # noqa: S108 - the container's own
     ]
 
 
-def _system() -> list[str]:
+def system_mounts() -> list[str]:
     """The machine's programs and libraries."""
     options = ["--ro-bind", "/usr", "/usr"]
     for path in map(Path, _SYSTEM):
@@ -213,7 +220,7 @@ def _system() -> list[str]:
     return [*options, "--ro-bind-try", "/opt/ros", "/opt/ros"]
 
 
-def _read_only(paths: Iterable[Path]) -> list[str]:
+def read_only_mounts(paths: Iterable[Path]) -> list[str]:
     """Bind paths where they are, leaving out what lies inside another one or inside the system's."""
     bound = [Path("/usr")]
     options: list[str] = []

@@ -1,0 +1,190 @@
+"""Bundles on this machine, each once: ``FOLDER/SHA256/NAME``, shared by all containers that need them.
+
+A bundle is fetched, verified and unpacked in a scratch folder, and appears whole by one rename.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import hashlib
+import os
+import re
+from collections import Counter, defaultdict
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+
+from rce.bundles.exceptions import BundleError
+from rce.bundles.limits import DEFAULT_LIMITS, BundleLimits
+from rce.bundles.signing import statement, verify
+from rce.bundles.unpacking import unpack
+from rce.control.contents import Piece
+from rce.control.exceptions import ContentError
+from rce.control.model import BundleSpec
+from rce_container.bundles.disk import forget_before_boot, in_thread, remove, scratch, size_of
+from rce_container.bundles.exceptions import BundleTrouble, NoSpace, Unfetched, Unverified
+
+Fetch = Callable[[str, int], Awaitable[Piece]]
+"""Fetches the piece of a content, by its hash, that begins at an offset; raises :class:`ContentError`."""
+
+_HASH = re.compile(r"[0-9a-f]{64}")
+_SCRATCH = "incoming"
+_AT_ONCE = 2
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+
+
+class BundleCache:
+    """The bundles of one machine.
+
+    Args:
+        folder: Belongs to this cache.
+        fetch: Fetches from the master.
+        space: Bytes; beyond it, those that no container holds and that were used longest ago are removed.
+        limits: How large each may be.
+    """
+
+    def __init__(
+        self, folder: Path, fetch: Fetch, *, space: int, limits: BundleLimits = DEFAULT_LIMITS
+    ) -> None:
+        self._folder = folder
+        self._fetch = fetch
+        self._space = space
+        self._limits = limits
+        self._sizes: dict[str, int] = {}
+        """Bytes of those that are there, the one that was used longest ago first."""
+        self._holders: defaultdict[str, set[str]] = defaultdict(set)
+        self._locks: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
+        self._busy: Counter[str] = Counter()
+        """How many hold or wait for each of the locks."""
+        self._turns = asyncio.Semaphore(_AT_ONCE)
+
+    def open(self) -> None:
+        """Look at what is there, and remove what was begun and not finished. Blocks.
+
+        Raises:
+            OSError: The folder cannot be used.
+        """
+        forget_before_boot(self._folder)
+        remove(self._folder / _SCRATCH)
+        found = [path for path in self._folder.iterdir() if _HASH.fullmatch(path.name)]
+        found.sort(key=lambda path: path.stat().st_mtime)
+        self._sizes = {path.name: size_of(path) for path in found}
+
+    def hold(self, holder: str, sha256s: set[str]) -> None:
+        """Note which bundles a container needs; they are not removed while it does."""
+        for sha256 in [*self._holders]:
+            self._holders[sha256].discard(holder)
+            if not self._holders[sha256]:
+                del self._holders[sha256]
+        for sha256 in sha256s:
+            self._holders[sha256].add(holder)
+
+    async def ensure(self, user: str, bundle: BundleSpec) -> Path:
+        """Have a bundle here. Several callers at once cause one fetch.
+
+        Args:
+            user: Who brought it.
+            bundle: What it is to be.
+
+        Returns:
+            The folder that holds the package's folder.
+
+        Raises:
+            BundleTrouble: It cannot be had now.
+        """
+        _check_signature(user, bundle)
+        path = self._folder / bundle.sha256
+        async with self._lock(bundle.sha256):
+            if bundle.sha256 not in self._sizes or not path.is_dir():
+                async with self._turns:
+                    await self._bring(bundle, path)
+            self._sizes[bundle.sha256] = self._sizes.pop(bundle.sha256)
+            await in_thread(os.utime, path)
+        await self._make_room()
+        return path
+
+    @contextlib.asynccontextmanager
+    async def _lock(self, sha256: str) -> AsyncIterator[None]:
+        self._busy[sha256] += 1
+        try:
+            async with self._locks[sha256]:
+                yield
+        finally:
+            self._busy[sha256] -= 1
+            if not self._busy[sha256]:
+                del self._busy[sha256], self._locks[sha256]
+
+    async def _bring(self, bundle: BundleSpec, path: Path) -> None:
+        self._sizes.pop(bundle.sha256, None)
+        try:
+            with scratch(self._folder / _SCRATCH) as folder:
+                archive = folder / "archive"
+                await self._download(bundle, archive)
+                tree = folder / "tree"
+                size = await in_thread(self._unpack, bundle, archive, tree)
+                await in_thread(_replace, tree, path)
+        except OSError as error:
+            raise trouble_of(error) from error
+        self._sizes[bundle.sha256] = size
+
+    async def _download(self, bundle: BundleSpec, archive: Path) -> None:
+        digest = hashlib.sha256()
+        offset, size = 0, 1
+        with archive.open("wb") as file:
+            while offset < size:
+                try:
+                    piece = await self._fetch(bundle.sha256, offset)
+                except ContentError as error:
+                    advice = "; push it again: rce package push" if error.missing else ""
+                    raise Unfetched(f"it cannot be fetched: {error}{advice}") from error
+                size = piece.size
+                offset += len(piece.data)
+                if max(size, offset) > self._limits.archive:
+                    raise Unverified(f"it has more than {self._limits.archive} bytes")
+                digest.update(piece.data)
+                await in_thread(file.write, piece.data)
+        if digest.hexdigest() != bundle.sha256:
+            raise Unverified(
+                "what the master handed out is not what was signed; push it again: rce package push"
+            )
+
+    def _unpack(self, bundle: BundleSpec, archive: Path, tree: Path) -> int:
+        tree.mkdir(mode=0o755)
+        with archive.open("rb") as file:
+            try:
+                found, _ = unpack(file, tree, self._limits)
+            except BundleError as error:
+                raise Unverified(f"its archive cannot be unpacked: {error}") from error
+        if found.name != bundle.name:
+            raise Unverified(f"its archive holds the package {found.name!r}")
+        return found.size
+
+    async def _make_room(self) -> None:
+        """Remove what was used longest ago and nobody holds, until the rest fits."""
+        for sha256 in list(self._sizes):
+            if sum(self._sizes.values()) <= self._space:
+                return
+            if sha256 not in self._holders and sha256 not in self._busy:
+                del self._sizes[sha256]
+                await in_thread(remove, self._folder / sha256)
+
+
+def trouble_of(error: OSError) -> BundleTrouble:
+    """Say in words for the owner what a disk's error means."""
+    if error.errno in _FULL:
+        return NoSpace("the disk of the container's machine is full; tell its operator")
+    return NoSpace(f"the container's machine cannot keep it: {error.strerror or error}; tell its operator")
+
+
+def _check_signature(user: str, bundle: BundleSpec) -> None:
+    signed = statement(user, bundle.name, bundle.version, bundle.sha256)
+    try:
+        verify(bundle.key, bundle.signature, signed)
+    except BundleError as error:
+        raise Unverified(f"{error}; push it again: rce package push") from error
+
+
+def _replace(tree: Path, path: Path) -> None:
+    remove(path)
+    tree.rename(path)

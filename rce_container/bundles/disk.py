@@ -1,0 +1,108 @@
+"""Folders that only ever appear whole, and how large they are. All of it blocks."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+_READ_ONLY_FOLDER = 0o755
+
+
+@contextlib.contextmanager
+def scratch(parent: Path) -> Iterator[Path]:
+    """Give a folder of one's own, and remove what is left of it."""
+    parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(dir=parent))
+    try:
+        yield folder
+    finally:
+        remove(folder)
+
+
+async def in_thread(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
+    """Run something that blocks; who is cancelled meanwhile waits for its end all the same.
+
+    So nobody removes a folder into which a thread still writes.
+    """
+    work = asyncio.ensure_future(asyncio.to_thread(function, *args, **kwargs))
+    try:
+        return await asyncio.shield(work)
+    except asyncio.CancelledError:
+        await asyncio.wait([work])
+        raise
+
+
+def remove(folder: Path) -> None:
+    """Remove a folder with all that is in it, if it is there."""
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def size_of(folder: Path) -> int:
+    """Tell how many bytes the files in a folder take."""
+    total = 0
+    for parent, _, files in os.walk(folder):
+        for name in files:
+            with contextlib.suppress(OSError):
+                total += os.lstat(os.path.join(parent, name)).st_size  # noqa: PTH118 - many files
+    return total
+
+
+def forget_before_boot(folder: Path) -> None:
+    """Empty a folder that was filled before the machine was started.
+
+    What is in it was never forced to the disk one by one, so it may not be whole after a power cut.
+    """
+    note = folder / "boot"
+    try:
+        now = BOOT_ID.read_text()
+    except OSError:
+        now = ""
+    with contextlib.suppress(OSError):
+        if now and note.read_text() == now:
+            return
+    for path in list(folder.iterdir()) if folder.is_dir() else []:
+        remove(path)
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    note.write_text(now)
+
+
+def replicate(source: Path, target: Path, *, link: bool) -> None:
+    """Make a tree once more, out of hard links where that works, else of copies.
+
+    Args:
+        source: A tree of folders, files and links.
+        target: Is made.
+        link: Whether hard links may be used: whoever gets the tree cannot write to its files.
+
+    Raises:
+        OSError: It cannot be made.
+    """
+    target.mkdir()
+    target.chmod(_READ_ONLY_FOLDER)
+    with os.scandir(source) as entries:
+        for entry in entries:
+            made = target / entry.name
+            if entry.is_symlink():
+                made.symlink_to(os.readlink(entry.path))  # noqa: PTH115 - as it is
+            elif entry.is_dir(follow_symlinks=False):
+                replicate(Path(entry.path), made, link=link)
+            elif not link or not _linked(entry.path, made):
+                shutil.copy2(entry.path, made)
+
+
+def _linked(source: str, target: Path) -> bool:
+    try:
+        target.hardlink_to(source)
+    except OSError:
+        return False  # another disk, or too many links: a copy does it
+    return True

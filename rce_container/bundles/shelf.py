@@ -1,0 +1,59 @@
+"""A container's folder of packages: seen from inside, read-only, from its start; filled while it runs."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+from rce_container.bundles.disk import remove, replicate, scratch
+from rce_container.environment.bundles import REQUIREMENTS
+
+KEPT = 8
+"""Bundles that no node names any more stay, the newest so many: a node that still runs may read from them."""
+_STAGING = "bundles.new"
+
+
+class Shelf:
+    """One container's packages. What is in it is whole: it appears by one rename.
+
+    Args:
+        folder: The folder that the container sees; there while the container is.
+        link: Whether the container cannot write to it, so that its files may be those of the cache.
+    """
+
+    def __init__(self, folder: Path, *, link: bool) -> None:
+        self._folder = folder
+        self._link = link
+
+    def has(self, sha256: str) -> bool:
+        """Tell whether a bundle is there."""
+        return (self._folder / sha256).is_dir()
+
+    def place(self, sha256: str, tree: Path, requirements: Path | None) -> None:
+        """Put a bundle in. Blocks.
+
+        Args:
+            sha256: Names it.
+            tree: What it holds.
+            requirements: What its ``requirements.txt`` asked for, installed; None for nothing.
+
+        Raises:
+            OSError: It cannot be put in; the container may just have ended.
+        """
+        if self.has(sha256):
+            return
+        if not self._folder.is_dir():
+            raise FileNotFoundError(f"{self._folder} is gone")
+        with scratch(self._folder.parent / _STAGING) as folder:
+            made = folder / sha256
+            replicate(tree, made, link=self._link)
+            if requirements is not None:
+                replicate(requirements, made / REQUIREMENTS, link=self._link)
+            made.rename(self._folder / sha256)
+
+    def tidy(self, wanted: Collection[str]) -> None:
+        """Take out what nobody names any more, beyond the newest few. Blocks."""
+        left = [path for path in self._folder.iterdir() if path.name not in wanted]
+        left.sort(key=lambda path: path.stat().st_mtime)
+        for path in left[:-KEPT]:
+            remove(path)
