@@ -18,12 +18,11 @@ from rce_client.backoff import Backoff, judge
 from rce_client.discovery import VERSION, locate
 from rce_client.exceptions import LostError, RefusedError
 from rce_client.sendqueue import Parcel, QueueLimits, SendQueue
+from rce_client.socket import EngineSocket
 
 if TYPE_CHECKING:
     import ssl
     from collections.abc import Sequence
-
-    from websockets.asyncio.client import ClientConnection
 
     from rce.protocol.codec import Frame
     from rce.protocol.stream import Event
@@ -172,13 +171,13 @@ class Courier:
         except TimeoutError:
             _log.warning("the engine takes no messages; what waits to be sent is lost")
 
-    async def _dial(self) -> ClientConnection:
+    async def _dial(self) -> EngineSocket:
         target, timing = self._target, self._timing
         url = await locate(
             target.url, target.user, version=target.version, tls=target.tls, timeout=timing.locate
         )
         parts = urlsplit(url)
-        return await connect(
+        socket = await connect(
             urlunsplit(parts._replace(query=target.query())),
             ssl=target.tls if parts.scheme == "wss" else None,
             compression=None,  # costs more time than it saves for all but slow links
@@ -189,9 +188,12 @@ class Courier:
             ping_timeout=timing.ping_timeout,
             close_timeout=timing.close,
             write_limit=timing.write_buffer,
+            create_connection=EngineSocket,
         )
+        assert isinstance(socket, EngineSocket)
+        return socket
 
-    async def _use(self, socket: ClientConnection) -> LostError:
+    async def _use(self, socket: EngineSocket) -> LostError:
         """Send and receive until the connection ends; return why it did."""
         self.connected = True
         error = LostError("the connection was closed")
@@ -208,7 +210,7 @@ class Courier:
             await socket.close()
         return error
 
-    async def _read(self, socket: ClientConnection) -> LostError:
+    async def _read(self, socket: EngineSocket) -> LostError:
         limit = self._timing.max_message
         stream = ProtocolStream.for_client(Limits(max_text=limit, max_binary=limit))
         now = asyncio.get_running_loop().time
@@ -225,15 +227,14 @@ class Courier:
             reason = closed.rcvd.reason if closed.rcvd is not None else ""
             return LostError(reason or f"the connection ended: {closed}")
 
-    async def _write(self, socket: ClientConnection) -> None:
+    async def _write(self, socket: EngineSocket) -> None:
         while True:
             parcel = self._queue.pop()
             if parcel is None:
                 self._idle.set()
                 parcel = await self._queue.get()
             try:
-                for frame in parcel.frames:
-                    await socket.send(frame)
+                await socket.send_frames(parcel.frames)
                 if parcel.sent is not None and not parcel.sent.done():
                     parcel.sent.set_result(None)
             except ConnectionClosed:

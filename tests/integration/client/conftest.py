@@ -89,7 +89,7 @@ class Engine:
 
 
 def _server_sockets() -> list[RobotSocket]:
-    return [item for item in gc.get_objects() if type(item) is RobotSocket]
+    return [item for item in gc.get_objects() if issubclass(type(item), RobotSocket)]
 
 
 @pytest.fixture

@@ -1,0 +1,37 @@
+"""The WebSocket of a client: all frames of a message go out together."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from websockets.asyncio.client import ClientConnection
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rce.protocol.codec import Frame
+
+JOIN_BELOW = 64 << 10
+"""Below this many bytes a copy costs less than another system call and another packet."""
+
+
+class EngineSocket(ClientConnection):
+    """A connection; made by ``websockets.asyncio.client.connect(create_connection=EngineSocket)``."""
+
+    async def send_frames(self, frames: Sequence[Frame]) -> None:
+        """Send the frames of a message, and wait until the socket's buffer has room again.
+
+        Raises:
+            websockets.exceptions.ConnectionClosed: The connection ended.
+        """
+        async with self.send_context():
+            for frame in frames:
+                if isinstance(frame, str):
+                    self.protocol.send_text(frame.encode())
+                else:
+                    self.protocol.send_binary(frame)
+            chunks = self.protocol.data_to_send()
+            if sum(map(len, chunks)) < JOIN_BELOW:
+                chunks = [b"".join(chunks)]
+            for chunk in chunks:
+                self.transport.write(chunk)
