@@ -57,7 +57,9 @@ def run_script(path: str, arguments: Sequence[str]) -> None:
         with io.open_code(path) as file:
             source = file.read()
     except OSError as error:
-        sys.stderr.write(f"{sys.executable}: can't open file {path!r}: {error}\n")
+        sys.stderr.write(
+            f"{sys.executable}: can't open file {path!r}: [Errno {error.errno}] {error.strerror}\n"
+        )
         raise SystemExit(_CANNOT_OPEN) from None
     try:
         exec(compile(source, path, "exec", dont_inherit=True), main.__dict__)  # noqa: S102 - it is what was asked

@@ -1,0 +1,121 @@
+"""The filter of system calls, by a small interpreter of the kernel's classic BPF."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import platform
+import socket
+import struct
+
+import pytest
+
+from rce_container.nursery.kernel import Namespaces
+from rce_container.seccomp.calls import ALLOWED, CONDITIONAL, REFUSED
+from rce_container.seccomp.library import LIBRARY, FilterUnavailableError, make_filter
+
+ARCHITECTURES = {"x86_64": 0xC000_003E, "aarch64": 0xC000_00B7}
+ALLOW, DENIED, INVISIBLE, KILL = 0x7FFF_0000, 0x5_0000 | errno.EPERM, 0x5_0000 | errno.ENOSYS, 0x8000_0000
+THREAD = 0x3D_0F00
+"""What a C library clones a thread with."""
+
+pytestmark = pytest.mark.skipif(
+    platform.machine() not in ARCHITECTURES, reason="knows the numbers of two architectures only"
+)
+
+
+@pytest.fixture(scope="module")
+def program() -> bytes:
+    try:
+        return make_filter()
+    except FilterUnavailableError as error:
+        pytest.skip(str(error))
+
+
+def number(call: str) -> int:
+    return ctypes.CDLL(LIBRARY).seccomp_syscall_resolve_name(call.encode())
+
+
+def run(program: bytes, data: bytes) -> int:
+    """Run a filter on a ``struct seccomp_data``; returns its verdict."""
+    code = list(struct.iter_unpack("=HBBI", program))
+    accumulator = at = 0
+    while True:
+        operation, true, false, k = code[at]
+        at += 1
+        jumps = {
+            0x15: accumulator == k,
+            0x25: accumulator > k,
+            0x35: accumulator >= k,
+            0x45: bool(accumulator & k),
+        }
+        if operation == 0x20:
+            (accumulator,) = struct.unpack_from("=I", data, k)
+        elif operation == 0x54:
+            accumulator &= k
+        elif operation == 0x05:
+            at += k
+        elif operation in jumps:
+            at += true if jumps[operation] else false
+        else:
+            assert operation == 0x06, f"unknown instruction {operation:#x}"
+            return int(k)
+
+
+def verdict(program: bytes, call: str, *arguments: int, machine: str = "") -> int:
+    words = (*arguments, 0, 0, 0, 0, 0, 0)[:6]
+    architecture = ARCHITECTURES[machine or platform.machine()]
+    return run(program, struct.pack("=iIQ6Q", number(call), architecture, 0, *words))
+
+
+@pytest.mark.parametrize("call", ["read", "openat", "execve", "futex", "epoll_pwait2", "rseq", "getrandom"])
+def test_ordinary_calls_are_allowed(program: bytes, call: str) -> None:
+    assert verdict(program, call) == ALLOW
+
+
+@pytest.mark.parametrize("call", [call for call in REFUSED if number(call) >= 0])
+def test_privileged_calls_are_denied(program: bytes, call: str) -> None:
+    assert verdict(program, call) == DENIED
+
+
+@pytest.mark.parametrize("call", ["clone3", "listmount", "lsm_set_self_attr"])
+def test_what_is_not_named_does_not_exist(program: bytes, call: str) -> None:
+    if number(call) < 0:
+        pytest.skip("this library does not know the call")
+    assert verdict(program, call) == INVISIBLE
+
+
+def test_threads_and_processes_are_allowed_and_namespaces_are_not(program: bytes) -> None:
+    assert verdict(program, "clone", THREAD) == ALLOW
+    assert verdict(program, "unshare", 0x400) == ALLOW
+    for kind in (*Namespaces, 0x80):
+        assert verdict(program, "unshare", kind) == INVISIBLE
+        assert verdict(program, "clone", THREAD | kind) == INVISIBLE
+
+
+@pytest.mark.parametrize(
+    ("family", "protocol", "allowed"),
+    [
+        (socket.AF_UNIX, 0, True),
+        (socket.AF_INET, 0, True),
+        (socket.AF_INET6, 0, True),
+        (socket.AF_INET | 1 << 32, 0, True),
+        (socket.AF_NETLINK, 0, True),
+        (socket.AF_NETLINK, 9, False),
+        (socket.AF_PACKET, 0, False),
+        (40, 0, False),
+        (38, 0, False),
+    ],
+)
+def test_sockets_are_of_a_few_families(program: bytes, family: int, protocol: int, allowed: bool) -> None:
+    assert (verdict(program, "socket", family, 2, protocol) == ALLOW) is allowed
+
+
+def test_another_architectures_calls_kill(program: bytes) -> None:
+    other = next(name for name in ARCHITECTURES if name != platform.machine())
+    assert verdict(program, "read", machine=other) == KILL
+
+
+def test_no_call_is_listed_twice() -> None:
+    calls = (*ALLOWED, *REFUSED, *{rule.call for rule in CONDITIONAL})
+    assert len(calls) == len(set(calls))
