@@ -259,8 +259,8 @@ class Unit:
     def _with_outer_pids(self, status: EndpointStatus) -> tuple[NodeStatus, ...]:
         """Replace the nodes' pids inside the container by those outside."""
         if any(node.pid and node.pid not in self._pids for node in status.nodes):
-            inside = self.handle.members(proc.table())
-            self._pids = {proc.inner_pid(process.pid): process.pid for process in inside}
+            pids = self.warden.cell.pids() or [one.pid for one in self.handle.members(proc.table())]
+            self._pids = {proc.inner_pid(pid): pid for pid in pids}
         return tuple(
             msgspec.structs.replace(node, pid=self._pids.get(node.pid, 0)) if node.pid else node
             for node in status.nodes

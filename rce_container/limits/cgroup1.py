@@ -101,7 +101,7 @@ class Cgroup1(CgroupLimiter):
             try:
                 self._make_parent(place.folder / self._folder)
             except OSError as error:
-                reasons.append(f"{place.folder}: {error.strerror}")
+                reasons.append(f"no cgroup can be made in {place.folder}: {error.strerror}")
                 continue
             places[place.folder] = place
             working.add(controller)
@@ -110,7 +110,7 @@ class Cgroup1(CgroupLimiter):
         self._missing = frozenset(CONTROLLERS[name] for name in CONTROLLERS.keys() - working) - {""}
         if not working & {"memory", "pids", "cpu"}:
             self.close()
-            raise LimitsUnavailableError("; ".join(reasons) or "no hierarchy of version 1 is mounted")
+            raise LimitsUnavailableError(reasons[0] if reasons else "no hierarchy of version 1 is mounted")
         if self._missing:
             self.detail = f"of containers' {', '.join(sorted(self._missing))} no limit holds: " + (
                 "; ".join(reasons) or "the controllers are not mounted"

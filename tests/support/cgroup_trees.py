@@ -44,7 +44,15 @@ class Tree2:
         own: The cgroup of this process.
     """
 
-    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, *, controllers: str, own: str) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        *,
+        controllers: str,
+        own: str,
+        of_root: str = "cpu memory pids io",
+    ) -> None:
         self.root = folder / "cgroup"
         self.own = self.root / own
         self.proc = folder / "proc"
@@ -56,7 +64,7 @@ class Tree2:
         monkeypatch.setattr(files, "write", self._write)
         for path in (self.root, *reversed([p for p in (self.own, *self.own.parents) if p > self.root])):
             path.mkdir(exist_ok=True)
-            self.fill(path, controllers)
+            self.fill(path, of_root if path == self.root and own else controllers)
         self.busy = set[Path]()
         """Cgroups that hold processes, and so cannot give controllers away."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from rce.control.messages import Gone
 from rce.control.model import EndpointState, NodeSpec, NodeState, NodeUsage, Resources
 from rce_container.environment import proc
 from rce_container.folder import StateFolder
-from rce_container.limits import Limits, choose_limiter
+from rce_container.limits import Limits, RlimitLimiter, choose_limiter
 
 pytestmark = pytest.mark.needs("cgroups")
 
@@ -225,3 +226,45 @@ async def test_cells_of_which_nothing_else_is_left_are_swept_with_their_processe
     async with machine.engine():
         assert lost.wait() == -signal.SIGKILL
         assert not machine.cells()
+
+
+async def test_nodes_die_before_their_environment_and_both_before_the_engine(packages: Machine) -> None:
+    machine = packages
+    async with machine.engine():
+        await machine.put(BOX, nodes=(NodeSpec(tag="talk", pkg="own", exe="talk.py"),))
+        await machine.log_holds(BOX, "talk", "hello")
+        node, environment = machine.node(BOX, "talk").pid, machine.environment().pid
+        scores = [int(Path(f"/proc/{pid}/oom_score_adj").read_text()) for pid in (node, environment)]
+        assert scores == [600, 300]
+
+
+async def test_without_cgroups_each_process_is_limited(
+    packages: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine = packages
+    monkeypatch.setattr("support.containers.choose_limiter", lambda *_: RlimitLimiter())
+    async with machine.engine():
+        await machine.put(BOX, resources=Resources(memory=128 * MB), nodes=(greedy("hog", "300"),))
+        died = await machine.node_is(BOX, "hog", NodeState.FAILED)
+        assert "MemoryError" in died.detail
+        assert "has 60" in await machine.log(BOX, "hog")
+        seen = await until(lambda: usage(machine, BOX))
+        assert (seen.memory_limit, seen.memory_peak) == (0, 0)
+        assert seen.memory > MB
+        await machine.put(BOX, 2, resources=Resources(memory=256 * MB))
+        await until(lambda: any("destroy it and create it again" in fault for fault in machine.faults))
+
+
+@pytest.mark.needs("root")
+def test_a_user_to_whom_no_cgroup_belongs_gets_the_weaker_limits() -> None:
+    code = (
+        "import logging, os, pathlib\n"
+        "from rce_container.limits import choose_limiter\n"
+        "logging.disable()\n"
+        "os.setresuid(65534, 65534, 65534)\n"
+        "limiter = choose_limiter('t', pathlib.Path('/nonexistent'))\n"
+        "print(limiter.name, limiter.detail)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.startswith("rlimit limits of containers are weak: no cgroup can be used"), done.stderr
+    assert "Permission denied" in done.stdout

@@ -197,6 +197,14 @@ def test_a_cgroup_without_controllers_is_refused(
     assert "no controllers" in chosen.detail
 
 
+def test_a_machine_with_all_controllers_in_the_first_version_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tree = Tree2(tmp_path, monkeypatch, controllers="", own="user.slice", of_root="")
+    with pytest.raises(LimitsUnavailableError, match="all controllers belong to version 1"):
+        limiter(tree)
+
+
 def test_a_cgroup_of_somebody_else_is_refused(tree: Tree2, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(path: Path, value: object) -> None:
         raise PermissionError(13, "Permission denied", str(path))
