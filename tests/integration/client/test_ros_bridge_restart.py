@@ -1,0 +1,58 @@
+"""``rce-ros`` when the robot's own ROS master is restarted: everything is registered again and flows."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+import pytest
+from support.ros_real import GRAPHS, free_port
+
+from rce.ros.node import Node
+from tests.integration.client.test_ros_bridge import EMPTY, STRING, config, program, ros_string, write
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from support.ros_real import Graph
+
+    from tests.integration.client.conftest import Engine
+
+
+async def everything_flows(graph: Graph, engine: Engine) -> None:
+    async with asyncio.timeout(40), Node("robot", argv=(), master_uri=graph.uri) as node:
+        publisher = await node.advertise("/say", STRING)
+        subscriber = await node.subscribe("/hear", STRING)
+        await node.advertise_service("/serve", EMPTY, lambda request: {"message": f"got {request.data}"})
+        await publisher.wait_for_subscribers(1)
+        await subscriber.wait_for_publishers(1)
+        await node.wait_for_service("/ask")
+        received = engine.end("say").received
+        while not received.empty():
+            received.get_nowait()
+        publisher.publish(data="up")
+        assert await received.get() == ros_string("up")
+        engine.end("hear").port.send(ros_string("down"))
+        assert (await anext(aiter(subscriber))).data == "down"
+        answer = await node.service_client("/ask", EMPTY)(data=True)
+        assert (answer.success, answer.message) == (True, "cloud")
+        assert await engine.end("serve").port.call(b"\x01") == b"\x00" + ros_string("got True")
+
+
+@pytest.mark.timeout(150)
+@pytest.mark.parametrize("kind", ["ours", pytest.param("roscore", marks=pytest.mark.needs("roslaunch"))])
+async def test_a_restarted_master_is_told_everything_again(kind: str, engine: Engine, tmp_path: Path) -> None:
+    async def cloud_answers(_: bytes) -> bytes:
+        return b"\x01" + ros_string("cloud")
+
+    port = free_port()
+    path = write(tmp_path, config(engine.door.url))
+    async with program(path, master=f"http://127.0.0.1:{port}/") as bridge:
+        async with GRAPHS[kind](tmp_path, port) as graph:
+            await bridge.until("rce-ros ready")
+            engine.end("ask").answer = cloud_answers
+            await everything_flows(graph, engine)
+        async with GRAPHS[kind](tmp_path, port) as graph:
+            await everything_flows(graph, engine)
+        assert bridge.process.returncode is None
+        assert not any("Traceback" in line for line in bridge.lines)
