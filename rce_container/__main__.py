@@ -47,6 +47,14 @@ def container(
         float,
         typer.Option(help="Seconds after which containers without this program end themselves.", min=0.1),
     ] = 30.0,
+    image: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="IMAGE|DIR",
+            help="Folder with a root file system that containers may have, beside podman's images; may be"
+            " repeated. The first one, image or folder, is that of all containers of --runtime podman.",
+        ),
+    ] = None,
     package_path_: Annotated[
         list[Path] | None,
         typer.Option("--package-path", help="Folder with packages of nodes; may be repeated."),
@@ -95,6 +103,7 @@ def container(
         packages=package_path(package_path_ or ()),
         labels=tuple(label or ()),
         grace=grace,
+        images=tuple(image or ()),
         slots=slots,
         slot_memory=slot_memory * MEGABYTE,
         slot_processes=slot_processes,

@@ -34,8 +34,10 @@ from rce_container.exceptions import RuntimeUnavailableError
 from rce_container.folder import StateFolder
 from rce_container.limits import Limiter, choose_limiter
 from rce_container.manager import Manager
+from rce_container.offers import Offers, find_offers
 from rce_container.runtimes.base import Runtime, source_root
 from rce_container.runtimes.namespace import NamespaceRuntime
+from rce_container.runtimes.podman import PodmanRuntime
 from rce_container.runtimes.process import ProcessRuntime
 from rce_container.settings import ContainerSettings
 from rce_container.uids import UidPool
@@ -44,7 +46,7 @@ log = logging.getLogger(__name__)
 
 LINK_PORT = 10030
 AUTO = "auto"
-RUNTIMES = (NamespaceRuntime.name, ProcessRuntime.name)
+RUNTIMES = (NamespaceRuntime.name, PodmanRuntime.name, ProcessRuntime.name)
 
 _NOT_ISOLATED = "containers are NOT isolated: nodes may do all that this user may"
 
@@ -78,8 +80,10 @@ class App:
         """
         uids = UidPool(self.settings.first_uid, self.settings.uids)
         namespace = NamespaceRuntime(home_bytes=self.settings.home_bytes, uids=uids)
-        runtimes: dict[str, Runtime] = {one.name: one for one in (namespace, ProcessRuntime())}
+        podman = PodmanRuntime(self.settings.images, home_bytes=self.settings.home_bytes, uids=uids)
+        runtimes: dict[str, Runtime] = {one.name: one for one in (namespace, podman, ProcessRuntime())}
         runtime, detail = await asyncio.to_thread(choose_runtime, self.runtime, runtimes)
+        offers = await asyncio.to_thread(find_offers, runtime, runtimes.values())
         await asyncio.to_thread(_compile_engine)
         state_dir = self.state_dir or default_state_dir() / "container"
         keep = self.settings.log_days, self.settings.log_space
@@ -97,7 +101,7 @@ class App:
                 reach = own_address(self.master, self.control_port) if is_any(self.host) else self.host
                 manager = Manager(
                     name=name,
-                    info=_machine(self.settings, runtime.name, limiter, detail),
+                    info=_machine(self.settings, offers, limiter, detail),
                     settings=self.settings,
                     runtimes=runtimes,
                     runtime=runtime,
@@ -158,6 +162,9 @@ def choose_runtime(wish: str, runtimes: dict[str, Runtime]) -> tuple[Runtime, st
             detail = f"{error}; "
         else:
             return namespace, namespace.detail
+    elif wish == PodmanRuntime.name:
+        runtimes[wish].probe()
+        return runtimes[wish], runtimes[wish].detail
     elif wish not in runtimes:
         raise RuntimeUnavailableError(
             wish, f"there is no such runtime; use one of {', '.join((AUTO, *runtimes))}"
@@ -201,7 +208,7 @@ def _quit_by_signal(manager: Manager) -> asyncio.Event:
     return quit_
 
 
-def _machine(settings: ContainerSettings, runtime: str, limiter: Limiter, detail: str) -> MachineInfo:
+def _machine(settings: ContainerSettings, offers: Offers, limiter: Limiter, detail: str) -> MachineInfo:
     memory = psutil.virtual_memory().total
     cores = os.cpu_count() or 0
     ceiling = limiter.ceiling()
@@ -213,12 +220,14 @@ def _machine(settings: ContainerSettings, runtime: str, limiter: Limiter, detail
         name=settings.machine,
         cores=cores,
         memory=memory,
-        runtime=runtime,
+        runtime=offers.runtimes[0],
+        runtimes=offers.runtimes,
+        networks=offers.networks,
         labels=settings.labels,
         requirements=settings.requirements is not None,
         slots=settings.slots or memory // MEMORY_PER_SLOT,
         limits=limiter.name,
-        detail="; ".join(filter(None, (detail, limiter.detail))),
+        detail="; ".join(filter(None, (detail, limiter.detail, offers.detail))),
     )
 
 

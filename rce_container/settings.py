@@ -48,6 +48,8 @@ class ContainerSettings:
     """How many bytes of packages that users brought are kept, unless more are in use."""
     requirements: InstallerSettings | None = None
     """How what these packages ask for in a ``requirements.txt`` is installed; None: it is not."""
+    images: tuple[str, ...] = ()
+    """See :class:`rce_container.runtimes.podman.PodmanRuntime`."""
     home_bytes: int = 256 * MEGABYTE
     """Size of a container's home, which lives in memory."""
     first_uid: int = FIRST_UID

@@ -21,7 +21,7 @@ HOLDER = (SHELL, "-c", f'echo && read -r word && [ "$word" = {FAREWELL.decode().
 """Says that the namespaces and mounts are there, then waits for the environment's farewell."""
 
 _GENERATIONS = 4
-"""How far the holder is from the shim, at most: bubblewrap takes one or two processes between them."""
+"""How far the holder is from the shim, at most: podman takes three processes between them."""
 
 
 class HeldHandle(Handle):
@@ -90,7 +90,7 @@ class HeldHandle(Handle):
         with socket.socket(fileno=os.dup(self._fds["tether"])) as tether:
             said, pid = await hear_credentials(tether, 1)
         if not said or not pid:
-            raise StartError("bubblewrap cannot make its namespaces")
+            raise StartError("its namespaces cannot be made")
         return pid
 
     def _open_holder(self, pid: int) -> int:

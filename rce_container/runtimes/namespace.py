@@ -76,10 +76,7 @@ class NamespaceRuntime(Runtime):
         """Make a container and start the engine's Python in it."""
         if not sys.platform.startswith("linux"):
             raise RuntimeUnavailableError(self.name, "it needs Linux")
-        if not self._bwrap:
-            raise RuntimeUnavailableError(
-                self.name, "bwrap is not installed (Debian, Ubuntu: apt install bubblewrap)"
-            )
+        self.require()
         _compile()
         self._nursery.close()
         self._nursery = Nursery(self._filter(), clean_environ(HOME))
@@ -90,6 +87,17 @@ class NamespaceRuntime(Runtime):
         if failures:
             self.close()
             raise RuntimeUnavailableError(self.name, str(failures[0])) from failures[0]
+
+    def require(self) -> None:
+        """Look for the programs that are needed. Blocks.
+
+        Raises:
+            RuntimeUnavailableError: One is missing.
+        """
+        if not self._bwrap:
+            raise RuntimeUnavailableError(
+                self.name, "bwrap is not installed (Debian, Ubuntu: apt install bubblewrap)"
+            )
 
     def bundles(self, folder: ContainerFolder) -> str:  # noqa: ARG002
         """The same in every container."""
@@ -104,7 +112,7 @@ class NamespaceRuntime(Runtime):
         return self._start(order)
 
     def _start(self, order: Order, check: tuple[str, ...] = ()) -> HeldHandle:
-        _write_etc(order)
+        write_etc(order)
         uid, lock = self._uids.take() if self._root else (0, -1)
         birth = Birth(
             boot=order.boot,
@@ -221,20 +229,26 @@ def system_mounts() -> list[str]:
 
 
 def read_only_mounts(paths: Iterable[Path]) -> list[str]:
-    """Bind paths where they are, leaving out what lies inside another one or inside the system's."""
-    bound = [Path("/usr")]
+    """Bind paths where they are, leaving out what lies inside the system's."""
     options: list[str] = []
-    for path in sorted({path.absolute() for path in paths}, key=lambda path: len(path.parts)):
-        if path == Path("/") or any(path.is_relative_to(outer) for outer in bound) or not path.exists():
-            continue
-        bound.append(path)
+    for path in outermost(paths, Path("/usr")):
         for parent in reversed(path.parents[:-1]):
             options += ["--dir", str(parent)]  # by itself bubblewrap makes them for its own user only
         options += ["--ro-bind", str(path), str(path)]
     return options
 
 
-def _write_etc(order: Order) -> None:
+def outermost(paths: Iterable[Path], *bound: Path) -> list[Path]:
+    """Leave out paths that lie inside another one or inside one that is ``bound``, or that do not exist."""
+    found: list[Path] = []
+    for path in sorted({path.absolute() for path in paths}, key=lambda path: len(path.parts)):
+        if path == Path("/") or any(map(path.is_relative_to, (*bound, *found))) or not path.exists():
+            continue
+        found.append(path)
+    return found
+
+
+def write_etc(order: Order) -> None:
     """Write the container's own ``/etc``, for its user to read. Its hosts may be known already."""
     etc, host = order.folder.etc, hostname(order.tag)
     etc.chmod(0o755)

@@ -1,36 +1,45 @@
-"""The runtime of images: podman makes the namespaces over an image's files, the nursery's children live in them.
+"""The runtime of images: podman makes the namespaces, the nursery's children live in them.
 
-It is the ``namespace`` runtime with another root: the holder is a shell of the image, started by podman, and
-the environment joins it from outside and confines itself as everywhere. So an image needs no Python of its own.
+It is the ``namespace`` runtime with another root. The holder is a shell of the image, started by podman; the
+environment joins it from outside and confines itself as everywhere, so an image needs no Python of its own.
 
-Podman, its monitor and the holder share a pid namespace of their own, whose process 1 is podman: they die
-together. All that podman notes of the container is in a tmpfs of a mount namespace of their own: it is gone with
-them, and the machine's own ``podman ps`` and mounts never show it. Images are read from the machine's store.
+Podman, its monitor and the holder have a pid namespace to themselves whose process 1 is podman: they die
+together. All that podman notes of the container is in memory, in a mount namespace of theirs, and goes with
+them; neither the machine's mounts nor its own ``podman ps`` ever show it. Images are read where they are.
 """
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 
 from rce_container.exceptions import RuntimeUnavailableError, StartError
 from rce_container.network.hosts import hostname
-from rce_container.nursery.mounts import HOME, LOGS, TEMPORARY
-from rce_container.runtimes.base import Order
-from rce_container.runtimes.held import HOLDER, HeldHandle
-from rce_container.runtimes.namespace import NamespaceRuntime, interpreter_paths, outermost, write_etc
+from rce_container.nursery.mounts import HOME, LOGS
+from rce_container.runtimes.base import SHELL, Order
+from rce_container.runtimes.held import HOLDER
+from rce_container.runtimes.namespace import (
+    BUNDLES,
+    HOME_BYTES,
+    NamespaceRuntime,
+    interpreter_paths,
+    outermost,
+)
+from rce_container.uids import UidPool
 
-_NAME = re.compile(r"[a-z0-9][\w.:-]*(/[\w.-]+)*(:[\w.-]+)?(@sha256:[0-9a-f]{64})?", re.ASCII | re.IGNORECASE)
+_IMAGE = re.compile(
+    r"[a-z0-9][\w.-]*(:[0-9]+)?(/[\w.-]+)*(:[\w.-]+)?(@sha256:[0-9a-f]{64})?", re.ASCII | re.IGNORECASE
+)
 _TIMEOUT_S = 20.0
-_OWN_FILES = ("passwd", "group", "hosts")
-_MACHINE = ("/usr", "/bin", "/lib", "/lib64")
+_DRIVER = "overlay"
 
-# Podman's own state is in memory. crun refuses machines that have controllers in both kinds of cgroups, though
-# it is to leave cgroups alone: the newer kind is hidden from it.
+# crun refuses machines that have controllers in cgroups of both versions, though it is to leave cgroups
+# alone: the newer version is hidden from it. Locks in files, because those in memory are the whole machine's.
 _SCRIPT = """
 mount -t tmpfs -o mode=700 tmpfs "$1" && cd "$1" || exit 1
 [ ! -d /sys/fs/cgroup/unified ] || mount -t tmpfs tmpfs /sys/fs/cgroup/unified
@@ -39,34 +48,159 @@ printf '[engine]\\nlock_type = "file"\\n' >conf
 shift
 exec "$@" 3<&0 0</dev/null 1>&2
 """
-_TETHER = "exec <&3 >&3 3<&-"
+_HOLDER = f"exec <&3 >&3 3<&-; {HOLDER[-1]}"
 """Podman passes the tether on as descriptor 3; the holder wants it as its standard input and output."""
+
+_APART = ("--mount", "--pid", "--fork", "--kill-child", "--mount-proc", "--propagation", "private")
+_MACHINE = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32")
+_OF_THE_IMAGE = ("/usr", "/opt/ros")
+_OWN_ETC = ("passwd", "group", "hosts")
+_TEMPORARY = ("/tmp:mode=1777", f"{HOME}:mode=755")  # noqa: S108 - the container's own
+_FIXED = (
+    *("--pull=never", "--entrypoint", SHELL, "--workdir=/", "--user=0:0", "--preserve-fds=1"),
+    *("--cgroups=disabled", "--cgroupns=private", "--ipc=private", "--read-only", "--read-only-tmpfs=false"),
+    *("--cap-drop=all", "--security-opt=no-new-privileges"),
+    *("--ulimit=nofile=1024:1024", "--ulimit=nproc=1024:1024"),  # podman's own may be above what is allowed
+    *("--no-hosts", "--passwd=false", "--unsetenv-all", "--http-proxy=false", "--image-volume=ignore"),
+    *("--systemd=false", "--sdnotify=ignore", "--log-driver=none"),
+)
 
 
 class PodmanRuntime(NamespaceRuntime):
-    """Isolation as by :class:`NamespaceRuntime`, in an image or a folder with a root file system. Needs root.
+    """Isolation as in :class:`NamespaceRuntime`, within an image or a folder. Needs root.
 
     Args:
-        images: What this machine offers beside the images in podman's store: folders. The first one, image or
-            folder, is that of containers which name none.
-        options: As for :class:`NamespaceRuntime`.
+        images: The folders with a root file system that containers may ask for, beside the images of
+            podman's store. The first one, folder or image, is that of containers which ask for none; without
+            any, those have the machine's programs.
+        home_bytes: Size of a container's home.
+        uids: The users for containers; None takes the default ones.
     """
 
     name = "podman"
 
-    def __init__(self, images: Sequence[str] = (), **options: Any) -> None:
-        super().__init__(**options)
+    def __init__(
+        self, images: Sequence[str] = (), *, home_bytes: int = HOME_BYTES, uids: UidPool | None = None
+    ) -> None:
+        super().__init__(home_bytes=home_bytes, uids=uids)
         self._images = tuple(images)
         self._podman = shutil.which("podman") or ""
-        self._store: tuple[str, str] = ("", "")
+        self._unshare = shutil.which("unshare") or ""
+        self._store = ""
 
-    def check_tools(self) -> None:
-        """Look for podman and its store of images."""
-        if not self._root:
-            raise RuntimeUnavailableError(self.name, "it needs root")
+    @property
+    def is_installed(self) -> bool:
+        """Whether podman is there, whether it works or not."""
+        return bool(self._podman)
+
+    def require(self) -> None:
+        """Look for podman and its images."""
+        reason = ""
         if not self._podman:
+            reason = "podman is not installed (Debian, Ubuntu: apt install podman crun)"
+        elif not self._root:
+            reason = "it needs root"
+        elif not self._unshare:
+            reason = "unshare is not installed (Debian, Ubuntu: apt install util-linux)"
+        if reason:
+            raise RuntimeUnavailableError(self.name, reason)
+        driver, self._store = self._find_store()
+        if driver != _DRIVER:
             raise RuntimeUnavailableError(
-                self.name, "podman is not installed (Debian, Ubuntu: apt install podman crun)"
+                self.name,
+                f"podman's images are in a store of the kind {driver!r}; set driver = {_DRIVER!r} in "
+                "/etc/containers/storage.conf",
             )
-        if not shutil.which("unshare"):
-            raise RuntimeUnavailableError(self.name, "unshare is not installed (Debian: apt install util-linux)")
+
+    def _find_store(self) -> tuple[str, str]:
+        form = "{{.Store.GraphDriverName}} {{.Store.GraphRoot}}"
+        try:
+            found = subprocess.run(  # noqa: S603
+                [self._podman, "info", "--format", form],
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                timeout=_TIMEOUT_S,
+                check=True,
+            )
+        except subprocess.CalledProcessError as error:
+            raise RuntimeUnavailableError(self.name, error.stderr.strip() or str(error)) from error
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise RuntimeUnavailableError(self.name, str(error)) from error
+        driver, _, root = found.stdout.strip().partition(" ")
+        return driver, root
+
+    def _command(self, order: Order) -> list[str]:
+        state = order.folder.path / "podman"
+        state.mkdir(mode=0o700, exist_ok=True)
+        podman = {
+            "--root": f"{state}/root",
+            "--runroot": f"{state}/run",
+            "--tmpdir": f"{state}/events",
+            "--runtime-flag": f"root={state}/crun",
+            "--cgroup-manager": "cgroupfs",
+            "--events-backend": "none",
+            "--storage-driver": _DRIVER,
+            "--storage-opt": f"additionalimagestore={self._store}",
+        }
+        run = {
+            "--name": order.folder.mark,
+            "--hostname": hostname(order.tag),
+            "--network": "host" if order.host_network else "none",
+        }
+        return [
+            *(self._unshare, *_APART, SHELL, "-c", _SCRIPT, "rce-podman", str(state)),
+            *(self._podman, *chain.from_iterable(podman.items())),
+            *("run", *_FIXED, *chain.from_iterable(run.items())),
+            *(f"--tmpfs={one},notmpcopyup" for one in _TEMPORARY),
+            *self._root_of(order),
+            *("-c", _HOLDER),
+        ]
+
+    def _root_of(self, order: Order) -> list[str]:
+        """The options that say what is mounted, and the image at their end.
+
+        Raises:
+            StartError: There is no such image for containers.
+        """
+        folder = order.folder
+        mounts = [(path, str(path)) for path in outermost(_paths(order))]
+        mounts += [(folder.etc / name, f"/etc/{name}") for name in _OWN_ETC]
+        mounts.append((folder.bundles, BUNDLES))
+        image = order.image or (self._images[0] if self._images else "")
+        if not image:
+            root = folder.path / "root"
+            root.mkdir(mode=0o755, exist_ok=True)
+            mounts += [(Path(path), path) for path in _MACHINE if Path(path).is_dir()]
+            last = ["--rootfs", f"{root}:O"]
+        elif image.startswith("/"):
+            if image not in self._images:
+                raise StartError(
+                    f"the folder {image} is not offered to containers; this machine's operator may offer it: "
+                    f"rce-container --image {image}"
+                )
+            last = ["--rootfs", f"{image}:O"]
+        elif _IMAGE.fullmatch(image):
+            last = [image]
+        else:
+            raise StartError(f"{image!r} is neither the name of an image nor the path of a folder")
+        options = [f"--volume={source}:{target}:ro" for source, target in mounts]
+        return [*options, f"--volume={folder.logs}:{LOGS}:rw", *last]
+
+
+def _paths(order: Order) -> list[Path]:
+    """What is seen inside at the same place as outside. What an image may have itself is the image's."""
+    packages = [path for path in order.packages if not any(map(path.is_relative_to, _OF_THE_IMAGE))]
+    return [*_engine_paths(), *packages]
+
+
+def _engine_paths() -> list[Path]:
+    """The engine and its Python; of a Python among the system's programs only what is its own."""
+    found: list[Path] = []
+    python = f"python{sys.version_info.major}.{sys.version_info.minor}"
+    for path in interpreter_paths():
+        if path in (Path("/usr"), Path("/usr/local")):
+            found += [path / "bin" / python, path / "lib" / python, *path.glob(f"lib/lib{python}*")]
+        else:
+            found.append(path)
+    return found
