@@ -9,9 +9,17 @@ BundleTrouble              told to the owner as it is; it is tried again
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 
 class BundleTrouble(Exception):  # noqa: N818 - base of what is told to a package's owner
-    """A package cannot come into a container now; the text says why and what to do."""
+    """A package cannot come into a container now; the text says why and what to do.
+
+    Attributes:
+        patience: How many times the usual pause is made before it is tried again.
+    """
+
+    patience: ClassVar[float] = 1.0
 
 
 class Unfetched(BundleTrouble):
@@ -28,3 +36,5 @@ class NoSpace(BundleTrouble):
 
 class RequirementsTrouble(BundleTrouble):
     """What it needs of Python cannot be installed."""
+
+    patience = 10.0  # each attempt costs the machine, and whoever serves the distributions, a lot

@@ -183,6 +183,7 @@ class Installer:
             *system_mounts(),
             *("--proc", "/proc", "--dev", "/dev", "--tmpfs", "/tmp"),  # noqa: S108 - its own
             *(("--chmod", "1777", "/tmp") if root else ()),  # noqa: S108
+            *("--dir", "/etc"),
             *(word for name in _ETC for word in ("--ro-bind-try", f"/etc/{name}", f"/etc/{name}")),
             *read_only_mounts([*interpreter_paths(), *seen]),
             *("--bind", str(build), BUILD, "--chdir", BUILD, "--"),

@@ -111,11 +111,11 @@ class Supply:
                 attempt += 1
                 what = f"package {bundle.name} {bundle.version}"
                 text = f"{what} is not there yet: {trouble}; it is tried again"
-                log.warning("%s: %s", self._holder, text)
                 if text != told:
+                    log.warning("%s: %s", self._holder, text)
                     self._tell(text)
                 told = text
-                await asyncio.sleep(pause)
+                await asyncio.sleep(pause * trouble.patience)
             else:
                 self._on_arrival()
                 return
