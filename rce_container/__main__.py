@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
-import logging
 import shlex
 import socket
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 import uvloop
 
+from rce.cli.options import (
+    LOOPBACK,
+    ControlPort,
+    Development,
+    LinkPort,
+    Machine,
+    MasterHost,
+    SecretFile,
+    Verbose,
+    chosen,
+    config_option,
+    start_logging,
+)
 from rce.config.exceptions import RunDirError, SecretError
 from rce.config.secret import load_secret
 from rce.control.limits import MEGABYTE
@@ -21,24 +33,41 @@ from rce_container.bundles.requirements import InstallerSettings
 from rce_container.exceptions import ContainerError
 from rce_container.settings import ContainerSettings
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+if TYPE_CHECKING:
+    from rce.config.settings import EngineSettings
 
-_LOOPBACK = "127.0.0.1"
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
 RuntimeName = Enum("RuntimeName", {name: name for name in (AUTO, *RUNTIMES)})  # type: ignore[misc]
 _AUTO = RuntimeName(AUTO)
 
 
+def _pick(settings: EngineSettings) -> dict[str, Any]:
+    """Say which settings of a file are which parameters here."""
+    picked = chosen(
+        settings.container,
+        {
+            "bind": "bind",
+            "link_port": "link_port",
+            "grace": "grace",
+            "labels": "label",
+            "package_path": "package_path_",
+        },
+    )
+    if "runtime" in settings.container.model_fields_set:
+        picked["runtime"] = settings.container.runtime.value
+    if "state_dir" in settings.model_fields_set:
+        picked["state_dir"] = settings.state_dir / "container"
+    return picked
+
+
 @app.command()
 def container(
-    master: Annotated[str, typer.Argument(metavar="MASTER_IP", help="Host or address of the master.")],
-    control_port: Annotated[int, typer.Option(help="The master's port for task sets.")] = 8080,
-    link_port: Annotated[
-        int | None,
-        typer.Option(help="Port for data links; 0 takes a free one [default: 10030, or a free one]"),
-    ] = None,
-    bind: Annotated[str, typer.Option(help="Address to accept links on [default: all]")] = "",
+    master: MasterHost,
+    control_port: ControlPort = 8080,
+    link_port: LinkPort = None,
+    bind: Annotated[str, typer.Option(help="Address to accept links on (default: all)")] = "",
     state_dir: Annotated[
         Path | None, typer.Option(help="Folder for name, logs and homes of the containers.")
     ] = None,
@@ -65,7 +94,7 @@ def container(
     ] = None,
     slots: Annotated[
         int,
-        typer.Option(help="Slots that this machine offers [default: one for each 64 MB of memory]", min=0),
+        typer.Option(help="Slots that this machine offers (default: one for each 64 MB of memory)", min=0),
     ] = 0,
     slot_memory: Annotated[
         int, typer.Option(metavar="MB", help="Memory of a container for each of its slots.", min=32)
@@ -86,18 +115,15 @@ def container(
     pip_args: Annotated[
         str, typer.Option(help="More arguments for pip, such as '--index-url URL'; split as a shell does.")
     ] = "",
-    name: Annotated[str, typer.Option(help="Name of this task set [default: made up once, then kept]")] = "",
-    machine: Annotated[str, typer.Option(help="Name of this machine [default: its host name]")] = "",
-    secret_file: Annotated[Path | None, typer.Option(help="File with the engine's shared secret.")] = None,
-    dev: Annotated[bool, typer.Option("--dev", help="Loopback only, with the development secret.")] = False,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log more.")] = False,
+    name: Annotated[str, typer.Option(help="Name of this task set (default: made up once, then kept)")] = "",
+    machine: Machine = "",
+    secret_file: SecretFile = None,
+    config: Annotated[Path | None, config_option(_pick)] = None,  # noqa: ARG001 - read before all others
+    dev: Development = False,
+    verbose: Verbose = False,
 ) -> None:
     """Run a container task set: makes the containers of the master at MASTER_IP on this machine."""
-    logging.basicConfig(
-        level=logging.DEBUG if verbose else logging.INFO,
-        format="%(asctime)s %(levelname)s %(name)s: %(message)s",
-    )
-    logging.getLogger("websockets").setLevel(logging.WARNING)
+    start_logging(verbose=verbose)
     settings = ContainerSettings(
         machine=machine or socket.gethostname(),
         packages=package_path(package_path_ or ()),
@@ -119,7 +145,7 @@ def container(
             settings=settings,
             runtime=runtime.value,
             link_port=link_port,
-            host=bind or (_LOOPBACK if dev else ""),
+            host=bind or (LOOPBACK if dev else ""),
             name=name,
             state_dir=state_dir,
         )

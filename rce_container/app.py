@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import compileall
 import contextlib
-import errno
 import logging
 import math
 import os
@@ -26,6 +25,7 @@ from rce.control.limits import MEMORY_PER_SLOT
 from rce.control.messages import MachineInfo
 from rce.link.address import in_url, is_any, own_address
 from rce.link.handover import Doorman
+from rce.link.listening import listen_on
 from rce.ros.packages import PackageIndex, installed_shares
 from rce_container.bundles.cache import BundleCache
 from rce_container.bundles.requirements import Installer
@@ -44,7 +44,6 @@ from rce_container.uids import UidPool
 
 log = logging.getLogger(__name__)
 
-LINK_PORT = 10030
 AUTO = "auto"
 RUNTIMES = (NamespaceRuntime.name, PodmanRuntime.name, ProcessRuntime.name)
 
@@ -92,7 +91,7 @@ class App:
             doorman = Doorman()
             async with contextlib.AsyncExitStack() as stack:
                 stack.push_async_callback(doorman.close)
-                port = await _listen(doorman, self.host, self.link_port)
+                port = await listen_on(doorman.listen, self.host, self.link_port)
                 limiter = await asyncio.to_thread(choose_limiter, state.token, state.cgroups)
                 stack.callback(limiter.close)
                 for one in runtimes.values():
@@ -181,18 +180,6 @@ def package_path(given: Sequence[Path]) -> tuple[Path, ...]:
         paths.append(examples_dir())
     paths += installed_shares()
     return tuple(dict.fromkeys(path.absolute() for path in paths))
-
-
-async def _listen(doorman: Doorman, host: str, port: int | None) -> int:
-    if port is not None:
-        return await doorman.listen(host, port)
-    try:
-        return await doorman.listen(host, LINK_PORT)
-    except OSError as error:
-        if error.errno != errno.EADDRINUSE:
-            raise
-        log.info("port %d is taken; links are accepted on another one", LINK_PORT)
-        return await doorman.listen(host, 0)
 
 
 def _quit_by_signal(manager: Manager) -> asyncio.Event:

@@ -2,67 +2,104 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 import uvloop
 
+from rce.cli.options import (
+    LOOPBACK,
+    ControlPort,
+    Development,
+    LinkPort,
+    Machine,
+    MasterHost,
+    SecretFile,
+    Verbose,
+    chosen,
+    config_option,
+    start_logging,
+)
 from rce.config.exceptions import RunDirError, SecretError
 from rce.config.secret import load_secret
+from rce.control.limits import MEGABYTE
 from rce.guard.files import raise_file_limit
 from rce.ros.tcpros.allocator import keep_large_blocks
 from rce_robot.app import App
 from rce_robot.settings import RobotSettings
 
+if TYPE_CHECKING:
+    from rce.config.settings import EngineSettings
+
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 _DEFAULTS = RobotSettings()
-_LOOPBACK = "127.0.0.1"
+
+
+def _pick(settings: EngineSettings) -> dict[str, Any]:
+    """Say which settings of a file are which parameters here."""
+    names = ("bind", "ws_port", "link_port", "public_host", "public_url")
+    sizes = {"user_memory": "user_memory", "memory": "memory"}
+    return {
+        **chosen(settings.robot, {name: name for name in names}),
+        **chosen(settings.robot, {"origins": "origin", "strangers": "strangers"}),
+        **{name: size // MEGABYTE for name, size in chosen(settings.robot, sizes).items()},
+        **chosen(settings.container, {"package_path": "package_path"}),
+    }
 
 
 @app.command()
 def robot(
-    master: Annotated[str, typer.Argument(metavar="MASTER_IP", help="Host or address of the master.")],
-    control_port: Annotated[int, typer.Option(help="The master's port for task sets.")] = 8080,
+    master: MasterHost,
+    control_port: ControlPort = 8080,
     ws_port: Annotated[int, typer.Option(help="Port that robots connect to; 0 takes a free one.")] = 9010,
-    link_port: Annotated[
-        int | None,
-        typer.Option(help="Port for data links; 0 takes a free one [default: 10030, or a free one]"),
-    ] = None,
-    bind: Annotated[str, typer.Option(help="Address to listen on [default: all]")] = "",
+    link_port: LinkPort = None,
+    bind: Annotated[str, typer.Option(help="Address to listen on (default: all)")] = "",
     public_host: Annotated[
-        str, typer.Option(help="Name or address of this machine for others [default: found out]")
+        str, typer.Option(help="Name or address of this machine for others (default: found out)")
     ] = "",
     public_url: Annotated[
         str, typer.Option(help="WebSocket URL that robots are sent to, if it is another.")
     ] = "",
-    machine: Annotated[str, typer.Option(help="Name of this machine [default: its host name]")] = "",
+    machine: Machine = "",
     package_path: Annotated[
         list[Path] | None, typer.Option(help="Folder with packages that define messages; may be repeated.")
     ] = None,
-    secret_file: Annotated[Path | None, typer.Option(help="File with the engine's shared secret.")] = None,
+    secret_file: SecretFile = None,
     origin: Annotated[
         list[str] | None, typer.Option(help="Origin of web pages that may connect; may be repeated.")
     ] = None,
-    dev: Annotated[bool, typer.Option("--dev", help="Loopback only, with the development secret.")] = False,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log more.")] = False,
+    user_memory: Annotated[
+        int,
+        typer.Option(
+            metavar="MB", help="What may wait for all robots of a user; over it the oldest goes.", min=1
+        ),
+    ] = _DEFAULTS.user_memory // MEGABYTE,
+    memory: Annotated[
+        int,
+        typer.Option(metavar="MB", help="The same for all users (default: half of the machine's)", min=0),
+    ] = 0,
+    strangers: Annotated[
+        int, typer.Option(help="Connections that have not logged in yet, from one address.", min=1)
+    ] = _DEFAULTS.strangers_per_address,
+    config: Annotated[Path | None, config_option(_pick)] = None,  # noqa: ARG001 - read before all others
+    dev: Development = False,
+    verbose: Verbose = False,
 ) -> None:
     """Run a robot task set: the WebSocket endpoint of robots, next to the master at MASTER_IP."""
-    logging.basicConfig(
-        level=logging.DEBUG if verbose else logging.INFO,
-        format="%(asctime)s %(levelname)s %(name)s: %(message)s",
-    )
-    logging.getLogger("websockets").setLevel(logging.WARNING)
+    start_logging(verbose=verbose)
     settings = RobotSettings(
-        host=bind or (_LOOPBACK if dev else _DEFAULTS.host),
+        host=bind or (LOOPBACK if dev else _DEFAULTS.host),
         ws_port=ws_port,
         link_port=link_port,
         public_host=public_host,
         public_url=public_url,
         machine=machine,
         origins=tuple(origin or ()),
+        user_memory=user_memory * MEGABYTE,
+        memory=memory * MEGABYTE,
+        strangers_per_address=strangers,
     )
     keep_large_blocks()
     raise_file_limit()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import errno
 import os
 import secrets
 import signal
@@ -23,6 +22,7 @@ from rce.control.model import LinkAddress
 from rce.guard.lobby import Lobby
 from rce.link import LinkHub
 from rce.link.address import in_url, is_any, own_address
+from rce.link.listening import listen_on
 from rce.link.unix import remove_stale_sockets
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rce.config.secret import Secret
-
-DEFAULT_LINK_PORT = 10030
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -131,19 +129,8 @@ async def _listen(hub: LinkHub, machine: str, name: str, reach: str, settings: R
     remove_stale_sockets(run_dir(), "robot_*.sock")
     path = run_dir() / f"{name}.sock"
     await hub.listen_unix(path)
-    port = await _listen_tcp(hub, settings.host, settings.link_port)
+    port = await listen_on(hub.listen_tcp, settings.host, settings.link_port)
     return LinkAddress(machine=machine, unix=str(path), host=reach, port=port)
-
-
-async def _listen_tcp(hub: LinkHub, host: str, port: int | None) -> int:
-    if port is not None:
-        return await hub.listen_tcp(host, port)
-    try:
-        return await hub.listen_tcp(host, DEFAULT_LINK_PORT)
-    except OSError as error:
-        if error.errno != errno.EADDRINUSE:
-            raise
-    return await hub.listen_tcp(host, 0)
 
 
 async def _bind(host: str, port: int) -> socket.socket:

@@ -1,0 +1,40 @@
+"""Which port a program accepts links on."""
+
+from __future__ import annotations
+
+import errno
+import logging
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+DEFAULT_PORT = 10030
+_log = logging.getLogger(__name__)
+
+
+async def listen_on(listen: Callable[[str, int], Awaitable[int]], host: str, port: int | None) -> int:
+    """Accept links: where it is said, else on :data:`DEFAULT_PORT`, or a free one where that is taken.
+
+    Peers learn the port from the master.
+
+    Args:
+        listen: Binds an address and a port (0: a free one); returns the port taken.
+        host: Address to bind.
+        port: None for the default one.
+
+    Returns:
+        The port taken.
+
+    Raises:
+        OSError: It cannot be taken.
+    """
+    if port is not None:
+        return await listen(host, port)
+    try:
+        return await listen(host, DEFAULT_PORT)
+    except OSError as error:
+        if error.errno != errno.EADDRINUSE:
+            raise
+    _log.info("port %d is taken; links are accepted on another one", DEFAULT_PORT)
+    return await listen(host, 0)
