@@ -46,9 +46,9 @@ def confine(birth: Birth, gifts: Gifts, program: bytes) -> int:
     procfs = os.open("/proc", os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
     _enter(gifts.holder, procfs, birth)
     owner = birth.uid or os.geteuid()
-    mounts.limit(mounts.HOME, birth.home_bytes, owner)
+    mounts.limit(mounts.HOME, birth.home_bytes, owner, 0o700)
     for path in mounts.TEMPORARY:
-        mounts.limit(path, birth.tmp_bytes, owner)
+        mounts.limit(path, birth.tmp_bytes, owner, 0o1777)
     mounts.mask_machine()
     logs = mounts.take_away_logs(owner)
     os.fchown(gifts.log, owner, owner)

@@ -40,17 +40,19 @@ _HIDDEN = (
 _READ_ONLY = ("/proc/bus", "/proc/fs", "/proc/irq", "/proc/sys", "/proc/sysrq-trigger")
 
 
-def limit(path: str, size: int, owner: int) -> None:
+def limit(path: str, size: int, owner: int, mode: int) -> None:
     """Bound a folder that lives in memory, and give it to a user.
 
     Args:
         path: A tmpfs.
         size: Bytes.
         owner: User and group.
+        mode: Permissions.
     """
     options = f"size={size},nr_inodes={size // _BYTES_PER_FILE}"
     mount(path, Mount.REMOUNT | _FLAGS, options=options)
     os.chown(path, owner, owner)
+    os.chmod(path, mode)  # noqa: PTH101 - like its neighbours
 
 
 def take_away_logs(owner: int) -> int:

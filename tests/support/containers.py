@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import os
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,7 @@ from rce_container.limits import choose_limiter
 from rce_container.manager import Manager
 from rce_container.runtimes.base import Runtime
 from rce_container.runtimes.namespace import NamespaceRuntime
+from rce_container.runtimes.podman import PodmanRuntime
 from rce_container.runtimes.process import ProcessRuntime
 from rce_container.settings import ContainerSettings
 
@@ -125,9 +126,11 @@ async def until(
 class Machine:
     """A machine's disk, and the managers that run on it one after the other."""
 
-    def __init__(self, folder: Path, runtime: str) -> None:
+    def __init__(self, folder: Path, runtime: str, images: Sequence[str] = (), **options: Any) -> None:
         self.folder = folder
-        self.runtimes: dict[str, Runtime] = {one.name: one for one in (NamespaceRuntime(), ProcessRuntime())}
+        podman = PodmanRuntime(images, **options)
+        runtimes: tuple[Runtime, ...] = (NamespaceRuntime(**options), podman, ProcessRuntime())
+        self.runtimes = {one.name: one for one in runtimes}
         self.runtime = self.runtimes[runtime]
         self.runtime.probe()
         self.packages = folder / "packages"
@@ -170,7 +173,7 @@ class Machine:
             self.cgroups = state.cgroups
             self.manager = Manager(
                 name=state.name(""),
-                info=MachineInfo(name=MACHINE),
+                info=MachineInfo(name=MACHINE, runtimes=tuple(self.runtimes)),
                 settings=settings,
                 runtimes=self.runtimes,
                 runtime=self.runtime,

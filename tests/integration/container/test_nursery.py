@@ -1,0 +1,154 @@
+"""What happens to containers and their starts when a process of their machinery dies."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+from support.containers import ECHO, Machine, until
+
+from rce.control.model import EndpointState, NodeSpec, NodeState
+from rce_container.environment import proc
+from rce_container.runtimes.held import HeldHandle
+from rce_container.runtimes.namespace import NamespaceRuntime
+
+BOX = "user/box"
+TALK = NodeSpec(tag="node", pkg="own", exe="talk.py")
+
+pytestmark = pytest.mark.needs("bwrap")
+
+
+@pytest.fixture
+async def namespaces(folder: Path) -> AsyncIterator[Machine]:
+    machine = Machine(folder, "namespace")
+    yield machine
+    machine.tidy()
+
+
+def nursery(machine: Machine) -> int:
+    assert isinstance(machine.runtime, NamespaceRuntime)
+    return machine.runtime._nursery.pid
+
+
+async def running(machine: Machine, id_: str = BOX, **parts: object) -> None:
+    await machine.put(id_, **parts)
+    await until(lambda: (s := machine.status(id_)) is not None and s.state is EndpointState.RUNNING)
+
+
+@pytest.mark.parametrize("victim", ["holder", "bubblewrap", "shim", "environment"])
+async def test_a_container_that_lost_a_part_is_made_again(namespaces: Machine, victim: str) -> None:
+    machine = namespaces
+    async with machine.engine():
+        await running(machine, nodes=(ECHO,))
+        await machine.node_is(BOX, "echo", NodeState.RUNNING)
+        first = machine.status(BOX)
+        (unit,) = machine.manager._units.values()
+        handle = unit.handle
+        assert isinstance(handle, HeldHandle)
+        assert handle.environment is not None
+        machine.note_processes()
+        holder = proc.read(handle.namespaces_pid)
+        assert holder is not None
+        pids = {
+            "holder": holder.pid,
+            "bubblewrap": holder.parent,
+            "shim": handle.process.pid,
+            "environment": handle.environment.pid,
+        }
+        assert len(set(pids.values())) == 4
+        os.kill(pids[victim], signal.SIGKILL)
+        await until(lambda: machine.status(BOX).incarnation not in ("", first.incarnation))
+        assert [pid for pid, start in machine.pids.items() if proc.alive(pid, start)] == []
+        await machine.node_is(BOX, "echo", NodeState.RUNNING)
+
+
+async def test_containers_do_not_need_the_nursery(namespaces: Machine) -> None:
+    machine = namespaces
+    async with machine.engine():
+        await running(machine, nodes=(TALK,))
+        before = machine.status(BOX)
+        old = nursery(machine)
+        os.kill(old, signal.SIGKILL)
+        await running(machine, "user/other")
+        assert nursery(machine) not in (0, old)
+        assert machine.status(BOX).incarnation == before.incarnation
+        await machine.put(BOX, 2, nodes=(TALK, ECHO))
+        await machine.node_is(BOX, "echo", NodeState.RUNNING)
+        assert machine.faults == []
+
+
+async def test_a_start_survives_the_nursery(namespaces: Machine) -> None:
+    machine = namespaces
+    async with machine.engine():
+        old = nursery(machine)
+        os.kill(old, signal.SIGSTOP)
+        await machine.put(BOX)
+        await until(lambda: _waits_for_birth(machine), what="the nursery has got its order")
+        os.kill(old, signal.SIGKILL)
+        await until(lambda: machine.status(BOX).state is EndpointState.RUNNING)
+        assert machine.faults == []
+        assert len(machine.marks | {path.name for path in machine.containers}) == 1
+
+
+def _waits_for_birth(machine: Machine) -> bool:
+    return any(unit.handle.namespaces_pid and not unit.handle.environment for unit in _units(machine))
+
+
+def _units(machine: Machine) -> list[object]:
+    return list(machine.manager._units.values())
+
+
+async def test_a_manager_that_dies_before_a_birth_leaves_nothing(namespaces: Machine) -> None:
+    machine = namespaces
+    async with machine.managed(grace=0.2):
+        os.kill(nursery(machine), signal.SIGSTOP)
+        await machine.put(BOX)
+        await until(lambda: _waits_for_birth(machine), what="the nursery has got its order")
+        machine.note_processes()
+    os.kill(nursery(machine), signal.SIGKILL)
+    await until(lambda: not machine.left(), what=machine.left)
+
+
+async def test_a_node_starts_without_the_cradle(namespaces: Machine) -> None:
+    machine = namespaces
+    async with machine.engine():
+        await running(machine)
+        (cradle,) = [one for one in machine.processes() if _name(one.pid) == "rce-cradle"]
+        os.kill(cradle.pid, signal.SIGKILL)
+        await until(lambda: not proc.alive(cradle.pid, cradle.start))
+        await machine.put(BOX, 2, nodes=(TALK, ECHO))
+        assert "hello" in await machine.log_holds(BOX, "node", "hello")
+        await machine.node_is(BOX, "echo", NodeState.RUNNING)
+        assert machine.faults == []
+
+
+def _name(pid: int) -> str:
+    return Path(f"/proc/{pid}/comm").read_text().strip()
+
+
+async def test_the_nursery_ends_with_its_manager(namespaces: Machine) -> None:
+    pid = nursery(namespaces)
+    process = proc.read(pid)
+    assert process is not None
+    assert isinstance(namespaces.runtime, NamespaceRuntime)
+    orders = namespaces.runtime._nursery._orders
+    assert orders is not None
+    orders.close()
+    await until(lambda: not proc.alive(pid, process.start), what="the nursery has ended")
+
+
+async def test_nobody_waits_for_bubblewrap_that_fails(namespaces: Machine) -> None:
+    machine = namespaces
+    async with machine.engine():
+        assert isinstance(machine.runtime, NamespaceRuntime)
+        machine.runtime._bwrap = "/bin/false"
+        await machine.put(BOX)
+        await until(lambda: machine.faults, timeout=10)
+        assert "its namespaces cannot be made" in machine.faults[0]
+        machine.runtime._bwrap = "/usr/bin/bwrap"
+        async with asyncio.timeout(20):
+            await until(lambda: machine.status(BOX).state is EndpointState.RUNNING)
