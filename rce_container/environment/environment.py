@@ -71,6 +71,7 @@ class Environment:
         self._cradle = cradle
         self._loop = asyncio.get_running_loop()
         self._ending = asyncio.Event()
+        self._end_reason = ""
         self._desired = EndpointSpec(id=boot.id, kind=EndpointKind.CONTAINER, revision=-1)
         self._applied_revision = -1
         self._news = asyncio.Event()
@@ -125,6 +126,7 @@ class Environment:
                 await self._close()
                 serving.cancel()
                 watching.cancel()
+        log.info("ended: %s", self._end_reason)
 
     def _make_core(self) -> Core:
         """The container's core, at its loopback and, if it has one, at its address in its group."""
@@ -135,6 +137,7 @@ class Environment:
     def end(self, reason: str) -> None:
         """Begin to end the container, whole."""
         log.info("ending: %s", reason)
+        self._end_reason = self._end_reason or reason
         self._ending.set()
 
     async def _close(self) -> None:

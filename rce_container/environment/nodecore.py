@@ -38,6 +38,8 @@ WELL_S = 30.0
 """A node that ran well for so long starts at the first pause again, and its restarts count anew."""
 FIRST_BEAT_WITHIN_S = 30.0
 """How long after its start a node may take for its first heartbeat."""
+LAST_CHANCE_S = 0.25
+"""How long a stuck node is seen to be so, and may still give a sign, before it is ended."""
 REGISTERS_WITHIN_S = 10.0
 """A node that did not register with the ROS core for so long probably never will."""
 SETTLES_WITHIN_S = 0.5
@@ -73,7 +75,7 @@ class _Node:
     """When it may be started again."""
     started_at: float = 0.0
     registered_at: float | None = None
-    ill_at: float | None = None
+    ill_at: float = math.inf
     """When it was taken for stuck."""
     silent_at: float = math.inf
     """When it is taken for stuck, unless a heartbeat comes before."""
@@ -101,8 +103,20 @@ class _Node:
         return bool(self.spec.heartbeat) and self.state in (NodeState.STARTING, NodeState.RUNNING)
 
     def ran_well(self, now: float) -> bool:
-        until = now if self.ill_at is None else self.ill_at
-        return until - self.started_at >= WELL_S
+        return min(now, self.ill_at) - self.started_at >= WELL_S
+
+    def is_given_up(self, now: float) -> bool:
+        """Whether it is stuck, and is to be ended for that."""
+        return (
+            self.state is NodeState.STUCK
+            and not self.is_leaving
+            and self.restarts_after(failed=True)
+            and now >= self.ill_at + LAST_CHANCE_S
+        )
+
+    def restarts_after(self, *, failed: bool) -> bool:
+        policy = self.spec.restart
+        return policy is RestartPolicy.ALWAYS or (failed and policy is RestartPolicy.ON_FAILURE)
 
     def status(self) -> NodeStatus:
         return NodeStatus(
@@ -259,14 +273,14 @@ class NodesCore:
         node.silent_at = self._now + node.spec.heartbeat_timeout
         if node.state is not NodeState.STUCK:
             return False
-        node.ill_at = None
+        node.ill_at = math.inf
         self._become(node, Happening.BEAT)
         self._note(node, "its heartbeat is there again")
         return True
 
     def _tick(self) -> None:
         for node in self._nodes.values():
-            if node.state is NodeState.STUCK and not node.is_leaving and self._restarts(node, failed=True):
+            if node.is_given_up(self._now):
                 node.failing = True
                 self._halt(node, node.detail)
             elif node.beats and node.silent_at <= self._now:
@@ -277,7 +291,7 @@ class NodesCore:
     def _stuck(self, node: _Node) -> None:
         node.ill_at = self._now
         self._become(node, Happening.SILENCE, detail=f"no message on {node.spec.heartbeat} any more")
-        again = "; it is restarted" if self._restarts(node, failed=True) else ""
+        again = "; it is restarted" if node.restarts_after(failed=True) else ""
         self._note(node, f"stuck: {node.detail}")
         self._tell(node, f"is stuck: {node.detail}{again}")
 
@@ -293,14 +307,14 @@ class NodesCore:
             self._renew(node, Happening.PAUSE)
         elif code == 0 and not stopped:
             self._end_well(node)
-        elif hopeless or not self._restarts(node, failed=True):
+        elif hopeless or not node.restarts_after(failed=True):
             self._fail(node, reason)
         else:
             self._again(node, reason, failed=True)
 
     def _end_well(self, node: _Node) -> None:
         node.is_done = True
-        if self._restarts(node, failed=False):
+        if node.restarts_after(failed=False):
             self._again(node, "ended by itself", failed=False)
         else:
             self._become(node, Happening.DONE, detail="ended by itself")
@@ -381,7 +395,7 @@ class NodesCore:
         node.restarts += node.pausing
         node.spec, node.exit_code = spec, None
         node.pausing = node.failing = node.is_done = False
-        node.started_at, node.registered_at, node.ill_at = self._now, None, None
+        node.started_at, node.registered_at, node.ill_at = self._now, None, math.inf
         node.silent_at = self._now + FIRST_BEAT_WITHIN_S
         self._become(node, Happening.LAUNCH)
         self._out.append(Launch(spec.tag, node.life, spec))
@@ -417,10 +431,6 @@ class NodesCore:
 
     # What is worked out
 
-    def _restarts(self, node: _Node, *, failed: bool) -> bool:
-        policy = node.spec.restart
-        return policy is RestartPolicy.ALWAYS or (failed and policy is RestartPolicy.ON_FAILURE)
-
     def _settles_at(self, node: _Node) -> float:
         match node.state:
             case NodeState.STARTING:
@@ -434,8 +444,7 @@ class NodesCore:
         return -math.inf
 
     def _deadline(self, node: _Node) -> float:
-        moments = list(self._moments(node))
-        return min(moments, default=math.inf)
+        return min(self._moments(node), default=math.inf)
 
     def _moments(self, node: _Node) -> Iterator[float]:
         if node.state is NodeState.WAITING and node.pausing and node.due > self._now:
@@ -444,8 +453,8 @@ class NodesCore:
             yield node.started_at + REGISTERS_WITHIN_S
         if node.beats:
             yield node.silent_at
-        if node.state is NodeState.STUCK and not node.is_leaving and self._restarts(node, failed=True):
-            yield self._now
+        if node.is_given_up(math.inf):
+            yield node.ill_at + LAST_CHANCE_S
 
 
 def _command(spec: NodeSpec) -> tuple[str, ...]:

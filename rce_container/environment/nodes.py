@@ -100,12 +100,11 @@ class NodeSet:
 
     def _feed(self, event: e.Event) -> None:
         instructions = self._core.handle(event, self._loop.time())
-        if not instructions and isinstance(event, e.Beat):
-            return
         for instruction in instructions:
             self._perform(instruction)
         self._set_timer()
-        self._workshop.on_change()
+        if instructions or not isinstance(event, e.Beat):
+            self._workshop.on_change()
 
     def _perform(self, instruction: e.Instruction) -> None:
         match instruction:

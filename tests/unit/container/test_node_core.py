@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 from rce.control.model import NodeSpec, NodeState, NodeStatus, RestartPolicy
 from rce_container.environment import nodeevents as e
 from rce_container.environment.life import NEXT, WITH_PROCESS, Happening, after
-from rce_container.environment.nodecore import BACKOFF_S, FIRST_BEAT_WITHIN_S, WELL_S, NodesCore
+from rce_container.environment.nodecore import (
+    BACKOFF_S,
+    FIRST_BEAT_WITHIN_S,
+    LAST_CHANCE_S,
+    WELL_S,
+    NodesCore,
+)
 from rce_container.environment.order import StartOrder, levels, ready_to_end
 
 FAILED = "exit code 3"
@@ -416,11 +422,9 @@ def test_a_silent_node_is_stuck_until_it_beats_again() -> None:
 
 def test_a_stuck_node_is_restarted_if_its_policy_says_so() -> None:
     world = beating(restart=RestartPolicy.ON_FAILURE, max_restarts=1)
-    world.wait(1.9)
-    world.now += 0.1
-    world.do(e.Tick())
+    world.wait(2.0)
     assert world.status().state is NodeState.STUCK, "it is seen to be stuck before it is ended"
-    world.wait(0)
+    world.wait(LAST_CHANCE_S)
     assert (world.status().state, set(world.halting)) == (NodeState.STOPPING, {"a"})
     assert world.core.is_degraded
     world.end(code=0)
@@ -430,9 +434,18 @@ def test_a_stuck_node_is_restarted_if_its_policy_says_so() -> None:
     world.wait(0.5)
     world.register()
     world.do(e.Beat("a"))
-    world.wait(2.0)
+    world.wait(2.0 + LAST_CHANCE_S)
     world.end(code=-9)
     assert world.status().state is NodeState.FAILED, "the limit counts here too"
+
+
+def test_a_stuck_node_has_a_last_chance() -> None:
+    world = beating(restart=RestartPolicy.ALWAYS)
+    world.wait(2.0)
+    world.wait(LAST_CHANCE_S / 2)
+    world.do(e.Beat("a"))
+    world.wait(1.9)
+    assert (world.status().state, world.halting) == (NodeState.RUNNING, {})
 
 
 def test_a_heart_that_never_began_to_beat_has_longer() -> None:

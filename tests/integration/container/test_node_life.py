@@ -1,0 +1,301 @@
+"""Nodes that crash, hang, wait for each other and talk: their life and their logs, with real processes."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from typing import Any
+
+import pytest
+from support.containers import Machine, joined, until
+
+from rce.control.logs import LogLevel, LogStream, LogWish
+from rce.control.messages import LogChunk, ReadLog, Status
+from rce.control.model import EndpointState, InterfaceSpec, NodeSpec, NodeState, RestartPolicy
+from rce.ros.types import TypeRegistry
+
+BOX = "user/box"
+STRING = TypeRegistry().message("std_msgs/String")
+
+NODES = {
+    "crash.py": (
+        "import sys\nprint('to stdout', flush=True)\nprint('it is broken', file=sys.stderr)\nsys.exit(3)\n"
+    ),
+    # Its first life beats for a second, then hangs and does not end on SIGINT; later ones beat for ever.
+    "beat.py": (
+        "import asyncio, pathlib, signal, sys, time\n"
+        "from rce.ros.node import Node, run\n"
+        "async def main():\n"
+        "    async with Node('beater') as node:\n"
+        "        beat = await node.advertise('beat', 'std_msgs/Empty')\n"
+        "        done = pathlib.Path('hung')\n"
+        "        while done.exists() or time.monotonic() < START + 1.0:\n"
+        "            beat.publish()\n"
+        "            await asyncio.sleep(0.05)\n"
+        "        done.touch()\n"
+        "        signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+        "        time.sleep(600)\n"
+        "START = time.monotonic()\n"
+        "run(main())\n"
+    ),
+    # Takes its time before it registers; prints what it hears.
+    "hear.py": (
+        "import asyncio, sys, time\n"
+        "from rce.ros.node import Node, run\n"
+        "async def main():\n"
+        "    async with Node(sys.argv[1]) as node:\n"
+        "        def hear(message):\n"
+        "            print('heard', message.data, flush=True)\n"
+        "        await node.subscribe(sys.argv[2], 'std_msgs/String', hear)\n"
+        "        print('ready', flush=True)\n"
+        "        await node.spin()\n"
+        "    print('left at', time.monotonic(), flush=True)\n"
+        "time.sleep(float(sys.argv[3]))\n"
+        "run(main())\n"
+    ),
+    "tell.py": (
+        "import sys\n"
+        "from rce.ros.node import Node, run\n"
+        "async def main():\n"
+        "    async with Node('teller') as node:\n"
+        "        print('printed', flush=True)\n"
+        "        print('complained', file=sys.stderr, flush=True)\n"
+        "        node.log.info('just saying')\n"
+        "        node.log.error('this is bad')\n"
+        "        await node.spin()\n"
+        "run(main())\n"
+    ),
+}
+
+
+@pytest.fixture(autouse=True)
+def _nodes(machine: Machine) -> None:
+    for name, text in NODES.items():
+        (machine.packages / "own" / "nodes" / name).write_text(text)
+
+
+def own(exe: str, args: str = "", tag: str = "node", **options: Any) -> NodeSpec:
+    return NodeSpec(tag=tag, pkg="own", exe=exe, args=args, **options)
+
+
+async def read(machine: Machine, node: str, *streams: LogStream, id_: str = BOX, **wish: Any) -> LogChunk:
+    request = ReadLog(request=1, id=id_, node=node, limit=1 << 20, wish=LogWish(streams=streams, **wish))
+    await machine.manager.handle(request)
+    chunk = machine.told.pop()
+    assert isinstance(chunk, LogChunk)
+    return chunk
+
+
+async def holds(machine: Machine, node: str, text: str, *streams: LogStream, **wish: Any) -> str:
+    async with asyncio.timeout(20):
+        while text not in (found := (await read(machine, node, *streams, **wish)).text):
+            await asyncio.sleep(0.02)
+    return found
+
+
+def states(machine: Machine, tag: str = "node") -> list[NodeState]:
+    """All states of a node that the master was told of, in order."""
+    found: list[NodeState] = []
+    for message in machine.of(Status):
+        for node in message.status.nodes:
+            if node.tag == tag and found[-1:] != [node.state]:
+                found.append(node.state)
+    return found
+
+
+async def test_a_node_that_crashes_is_restarted_up_to_its_limit(machine: Machine) -> None:
+    crash = own("crash.py", restart=RestartPolicy.ON_FAILURE, max_restarts=2)
+    async with machine.engine():
+        await machine.put(BOX, nodes=(crash, own("talk.py", tag="other")))
+        node = await machine.node_is(BOX, "node", NodeState.FAILED)
+        assert (node.restarts, node.exit_code, node.pid) == (2, 3, 0)
+        assert node.detail.startswith(
+            "exit code 3; its last words: it is broken; it was started again 2 times"
+        )
+        assert [one for one in states(machine) if one is NodeState.WAITING] == [NodeState.WAITING] * 2
+        assert machine.status(BOX).state is EndpointState.DEGRADED
+        text = (await read(machine, "node")).text
+        assert text.count("it is broken\n") == text.count("to stdout\n") == 3
+        ended = "-- ended: exit code 3; its last words: it is broken --\n"
+        pauses = "".join(f"{ended}-- starts again after {pause} s --\n" for pause in ("0.5", "1"))
+        assert (await read(machine, "node", LogStream.ENGINE)).text == pauses + ended
+        assert len([text for text in machine.faults if "node node" in text]) == 2
+        await machine.put(BOX, 2, nodes=(own("talk.py"), own("talk.py", tag="other")))
+        await until(lambda: machine.status(BOX).state is EndpointState.RUNNING, what="all is well again")
+        assert machine.node(BOX, "node").restarts == 0
+
+
+async def test_nodes_start_one_after_the_other_and_say_what_they_wait_for(machine: Machine) -> None:
+    async with machine.engine():
+        await machine.put(
+            BOX,
+            nodes=(
+                own("hear.py", "last x 0", tag="last", after=("slow", "once")),
+                own("hear.py", "slow x 0.5", tag="slow"),
+                own("end.py", tag="once"),
+                own("talk.py", tag="a", after=("b",)),
+                own("talk.py", tag="b", after=("a",)),
+                own("talk.py", tag="c", after=("nobody",)),
+            ),
+        )
+        assert (await machine.node_is(BOX, "last", NodeState.WAITING)).detail.startswith("waits for slow")
+        assert machine.node(BOX, "a").detail.startswith("waits for itself (a after b after a)")
+        assert machine.node(BOX, "c").detail.startswith("waits for 'nobody'")
+        await machine.node_is(BOX, "last", NodeState.RUNNING)
+        assert machine.node(BOX, "slow").state is NodeState.RUNNING
+        assert machine.node(BOX, "once").state is NodeState.EXITED
+        for tag in "abc":
+            assert machine.node(BOX, tag).state is NodeState.WAITING
+            assert any(f"node {tag} waits for" in fault for fault in machine.faults)
+
+
+async def test_nodes_end_in_the_reverse_of_their_order(machine: Machine) -> None:
+    async with machine.engine():
+        await machine.put(
+            BOX,
+            nodes=(
+                own("hear.py", "first x 0", tag="first"),
+                own("hear.py", "second x 0", tag="second", after=("first",)),
+                own("hear.py", "third x 0", tag="third", after=("second",)),
+            ),
+        )
+        await machine.node_is(BOX, "third", NodeState.RUNNING)
+        await machine.drop(BOX)
+        left = {}
+        for tag in ("first", "second", "third"):
+            text = (await read(machine, tag, LogStream.STDOUT)).text
+            left[tag] = float(text.rpartition("left at")[2])
+            assert "ended: it was told to" in (await read(machine, tag, LogStream.ENGINE)).text
+        assert left["third"] < left["second"] < left["first"]
+
+
+async def test_a_node_whose_heart_stops_is_restarted(machine: Machine) -> None:
+    beat = own("beat.py", heartbeat="beat", heartbeat_timeout=0.7, restart=RestartPolicy.ALWAYS)
+    async with machine.engine(interrupt_timeout=0.3, terminate_timeout=0.3):
+        await machine.put(BOX, nodes=(beat,))
+        await until(lambda: NodeState.STUCK in states(machine), what="the node is stuck")
+        first = await machine.node_is(BOX, "node", NodeState.RUNNING)
+        assert first.restarts == 1
+        await until(lambda: machine.status(BOX).state is EndpointState.RUNNING, what="all is well again")
+        found = states(machine)
+        stuck = found.index(NodeState.STUCK)
+        assert found[stuck : stuck + 5] == [
+            NodeState.STUCK,
+            NodeState.STOPPING,
+            NodeState.WAITING,
+            NodeState.STARTING,
+            NodeState.RUNNING,
+        ]
+        assert EndpointState.DEGRADED in [message.status.state for message in machine.of(Status)]
+        assert any(
+            "is stuck: no message on beat any more; it is restarted" in text for text in machine.faults
+        )
+        text = (await read(machine, "node", LogStream.ENGINE)).text
+        assert text.splitlines() == [
+            "-- stuck: no message on beat any more --",
+            "-- ended: killed, because it did not end on SIGINT and SIGTERM --",
+            "-- starts again after 0.5 s --",
+        ]
+
+
+async def test_what_is_sent_when_st_is_true_is_heard_by_nodes_that_start_late(machine: Machine) -> None:
+    interface = InterfaceSpec(tag="req", type="PublisherInterface", cls="std_msgs/String", addr="late")
+    async with machine.engine():
+        await machine.put(
+            BOX,
+            nodes=(
+                own("hear.py", "early other 0.5", tag="early"),
+                own("hear.py", "late late 0.5", tag="late", after=("early",)),
+            ),
+            interfaces=(interface,),
+            peer="user/robot",
+        )
+        address = (await until(lambda: machine.status(BOX), what="a status")).address
+        async with joined(address) as peer:
+            await peer.active("req")
+            peer.ends["req"].port.send(STRING.serialize(STRING.new(data="the first")))
+            assert "heard the first" in await holds(machine, "late", "heard")
+            assert machine.faults == []
+
+
+async def test_streams_and_log_records_are_told_apart(machine: Machine) -> None:
+    async with machine.engine():
+        await machine.put(BOX, nodes=(own("tell.py"),))
+        await holds(machine, "node", "this is bad", LogStream.ROSOUT)
+        assert (await read(machine, "node", LogStream.STDOUT)).text == "printed\n"
+        assert "complained\n" in (await read(machine, "node", LogStream.STDERR)).text
+        records = (await read(machine, "node", LogStream.ROSOUT)).text.splitlines()
+        assert [line.partition(" ")[0] for line in records if "ing" in line or "bad" in line] == [
+            "[INFO]",
+            "[ERROR]",
+        ]
+        serious = (await read(machine, "node", LogStream.ROSOUT, level=LogLevel.ERROR)).text
+        assert (serious.count("\n"), "this is bad" in serious) == (1, True)
+        text = await holds(machine, "", "this is bad", LogStream.ROSOUT)
+        assert " ERROR /teller [" in text
+        assert text.splitlines()[2].endswith("  Node Startup")
+
+
+async def test_a_killed_node_says_by_what(machine: Machine) -> None:
+    async with machine.engine():
+        await machine.put(BOX, nodes=(own("talk.py"),))
+        await machine.log_holds(BOX, "node", "hello")
+        os.kill(machine.node(BOX, "node").pid, signal.SIGSEGV)
+        await machine.node_is(BOX, "node", NodeState.FAILED)
+        text = (await read(machine, "node", LogStream.ENGINE)).text
+        assert text.startswith("-- ended: killed by SIGSEGV")
+
+
+async def test_logs_outlive_their_container(machine: Machine) -> None:
+    async with machine.engine():
+        await machine.put(BOX, nodes=(own("talk.py", "one"),))
+        await machine.log_holds(BOX, "node", "hello one")
+        first = machine.status(BOX).incarnation
+        machine.note_processes()
+        os.kill(machine.environment().pid, signal.SIGKILL)
+        await until(lambda: machine.status(BOX).incarnation not in ("", first))
+        await machine.log_holds(BOX, "node", "hello one")
+        before = await read(machine, "node", previous=True)
+        assert (before.life, "hello one" in before.text) == (first, True)
+        assert before.ended > 0
+        assert "its environment died" in before.reason
+        machine.told.clear()
+        await machine.drop(BOX)
+        after = await read(machine, "node")
+        assert after.life not in ("", first)
+        assert "hello one" in after.text
+        assert after.text.endswith("-- ended: it was told to by SIGINT --\n")
+        assert (await read(machine, "node", life=first)).text == before.text
+        assert "no logs" in (await read(machine, "node", id_="another/box")).error
+        machine.check_clean()
+
+
+async def test_logs_outlive_a_manager_that_is_killed_and_a_container_that_nobody_saw_end(
+    machine: Machine,
+) -> None:
+    async with machine.managed(grace=0.5):
+        await machine.put(BOX, nodes=(own("talk.py"),))
+        await machine.log_holds(BOX, "node", "hello")
+        machine.note_processes()
+    await until(lambda: not machine.left(), timeout=40, what=machine.left)
+    async with machine.engine():
+        chunk = await read(machine, "node")
+        assert "hello" in chunk.text
+        assert "no manager saw it end; its last words" in chunk.reason
+        assert "no manager for 0.5 s" in chunk.reason
+
+
+async def test_the_logs_of_what_could_not_be_made_say_so(machine: Machine, monkeypatch: Any) -> None:
+    from rce_container.exceptions import StartError
+
+    def refuse(*_: object) -> None:
+        raise StartError("the disk is full")
+
+    async with machine.engine():
+        with monkeypatch.context() as patch:
+            patch.setattr(type(machine.runtime), "start", refuse)
+            await machine.put(BOX)
+            assert "the disk is full" in machine.faults[0]
+            for record in (machine.folder / "state" / "logs" / BOX).glob("*.json"):
+                assert "cannot be started: the disk is full" in record.read_text()
