@@ -55,7 +55,7 @@ class LogFile(RotatingFileHandler):
 
 
 def mark_latest(folder: Path) -> None:
-    """Let ``latest`` beside a run's folder point at it, as ``roslaunch`` does, unless a file has that name."""
+    """Let ``latest`` beside a run's folder point at it, as ``roslaunch`` does; a file of that name stays."""
     link = folder.with_name(LATEST)
     try:
         if link.is_symlink():

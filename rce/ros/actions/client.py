@@ -13,6 +13,7 @@ from rce.ros.actions import topics
 from rce.ros.actions.client_goal import ChangeCallback, ClientGoal, FeedbackCallback
 from rce.ros.actions.exceptions import IllegalTransition
 from rce.ros.actions.goal_id import GoalId
+from rce.ros.actions.patience import PatientClock
 from rce.ros.actions.states import CommState, GoalState
 from rce.ros.actions.tracker import GoalTracker
 from rce.ros.handles import release
@@ -58,6 +59,7 @@ class ActionClient:
             name: The action's name: the namespace of its topics.
             kind: Its type, such as ``actionlib_tutorials/FibonacciAction``; ``Action`` may be left out.
             patience: Seconds of silence of the server after which its goals are lost; ``math.inf``: never.
+                While simulated time stands still, nothing is missed.
         """
         self.name = node.resolve(name)
         self._node = node
@@ -69,6 +71,7 @@ class ActionClient:
         self._heard = asyncio.Event()
         self._busy = asyncio.Event()
         self._stack = AsyncExitStack()
+        self._clock: PatientClock
         self._goal: Publisher
         self._cancel: Publisher
         self._inputs: list[Subscriber] = []
@@ -85,6 +88,7 @@ class ActionClient:
 
     async def __aenter__(self) -> Self:
         node, types = self._node, self._types
+        self._clock = _patient_clock(node)
         async with AsyncExitStack() as stack:
             stack.callback(self._lose_all, "the client was closed")
             tasks = await stack.enter_async_context(TaskScope())
@@ -154,7 +158,7 @@ class ActionClient:
         )
         payload = self._goal.type.serialize(message)
         await self.wait_for_server()
-        time = self._time()
+        time = self._clock.now()
         sent = ClientGoal(
             goal_id, GoalTracker(goal_id.id, time, time), self._send_cancel, on_feedback, on_change
         )
@@ -174,7 +178,7 @@ class ActionClient:
     # ------------------------------------------------------------------ what the server says
 
     def _status_received(self, message: Message) -> None:
-        now = self._time()
+        now = self._clock.now()
         self._heard_at = now
         self._heard.set()
         listed = {status.goal_id.id: status for status in message.status_list}
@@ -197,7 +201,7 @@ class ActionClient:
         except ValueError as error:
             _log.warning("the server of %s says what cannot be: %s", self.name, error)
             state = GoalState.LOST
-        self._update(goal, goal.tracker.ended(state, message.status.text, self._time()), message.result)
+        self._update(goal, goal.tracker.ended(state, message.status.text, self._clock.now()), message.result)
 
     def _feedback_received(self, message: Message) -> None:
         goal = self._goals.get(message.status.goal_id.id)
@@ -212,7 +216,7 @@ class ActionClient:
             await asyncio.sleep(TICK)
             if self._node.is_shutdown:
                 self._lose_all("the node stops")
-            now = self._time()
+            now = self._clock.now()
             for goal in self.goals:
                 self._update(goal, goal.tracker.check(now, self._heard_at, self._patience))
                 if goal.tracker.must_repeat(now):
@@ -228,11 +232,11 @@ class ActionClient:
 
     def _send_cancel(self, goal: ClientGoal) -> None:
         self._cancel.publish(id=goal.id)
-        self._update(goal, goal.tracker.cancelled(self._time()))
+        self._update(goal, goal.tracker.cancelled(self._clock.now()))
 
     def _lose_all(self, text: str) -> None:
         for goal in self.goals:
-            self._update(goal, goal.tracker.lose(text, self._time()))
+            self._update(goal, goal.tracker.lose(text, self._clock.now()))
 
     def _update(self, goal: ClientGoal, passed: tuple[CommState, ...], result: Message | None = None) -> None:
         if goal.is_done:
@@ -240,6 +244,8 @@ class ActionClient:
             self._payloads.pop(goal.id, None)
         goal.changed(passed, result)
 
-    @staticmethod
-    def _time() -> float:
-        return asyncio.get_running_loop().time()
+
+def _patient_clock(node: Node) -> PatientClock:
+    """A machine's clock may be set back; silence is not measured in that, unless time is simulated."""
+    machine = asyncio.get_running_loop().time
+    return PatientClock(machine, node.time if node.is_time_simulated else machine)

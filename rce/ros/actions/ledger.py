@@ -121,6 +121,10 @@ class GoalLedger:
         self._cancelled_up_to = max(self._cancelled_up_to, request.stamp)
         return asked
 
+    def begin_anew(self) -> None:
+        """Learn that time jumped back: cancellations of all goals up to a time are void."""
+        self._cancelled_up_to = 0
+
     def apply(self, goal_id: str, event: GoalEvent, now: float, text: str = "") -> Entry:
         """Let something happen to a goal.
 

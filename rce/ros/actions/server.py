@@ -19,7 +19,7 @@ from rce.ros.tasks import TaskScope
 
 if TYPE_CHECKING:
     from rce.ros.node import Node, Publisher
-    from rce.ros.types import Message
+    from rce.ros.types import Message, Time
 
 _log = logging.getLogger(__name__)
 
@@ -79,6 +79,7 @@ class ActionServer:
         self._auto_accept = auto_accept
         self._goals: dict[str, ServerGoal] = {}
         self._ledger = GoalLedger()
+        self._latest = 0
         self._stack = AsyncExitStack()
         self._tasks = TaskScope()
         self._status: Publisher
@@ -135,13 +136,14 @@ class ActionServer:
 
     async def _keep_publishing(self, period: float) -> None:
         while True:
-            await asyncio.sleep(period)
+            await asyncio.sleep(period)  # of real time: clients learn how goals stand while time stands still
+            self._see_time()
             self._publish_status()
 
     # ------------------------------------------------------------------ what clients say
 
     def _goal_received(self, message: Message) -> None:
-        goal_id, now = GoalId.read(message.goal_id), self._node.now()
+        goal_id, now = GoalId.read(message.goal_id), self._see_time()
         if not goal_id.id:
             goal_id = GoalId(GoalId.make(self._node.name, now).id, goal_id.stamp)
         if not goal_id.stamp:
@@ -157,11 +159,21 @@ class ActionServer:
         self._perform(self._policy.offer(goal_id))
 
     def _cancel_received(self, message: Message) -> None:
+        self._see_time()
         asked = self._ledger.cancel(GoalId.read(message), self._time())
         for goal_id in asked:
             self._perform(self._policy.cancel(goal_id))
         if asked:
             self._publish_status()
+
+    def _see_time(self) -> Time:
+        """Return ROS time, and notice if it jumped back: a simulation or a bag began anew."""
+        now = self._node.now()
+        nanoseconds = now.to_nsec()
+        if nanoseconds < self._latest:
+            self._ledger.begin_anew()
+        self._latest = nanoseconds
+        return now
 
     def _perform(self, steps: list[Step]) -> None:
         for step in steps:
@@ -208,6 +220,10 @@ class ActionServer:
         message = kind.new(header=self._header(), status=_status(entry), feedback=feedback)
         # As bytes: the program may change its message after that.
         self._feedback.publish_serialized(kind.serialize(message))
+
+    async def sleep(self, seconds: float) -> bool:
+        """Sleep in ROS time; tell whether the node goes on."""
+        return await self._node.sleep(seconds)
 
     # ------------------------------------------------------------------ work
 

@@ -26,6 +26,9 @@ class GoalServer(Protocol):
     def publish_feedback(self, entry: Entry, feedback: Message | Content) -> None:
         """Tell the goal's clients how it goes."""
 
+    async def sleep(self, seconds: float) -> bool:
+        """Sleep in ROS time; tell whether the node goes on."""
+
 
 class ServerGoal:
     """One goal of an action server; what handlers are called with.
@@ -133,17 +136,22 @@ class ServerGoal:
         await self._stop.wait()
 
     async def sleep(self, seconds: float) -> bool:
-        """Sleep for real seconds, or wake up early because the goal is asked to end.
+        """Sleep in ROS time, or wake up early because the goal is asked to end or the node to stop.
+
+        Simulated time that jumps back wakes up too.
 
         Returns:
             Whether to go on: ``while await goal.sleep(0.1): ...``.
         """
+        sleeping = asyncio.ensure_future(self._server.sleep(seconds))
+        stopping = asyncio.ensure_future(self._stop.wait())
         try:
-            async with asyncio.timeout(seconds):
-                await self._stop.wait()
-        except TimeoutError:
-            return True
-        return False
+            await asyncio.wait((sleeping, stopping), return_when=asyncio.FIRST_COMPLETED)
+            return not self._stop.is_set() and sleeping.result()
+        finally:
+            for task in (sleeping, stopping):
+                task.cancel()
+            await asyncio.gather(sleeping, stopping, return_exceptions=True)
 
     def request_cancel(self) -> None:
         """Ask the handler to end it; the server does, programs may."""

@@ -31,9 +31,14 @@ class Rate:
         self._last = clock.nanoseconds()
 
     @property
+    def due(self) -> int:
+        """When the next beat is, in nanoseconds of ROS time."""
+        return self._last + self._step
+
+    @property
     def remaining(self) -> float:
         """Seconds until the next beat; negative if it was missed."""
-        return (self._last + self._step - self._clock.nanoseconds()) / NANOSECONDS
+        return (self.due - self._clock.nanoseconds()) / NANOSECONDS
 
     async def sleep(self) -> bool:
         """Sleep until the next beat.
@@ -77,7 +82,7 @@ class Timer:
     """Calls a function at a rate. Made by :meth:`rce.ros.node.Node.timer`; runs until the node stops.
 
     A coroutine function is awaited before the next call; calls that are missed meanwhile are left out. What
-    it raises is logged.
+    it raises is logged. When simulated time jumps back, the next call is a period later.
     """
 
     def __init__(
@@ -99,13 +104,16 @@ class Timer:
 
     async def _run(self) -> None:
         last: float | None = None
-        expected = self._clock.nanoseconds() / NANOSECONDS + self._rate.remaining
+        due = self._rate.due
         while await self._rate.sleep():
-            now = self._clock.nanoseconds() / NANOSECONDS
-            await self._call(TimerEvent(expected, now, last))
-            if self._oneshot:
-                return
-            last, expected = now, self._clock.nanoseconds() / NANOSECONDS + self._rate.remaining
+            jumped_back = self._clock.simulated and self._clock.nanoseconds() < due
+            if not jumped_back:
+                now = self._clock.nanoseconds() / NANOSECONDS
+                await self._call(TimerEvent(due / NANOSECONDS, now, last))
+                if self._oneshot:
+                    return
+                last = now
+            due = self._rate.due
 
     async def _call(self, event: TimerEvent) -> None:
         self.calls += 1

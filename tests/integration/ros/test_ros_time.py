@@ -76,6 +76,40 @@ async def test_time_is_simulated(core: Core, make_node: MakeNode) -> None:
         assert not await a.sleep(0)
 
 
+async def test_timers_and_rates_when_time_jumps_back(core: Core, make_node: MakeNode) -> None:
+    core.set_param("/use_sim_time", True)
+    async with make_node("sim") as sim, make_node("a") as a:
+        publisher = await sim.advertise("/clock", "rosgraph_msgs/Clock")
+        await publisher.wait_for_subscribers(2, timeout=10)
+        await tick(publisher, a, 100.0)
+        calls: list[tuple[float, float, float | None]] = []
+        a.timer(2.0, lambda event: calls.append(tuple(event)))
+        once = a.timer(3.0, lambda event: None, oneshot=True)
+        beats: list[float] = []
+
+        async def beat() -> None:
+            async for _ in a.rate(0.5):
+                beats.append(a.time())  # noqa: PERF401 - one by one, as they come
+
+        beating = asyncio.create_task(beat())
+        await asyncio.sleep(0)
+        for seconds in (101.0, 102.0, 50.0, 51.0, 52.0, 54.0, 200.0, 201.0, 202.0):
+            await tick(publisher, a, seconds)
+            for _ in range(4):
+                await asyncio.sleep(0)
+        assert [(due, now) for due, now, _ in calls] == [
+            (102.0, 102.0),
+            (52.0, 52.0),  # a period after the jump, not at it
+            (54.0, 54.0),
+            (56.0, 200.0),  # what was missed meanwhile is left out
+            (202.0, 202.0),
+        ]
+        assert beats == [100.0, 102.0, 50.0, 52.0, 54.0, 200.0, 202.0]
+        assert once.calls == 1
+        beating.cancel()
+        await asyncio.gather(beating, return_exceptions=True)
+
+
 async def test_log_records_carry_simulated_time(core: Core, make_node: MakeNode) -> None:
     core.set_param("/use_sim_time", True)
     async with make_node("sim") as sim, make_node("a") as a:
