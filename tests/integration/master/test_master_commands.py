@@ -81,5 +81,5 @@ async def test_logs_are_printed_whole(
     async with site.containers() as containers:
         containers.log = b"0123456789" * 20_000
         await site.api("POST", "/containers", {"tag": "c"}, status=204)
-        await follow._logs("c", follow=False, offset=0, user="")
+        await follow._logs("c", follow=False, offset=0, query={})
     assert capsys.readouterr().out == "0123456789" * 20_000
