@@ -9,7 +9,7 @@ from typing import Any
 
 import uvloop
 
-from benchmarks import containers, fanout, rate, roundtrip, stalled
+from benchmarks import containers, fanout, rate, roundtrip, sandboxes, stalled
 from benchmarks.engine import RunningEngine, engine
 from benchmarks.figures import plot_round_trips, save, show
 
@@ -27,6 +27,10 @@ def suites(*, quick: bool) -> dict[str, tuple[str, Callable[[RunningEngine], Awa
     return {
         "memory": ("Memory of each task set, idle", _memory),
         "start": ("Container start", lambda e: containers.start_times(e, count=5 if quick else 20)),
+        "sandboxes": (
+            "Other ways into namespaces",
+            lambda _: sandboxes.start_times(count=5 if quick else 20),
+        ),
         "many": ("Many containers", lambda e: containers.many(e, count=10 if quick else 100)),
         "roundtrip": ("Round trip", lambda e: roundtrip.run(e, passes=passes, sizes=sizes)),
         "rate": ("Message rate", lambda e: rate.run(e, seconds=seconds)),

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import psutil
-
-from benchmarks.engine import RunningEngine, pss
+from benchmarks.engine import RunningEngine, pss, words
 from benchmarks.figures import spread
 from benchmarks.wire import STRING, Robot, robot, serialized_string
 
@@ -59,18 +57,27 @@ def memory(running: RunningEngine) -> list[dict[str, Any]]:
 
 def _weight_of_each(running: RunningEngine, count: int) -> dict[str, float]:
     """What one of ``count`` containers weighs on average, by kind of process."""
-    kinds = {"environment": "rce_container.environment", "echo node": "stringEcho.py", "bwrap": "bwrap"}
-    weights = dict.fromkeys((*kinds, "shim"), 0)
+    kinds = {
+        "environment": "rce_container.environment",
+        "cradle": "rce_container.nursery.cradle",
+        "echo node": "stringEcho.py",
+        "bwrap": "bwrap",
+        "holder": "read -r word",
+        "shim": "rce-container-shim",
+    }
+    weights = dict.fromkeys(kinds, 0)
     for process in running.processes():
-        with contextlib.suppress(psutil.Error):
-            name, line = process.name(), " ".join(process.cmdline())
-            if name.startswith("python"):
-                kind = next((kind for kind, needle in kinds.items() if needle in line), "")
-            else:
-                kind = {"bwrap": "bwrap", "sh": "shim"}.get(name, "")
-            if kind:
-                weights[kind] += pss(process)
-    return {f"{kind} PSS MB": round(weight / count / 1e6, 1) for kind, weight in weights.items()}
+        line = words(process)
+        first = Path(line[0]).name if line else ""
+        text = " ".join(line)
+        kind = "bwrap" if first == "bwrap" else ""
+        if first.startswith(("python", "sh")):
+            kind = next((kind for kind, needle in reversed(kinds.items()) if needle in text), "")
+        if kind:
+            weights[kind] += pss(process)
+    sizes = {f"{kind} PSS MB": round(weight / count / 1e6, 2) for kind, weight in weights.items()}
+    idle = sum(weight for kind, weight in weights.items() if kind != "echo node")
+    return {**sizes, "idle container PSS MB": round(idle / count / 1e6, 1)}
 
 
 async def _create(client: Robot, containers: list[str]) -> None:

@@ -40,7 +40,16 @@ class RunningEngine:
 
     def named(self, needle: str) -> list[psutil.Process]:
         """Its Python processes whose command line holds ``needle``."""
-        return [p for p in self.processes() if needle in " ".join(p.cmdline()) and "python" in p.name()]
+        return [
+            p for p in self.processes() if needle in " ".join(words(p)) and "python" in "".join(words(p)[:1])
+        ]
+
+
+def words(process: psutil.Process) -> list[str]:
+    """The command line; empty for a process that ended."""
+    with contextlib.suppress(psutil.Error):
+        return process.cmdline()
+    return []
 
 
 def pss(process: psutil.Process) -> int:
