@@ -237,6 +237,29 @@ async def test_streams_and_log_records_are_told_apart(machine: Machine) -> None:
         assert text.splitlines()[2].endswith("  Node Startup")
 
 
+@pytest.mark.needs("rospy")
+async def test_records_of_a_rospy_node_go_to_its_log(machine: Machine) -> None:
+    package = machine.packages / "sys"
+    (package / "nodes").mkdir(parents=True)
+    (package / "package.yaml").write_text("name: sys\npython: system\n")
+    script = package / "nodes" / "tell.py"
+    script.write_text(
+        "#!/usr/bin/python3\n"
+        "import rospy\n"
+        "rospy.init_node('real')\n"
+        "rate = rospy.Rate(20)\n"
+        "while not rospy.is_shutdown():\n"
+        "    rospy.logwarn('from rospy')\n"
+        "    rate.sleep()\n"
+    )
+    script.chmod(0o755)
+    async with machine.engine():
+        await machine.put(BOX, nodes=(NodeSpec(tag="node", pkg="sys", exe="tell.py"),))
+        text = await holds(machine, "node", "from rospy", LogStream.ROSOUT, level=LogLevel.WARN)
+        assert text.startswith("[WARN] [")
+        assert "WARN /real [" in await holds(machine, "", "from rospy", LogStream.ROSOUT)
+
+
 async def test_a_killed_node_says_by_what(machine: Machine) -> None:
     async with machine.engine():
         await machine.put(BOX, nodes=(own("talk.py"),))
