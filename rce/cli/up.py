@@ -112,6 +112,8 @@ def programs(settings: EngineSettings) -> Iterable[Program]:
         *_options({"state-dir": state / "master", "robot-grace": settings.master.robot_grace}),
         *_options({"container-grace": settings.master.container_grace}),
         *_options({"token-lifetime": settings.master.token_lifetime}),
+        *_options({"max-slots": settings.master.max_slots, "max-cpu": settings.master.max_cpu}),
+        *_options({"max-memory": f"{settings.master.max_memory}B"}),
         *(control + common),
     )
     packages = _repeat("package-path", settings.container.package_path)
@@ -124,6 +126,10 @@ def programs(settings: EngineSettings) -> Iterable[Program]:
             *_options({"link-port": _next(settings.robot.link_port, 2 * index)}),
             *_options({"public-host": settings.robot.public_host, "public-url": settings.robot.public_url}),
             *_repeat("origin", settings.robot.origins),
+            *_options(
+                {"user-memory": settings.robot.user_memory >> 20, "memory": settings.robot.memory >> 20}
+            ),
+            *_options({"strangers": settings.robot.strangers}),
             *(packages + control + common),
         )
     yield _program(
@@ -134,6 +140,8 @@ def programs(settings: EngineSettings) -> Iterable[Program]:
         *_options({"state-dir": state / "container", "runtime": settings.container.runtime.value}),
         *_options({"grace": settings.container.grace}),
         *_repeat("label", settings.container.labels),
+        *(("--allow-requirements",) if settings.container.allow_requirements else ()),
+        *_joined({"pip-args": settings.container.pip_args}),
         *(packages + control + common),
     )
 
@@ -145,6 +153,11 @@ def _next(port: int, offset: int) -> int:
 def _options(values: dict[str, Any]) -> list[str]:
     given = {name: value for name, value in values.items() if value not in (None, "")}
     return [text for name, value in given.items() for text in (f"--{name}", str(value))]
+
+
+def _joined(values: dict[str, str]) -> list[str]:
+    """Options whose values may begin with a dash."""
+    return [f"--{name}={value}" for name, value in values.items() if value]
 
 
 def _repeat(name: str, values: Iterable[object]) -> list[str]:

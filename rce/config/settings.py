@@ -17,6 +17,7 @@ from rce.config.documents import parse, read_file
 from rce.config.exceptions import ConfigError, Fault
 from rce.config.folders import default_state_dir
 from rce.config.validation import Strict, faults_of
+from rce.protocol.quantities import read_cores, read_memory
 
 LOOPBACK = "127.0.0.1"
 ANYWHERE = "0.0.0.0"  # noqa: S104 - an engine serves other machines unless in development mode
@@ -55,6 +56,14 @@ def _as_runtime(value: Any) -> Any:
         raise ValueError(f"must be one of {', '.join(item.value for item in Runtime)}") from None
 
 
+def _as_cores(value: Any) -> Any:
+    return read_cores(value)
+
+
+def _as_bytes(value: Any) -> Any:
+    return read_memory(value)
+
+
 Host = Annotated[str, AfterValidator(_check_host)]
 Port = Annotated[int, Field(ge=0, le=65535)]
 """A TCP port; 0 takes a free one."""
@@ -76,6 +85,12 @@ class MasterSettings(Strict):
     """How long a container task set may be away until its containers are placed elsewhere."""
     token_lifetime: Seconds = 30 * 86400.0
     """How long an API token is valid."""
+    max_slots: int = Field(default=0, ge=0)
+    """Slots that the containers of one user may take together; 0 for no limit. Administrators have none."""
+    max_cpu: Annotated[float, BeforeValidator(_as_cores)] = 0.0
+    """Cores that the containers of one user may ask for together."""
+    max_memory: Annotated[int, BeforeValidator(_as_bytes)] = 0
+    """Bytes that the containers of one user may ask for together; written in MB, or as a text such as ``8G``."""
 
 
 class RobotSettings(Strict):
@@ -94,6 +109,12 @@ class RobotSettings(Strict):
     """The whole URL that clients are sent to, where a proxy stands in front."""
     origins: tuple[str, ...] = Field(default=(), strict=False)
     """Origins whose web pages may connect; ``*`` is any."""
+    user_memory: Annotated[int, BeforeValidator(_as_bytes), Field(ge=1 << 20)] = 512 << 20
+    """Bytes of messages that may wait for all robots of a user; written as other memory."""
+    memory: Annotated[int, BeforeValidator(_as_bytes)] = 0
+    """The same for all users; 0 is half of the machine's memory."""
+    strangers: int = Field(default=256, ge=1)
+    """Connections from one address that have not logged in yet."""
 
 
 class ContainerSettings(Strict):
@@ -109,6 +130,10 @@ class ContainerSettings(Strict):
     """How long containers wait for a manager that was killed until they end themselves."""
     labels: tuple[str, ...] = Field(default=(), strict=False)
     """What this machine has; containers ask for it as special features."""
+    allow_requirements: bool = False
+    """Whether what users' packages ask for in a ``requirements.txt`` is installed."""
+    pip_args: str = ""
+    """More arguments for pip, such as another index."""
 
 
 class EngineSettings(Strict):

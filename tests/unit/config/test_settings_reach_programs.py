@@ -26,9 +26,23 @@ SETTINGS = EngineSettings(
     dev=True,
     state_dir=Path("/state"),
     secret_file=Path("/secret"),
-    master=MasterSettings(bind="127.0.0.2", http_port=1, control_port=2, token_lifetime=3.0),
+    master=MasterSettings(
+        bind="127.0.0.2",
+        http_port=1,
+        control_port=2,
+        token_lifetime=3.0,
+        max_slots=4,
+        max_cpu=1.5,
+        max_memory=8 << 10,
+    ),
     robot=RobotSettings(count=2, public_host="robots.example.org", origins=("https://a.example",)),
-    container=ContainerSettings(runtime=Runtime.PROCESS, labels=("gpu", "lidar"), package_path=(Path("/p"),)),
+    container=ContainerSettings(
+        runtime=Runtime.PROCESS,
+        labels=("gpu", "lidar"),
+        package_path=(Path("/p"),),
+        allow_requirements=True,
+        pip_args="--no-index --pre",
+    ),
 )
 
 
@@ -49,5 +63,10 @@ def test_every_option_is_known(settings: EngineSettings) -> None:
 def test_what_is_set_arrives() -> None:
     contexts = parsed(SETTINGS)
     assert contexts["master"].params["token_lifetime"] == 3.0
+    assert contexts["master"].params["max_slots"] == 4
+    assert contexts["container"].params["allow_requirements"]
+    assert contexts["container"].params["pip_args"] == "--no-index --pre"
+    assert contexts["master"].params["max_cpu"] == 1.5
+    assert contexts["master"].params["max_memory"] == f"{8 << 30}B"
     assert contexts["robot2"].params["public_host"] == "robots.example.org"
     assert list(contexts["container"].params["label"]) == ["gpu", "lidar"]
