@@ -32,6 +32,7 @@ from rce_container.archive import LOG_DAYS, LOG_SPACE
 from rce_container.bundles.requirements import InstallerSettings
 from rce_container.exceptions import ContainerError
 from rce_container.settings import ContainerSettings
+from rce_container.uids import FIRST_UID, UIDS
 
 if TYPE_CHECKING:
     from rce.config.settings import EngineSettings
@@ -102,6 +103,17 @@ def container(
     slot_processes: Annotated[
         int, typer.Option(help="Processes and threads of a container for each of its slots.", min=16)
     ] = 256,
+    home_size: Annotated[
+        int, typer.Option(metavar="MB", help="Size of a container's home, which is in memory.", min=1)
+    ] = 256,
+    first_uid: Annotated[
+        int,
+        typer.Option(
+            help="As root: the first of the users that containers run as; they must belong to nobody else.",
+            min=1,
+        ),
+    ] = FIRST_UID,
+    uids: Annotated[int, typer.Option(help="As root: how many such users there are.", min=1)] = UIDS,
     log_days: Annotated[
         float, typer.Option(help="Days for which the logs of containers that ended are kept.", min=0.0)
     ] = LOG_DAYS,
@@ -133,6 +145,9 @@ def container(
         slots=slots,
         slot_memory=slot_memory * MEGABYTE,
         slot_processes=slot_processes,
+        home_bytes=home_size * MEGABYTE,
+        first_uid=first_uid,
+        uids=uids,
         log_days=log_days,
         log_space=log_space * MEGABYTE,
         requirements=InstallerSettings(pip_args=tuple(shlex.split(pip_args))) if allow_requirements else None,
