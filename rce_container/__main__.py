@@ -31,7 +31,7 @@ from rce_container.app import AUTO, RUNTIMES, App, package_path
 from rce_container.archive import LOG_DAYS, LOG_SPACE
 from rce_container.bundles.requirements import InstallerSettings
 from rce_container.exceptions import ContainerError
-from rce_container.settings import ContainerSettings
+from rce_container.settings import BUNDLE_SPACE, ContainerSettings
 from rce_container.uids import FIRST_UID, UIDS
 
 if TYPE_CHECKING:
@@ -120,6 +120,9 @@ def container(
     log_space: Annotated[
         int, typer.Option(metavar="MB", help="What those logs may take in all; the oldest go first.", min=0)
     ] = LOG_SPACE // MEGABYTE,
+    bundle_space: Annotated[
+        int, typer.Option(metavar="MB", help="What packages of users may take on the disk.", min=0)
+    ] = BUNDLE_SPACE // MEGABYTE,
     allow_requirements: Annotated[
         bool,
         typer.Option("--allow-requirements", help="Install what users' packages ask for (requirements.txt)."),
@@ -150,6 +153,7 @@ def container(
         uids=uids,
         log_days=log_days,
         log_space=log_space * MEGABYTE,
+        bundle_space=bundle_space * MEGABYTE,
         requirements=InstallerSettings(pip_args=tuple(shlex.split(pip_args))) if allow_requirements else None,
     )
     try:

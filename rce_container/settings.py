@@ -11,6 +11,8 @@ from rce_container.archive import LOG_DAYS, LOG_SPACE
 from rce_container.bundles.requirements import InstallerSettings
 from rce_container.uids import FIRST_UID, UIDS
 
+BUNDLE_SPACE = 4096 * MEGABYTE
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ContainerSettings:
@@ -44,7 +46,7 @@ class ContainerSettings:
     """How many bytes the logs of containers that ended may take in all; the oldest go first."""
     prune_interval: float = 60.0
     """How often is looked for logs to remove."""
-    bundle_space: int = 4096 * MEGABYTE
+    bundle_space: int = BUNDLE_SPACE
     """How many bytes of packages that users brought are kept, unless more are in use."""
     requirements: InstallerSettings | None = None
     """How what these packages ask for in a ``requirements.txt`` is installed; None: it is not."""

@@ -22,7 +22,7 @@ from rce.bundles.unpacking import unpack
 from rce.control.contents import Piece
 from rce.control.exceptions import ContentError
 from rce.control.model import BundleSpec
-from rce_container.bundles.disk import forget_before_boot, in_thread, remove, scratch, size_of
+from rce_container.bundles.disk import forget_before_boot, in_thread, remove, scratch_aside, size_of
 from rce_container.bundles.exceptions import BundleTrouble, NoSpace, Unfetched, Unverified
 
 Fetch = Callable[[str, int], Awaitable[Piece]]
@@ -118,7 +118,7 @@ class BundleCache:
     async def _bring(self, bundle: BundleSpec, path: Path) -> None:
         self._sizes.pop(bundle.sha256, None)
         try:
-            with scratch(self._folder / _SCRATCH) as folder:
+            async with scratch_aside(self._folder / _SCRATCH) as folder:
                 archive = folder / "archive"
                 await self._download(bundle, archive)
                 tree = folder / "tree"

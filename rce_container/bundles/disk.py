@@ -1,4 +1,4 @@
-"""Folders that only ever appear whole, and how large they are. All of it blocks."""
+"""Folders that only ever appear whole, and how large they are. What is not asynchronous blocks."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import contextlib
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
@@ -21,12 +21,16 @@ _READ_ONLY_FOLDER = 0o755
 @contextlib.contextmanager
 def scratch(parent: Path) -> Iterator[Path]:
     """Give a folder of one's own, and remove what is left of it."""
-    parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    folder = Path(tempfile.mkdtemp(dir=parent))
+    folder = _make_scratch(parent)
     try:
         yield folder
     finally:
         remove(folder)
+
+
+def _make_scratch(parent: Path) -> Path:
+    parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    return Path(tempfile.mkdtemp(dir=parent))
 
 
 async def in_thread(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
@@ -40,6 +44,16 @@ async def in_thread(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs)
     except asyncio.CancelledError:
         await asyncio.wait([work])
         raise
+
+
+@contextlib.asynccontextmanager
+async def scratch_aside(parent: Path) -> AsyncIterator[Path]:
+    """Do what :func:`scratch` does, in a thread."""
+    folder = await in_thread(_make_scratch, parent)
+    try:
+        yield folder
+    finally:
+        await in_thread(remove, folder)
 
 
 def remove(folder: Path) -> None:

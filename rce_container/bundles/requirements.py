@@ -19,7 +19,7 @@ from pathlib import Path
 
 from rce.bundles.requirements import FILE_NAME, read_requirements
 from rce.ros.packages import MANIFESTS, BadPackage, parse_manifest
-from rce_container.bundles.disk import forget_before_boot, in_thread, remove, scratch, size_of
+from rce_container.bundles.disk import forget_before_boot, in_thread, remove, scratch_aside, size_of
 from rce_container.bundles.exceptions import RequirementsTrouble
 from rce_container.exceptions import RuntimeUnavailableError
 from rce_container.runtimes.namespace import interpreter_paths, read_only_mounts, system_mounts
@@ -112,7 +112,7 @@ class Installer:
         return path
 
     async def _build(self, path: Path, text: str, python: str) -> None:
-        with scratch(self._folder / _SCRATCH) as folder:
+        async with scratch_aside(self._folder / _SCRATCH) as folder:
             build = folder / "build"
             build.mkdir(mode=0o755)
             (build / FILE_NAME).write_text(text)

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+UPLOAD_S = 1800.0
+"""How long an archive may take to come in."""
 MAX_UPLOADS = 8
 """At the same time; of one user one."""
 
@@ -101,19 +103,27 @@ class PackageOffice:
         """
         self._check_early(wish, size)
         with self._turn(wish.user):
-            async with self._store.receive(chunks) as incoming:
-                _verify(wish, incoming)
-                contents = await incoming.inspect()
-                bundle = self._bundle(wish, incoming, contents)
-                packages.check_new(self._realm.tables, bundle)
-                async with self._lock:
-                    try:
-                        await self._store.keep(incoming)
-                        await self._realm.submit(commands.AddBundle(bundle=bundle))
-                    finally:
-                        self._dirty.set()
+            try:
+                async with asyncio.timeout(UPLOAD_S):
+                    bundle, contents = await self._take(wish, chunks)
+            except TimeoutError:
+                raise Busy(f"the archive did not come in within {UPLOAD_S:.0f} s") from None
         kept = self._realm.tables.bundles.get(bundle.id) or bundle
         return kept, (*contents.warnings, *self._warnings(contents))
+
+    async def _take(self, wish: Wish, chunks: AsyncIterator[bytes]) -> tuple[Bundle, Contents]:
+        async with self._store.receive(chunks) as incoming:
+            _verify(wish, incoming)
+            contents = await incoming.inspect()
+            bundle = self._bundle(wish, incoming, contents)
+            packages.check_new(self._realm.tables, bundle)
+            async with self._lock:
+                try:
+                    await self._store.keep(incoming)
+                    await self._realm.submit(commands.AddBundle(bundle=bundle))
+                finally:
+                    self._dirty.set()
+        return bundle, contents
 
     def _check_early(self, wish: Wish, size: int) -> None:
         """Refuse what is to be refused anyway before all of it has come."""

@@ -13,7 +13,7 @@ import pytest
 from support.bundles import pack, sign, write_package
 from support.containers import Machine, until
 
-from rce.control.model import BundleSpec, NodeSpec, NodeState, ParameterSpec
+from rce.control.model import BundleSpec, InterfaceSpec, NodeSpec, NodeState, ParameterSpec
 from rce_container.bundles.requirements import Installer, InstallerSettings
 
 BOX = "user/box"
@@ -112,6 +112,25 @@ async def test_a_package_that_comes_late_holds_up_nothing_else(shop: Machine) ->
         assert len(shop.faults) == 1
         assert "package nav 1.0 is not there yet" in shop.faults[0]
         assert "rce package push" in shop.faults[0]
+
+
+async def test_interfaces_wait_for_types_of_a_package_that_is_still_to_come(shop: Machine) -> None:
+    async with shop.engine():
+        box = offer(shop, "Box", hold=True, nodes__run=SAY.format(text="here"))
+        (shop.folder / "source" / "1.0" / "Box" / "srv").mkdir()
+        (shop.folder / "source" / "1.0" / "Box" / "srv" / "Open.srv").write_text("---\nbool done\n")
+        archive = pack(shop.folder / "source" / "1.0" / "Box")
+        box = sign(archive, "Box", "1.0")
+        interfaces = (
+            InterfaceSpec(tag="open", type="ServiceClientInterface", cls="Box/Open", addr="/open"),
+            InterfaceSpec(tag="say", type="PublisherInterface", cls="std_msgs/String", addr="/say"),
+        )
+        await shop.put(BOX, nodes=(node("Box"),), bundles=(box,), interfaces=interfaces)
+        await until(lambda: (status := shop.status(BOX)) and set(status.interfaces) == {"say"})
+        shop.contents[box.sha256] = archive
+        await until(lambda: (status := shop.status(BOX)) and set(status.interfaces) == {"say", "open"})
+        await shop.log_holds(BOX, "node", "here")
+        assert not [fault for fault in shop.faults if "interface" in fault]
 
 
 async def test_a_new_version_comes_while_nodes_run(shop: Machine) -> None:

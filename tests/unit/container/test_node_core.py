@@ -599,3 +599,19 @@ def test_the_limit_of_restarts_is_never_exceeded(steps: list[str], limit: int) -
         assert world.status().restarts <= limit, "no life of these is long enough to count anew"
         if world.now > WELL_S:
             break
+
+
+def test_a_node_that_lacks_its_package_waits_and_one_that_runs_is_left_alone() -> None:
+    world = World()
+    world.do(e.Lack({"a": "waits for its package nav 1.0"}))
+    world.desire(spec("a"), spec("b"), spec("c", after=("a",)))
+    assert world.launched == ["b"]
+    assert (world.status().state, world.status().detail) == (
+        NodeState.WAITING,
+        "waits for its package nav 1.0",
+    )
+    assert "a (waiting)" in world.status("c").detail
+    world.do(e.Lack({"b": "waits for its package nav 2.0"}))
+    assert world.launched == ["b", "a"]
+    assert world.halted == []
+    assert world.told == []
