@@ -82,6 +82,9 @@ class App:
         podman = PodmanRuntime(self.settings.images, home_bytes=self.settings.home_bytes, uids=uids)
         runtimes: dict[str, Runtime] = {one.name: one for one in (namespace, podman, ProcessRuntime())}
         runtime, detail = await asyncio.to_thread(choose_runtime, self.runtime, runtimes)
+        if review := runtime.review(self.settings.packages):
+            log.warning("%s", review)
+        detail = "; ".join(filter(None, (detail, review)))
         offers = await asyncio.to_thread(find_offers, runtime, runtimes.values())
         await asyncio.to_thread(_compile_engine)
         state_dir = self.state_dir or default_state_dir() / "container"

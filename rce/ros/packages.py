@@ -139,7 +139,9 @@ class PackageIndex:
         scripts = _scripts(name)
         if scripts:
             return Package(name, _folder_of(scripts[0][1]), python="engine")
-        raise PackageNotFound(f"no package {name!r} on the package path ({self.describe_path()})")
+        closed = [str(root) for root in self.path if root.exists() and not os.access(root, os.R_OK | os.X_OK)]
+        hint = f"; {os.pathsep.join(closed)} may not be read here" if closed else ""
+        raise PackageNotFound(f"no package {name!r} on the package path ({self.describe_path()}){hint}")
 
     def locate(self, name: str) -> Path | None:
         """Return the folder of a package, None if there is none on the path."""
@@ -194,13 +196,16 @@ def _renamed(root: Path, name: str) -> Path | None:
 
 
 def _is_package(folder: Path) -> bool:
-    return _manifest(folder) is not None or any((folder / kind).is_dir() for kind in ("msg", "srv", "action"))
+    if _manifest(folder) is not None:
+        return True
+    # Not pathlib's question: it raises where a folder may not be entered, and the other folders are to count.
+    return any(os.path.isdir(folder / kind) for kind in ("msg", "srv", "action"))  # noqa: PTH112
 
 
 def _manifest(folder: Path) -> Path | None:
     for name in MANIFESTS:
         file = folder / name
-        if file.is_file():
+        if os.path.isfile(file):  # noqa: PTH113 - see above
             return file
     return None
 

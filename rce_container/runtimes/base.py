@@ -13,7 +13,7 @@ import os
 import subprocess
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
@@ -182,6 +182,8 @@ class Runtime(ABC):
     name: ClassVar[str]
     isolated: ClassVar[bool]
     """Whether the container has a pid namespace of its own, which ends with its environment."""
+    image: str = ""
+    """Root file system of containers that name none; empty for the machine's programs."""
     detail: str = ""
     """What is not as it should be, for the machine's record; known after :meth:`probe`."""
 
@@ -200,6 +202,10 @@ class Runtime(ABC):
         Raises:
             StartError: It cannot be started.
         """
+
+    def review(self, packages: Iterable[Path]) -> str:  # noqa: ARG002
+        """Say what containers will miss of the package path; empty if nothing."""
+        return ""
 
     def close(self) -> None:  # noqa: B027 - most keep nothing
         """End what the runtime keeps running for itself; containers live on."""

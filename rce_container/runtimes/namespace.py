@@ -13,14 +13,16 @@ import asyncio
 import compileall
 import os
 import shutil
+import stat
 import sys
 import tempfile
 import threading
 from collections.abc import Iterable
 from pathlib import Path
 
+from rce_container.environment.logs import ENVIRONMENT_LOG, segment_path
 from rce_container.environment.messages import Boot
-from rce_container.exceptions import ContainerError, RuntimeUnavailableError
+from rce_container.exceptions import ContainerError, RuntimeUnavailableError, StartError
 from rce_container.folder import ContainerFolder
 from rce_container.network.hosts import hostname, hosts_text
 from rce_container.nursery.confine import USER_ID
@@ -50,6 +52,7 @@ _ETC = (
     "ros",
 )
 _PROBE_TIMEOUT_S = 20.0
+_READ_BY_OTHERS = stat.S_IROTH | stat.S_IXOTH
 
 
 class NamespaceRuntime(Runtime):
@@ -102,6 +105,13 @@ class NamespaceRuntime(Runtime):
     def bundles(self, folder: ContainerFolder) -> str:  # noqa: ARG002
         """The same in every container."""
         return BUNDLES
+
+    def review(self, packages: Iterable[Path]) -> str:
+        """As root, containers are users to whom a private folder is closed."""
+        closed = [str(path) for path in packages if self._root and _is_closed(path)]
+        if not closed:
+            return ""
+        return f"containers cannot read {', '.join(closed)}: make it readable by everybody (chmod -R o+rX)"
 
     def close(self) -> None:
         """End the nursery; the containers live on."""
@@ -169,6 +179,11 @@ class NamespaceRuntime(Runtime):
                 try:
                     async with asyncio.timeout(_PROBE_TIMEOUT_S):
                         await handle.launch()
+                except StartError as error:
+                    words = (
+                        segment_path(folder.logs, ENVIRONMENT_LOG, 0).read_text(errors="replace").splitlines()
+                    )
+                    raise StartError("; ".join([str(error), *words[-1:]])) from error
                 finally:
                     await handle.kill()
 
@@ -236,6 +251,15 @@ def read_only_mounts(paths: Iterable[Path]) -> list[str]:
             options += ["--dir", str(parent)]  # by itself bubblewrap makes them for its own user only
         options += ["--ro-bind", str(path), str(path)]
     return options
+
+
+def _is_closed(folder: Path) -> bool:
+    """Whether a folder is there that not everybody may read."""
+    try:
+        mode = folder.stat().st_mode
+    except OSError:
+        return False
+    return mode & _READ_BY_OTHERS != _READ_BY_OTHERS
 
 
 def outermost(paths: Iterable[Path], *bound: Path) -> list[Path]:

@@ -53,16 +53,20 @@ async def traffic(client: Stranger) -> AsyncIterator[Traffic]:
             await task
 
 
+def is_python(process: psutil.Process) -> bool:
+    return "python" in process.cmdline()[0]
+
+
 def node_pids(engine: Engine) -> set[int]:
     """Processes of the echo node, which runs whenever this is asked."""
-    found = {process.pid for process in engine.processes_of("stringEcho.py") if "python" in process.name()}
+    found = {process.pid for process in engine.processes_of("stringEcho.py") if is_python(process)}
     assert found, "the node does not run"
     return found
 
 
 def environments(engine: Engine) -> list[psutil.Process]:
     """Processes of the environment, which runs whenever this is asked; not those that only hold it."""
-    found = [p for p in engine.processes_of("rce_container.environment") if "python" in p.name()]
+    found = [p for p in engine.processes_of("rce_container.environment") if is_python(p)]
     assert found, "the environment does not run"
     return found
 

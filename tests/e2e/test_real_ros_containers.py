@@ -40,6 +40,7 @@ rospy.spin()
 def packages() -> Iterator[Path]:
     """A folder with a package as ROS's build tools leave it."""
     folder = Path(tempfile.mkdtemp(prefix="rce-pkg-", dir="/tmp"))
+    folder.chmod(0o755)
     package = folder / "real_nodes"
     (package / "scripts").mkdir(parents=True)
     (package / "lib").mkdir()

@@ -240,7 +240,22 @@ def engine_processes(folder: Path) -> list[psutil.Process]:
                 found |= {child.pid: child for child in (process, *process.children(recursive=True))}
         except (psutil.NoSuchProcess, psutil.AccessDenied, psutil.ZombieProcess):
             continue
+    for environment in _environments(folder):
+        with contextlib.suppress(psutil.NoSuchProcess):
+            found |= {child.pid: child for child in (environment, *environment.children(recursive=True))}
     return list(found.values())
+
+
+def _environments(folder: Path) -> list[psutil.Process]:
+    """The environments that descend from nothing of the engine, because what forked them is gone."""
+    found = []
+    for path in folder.rglob("record.json"):
+        with contextlib.suppress(OSError, psutil.NoSuchProcess):
+            pid = json.loads(path.read_bytes()).get("environment", 0)
+            process = psutil.Process(pid) if pid else None
+            if process is not None and "rce_container.environment" in process.cmdline():
+                found.append(process)
+    return found
 
 
 @contextlib.asynccontextmanager

@@ -172,3 +172,23 @@ def test_arguments_are_split_as_a_shell_splits_and_values_stay_in_their_word(tmp
     )
     value = "two words' \"; rm -rf /"
     assert words == ["a", "b c", "d e", "f g", value, f"{folder}/m.yaml", f"x:={value};", "ls"]
+
+
+def test_a_folder_that_may_not_be_entered_spoils_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed, one = tmp_path / "closed", make(tmp_path / "open" / "one")
+    closed.mkdir()
+
+    def stat(path: str | Path, **how: bool) -> os.stat_result:
+        if Path(path).is_relative_to(closed) and Path(path) != closed:
+            raise PermissionError(13, "Permission denied", str(path))
+        return original(path, **how)
+
+    original = os.stat
+    monkeypatch.setattr(os, "stat", stat)
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != closed)
+    index = PackageIndex([closed, tmp_path / "open"])
+    assert index.find("one").path == one
+    with pytest.raises(PackageNotFound, match=f"{closed} may not be read here"):
+        index.find("two")
