@@ -371,7 +371,7 @@ class Manager:
                 join=cell.join,
                 host_network=host_network,
                 switch=seat.path if seat else "",
-                image=resources.image,
+                image=resources.image or runtime.image,
             )
             handle = runtime.start(order)
         process = handle.process

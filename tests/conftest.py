@@ -35,6 +35,20 @@ def _runs(*argv: str) -> bool:
         return False
 
 
+def _can_run_images() -> bool:
+    """Try to make a container, as the engine does."""
+    from rce_container.exceptions import RuntimeUnavailableError
+    from rce_container.runtimes.podman import PodmanRuntime
+
+    runtime = PodmanRuntime()
+    try:
+        runtime.probe()
+    except RuntimeUnavailableError:
+        return False
+    runtime.close()
+    return True
+
+
 def _can_make_networks() -> bool:
     """Try with a namespace of an own name and a pair of interfaces in it."""
     name = f"rce-check-{os.getpid()}"
@@ -113,6 +127,10 @@ _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
     ),
     "root": (lambda: os.geteuid() == 0, "needs root"),
     "cgroups": (_can_limit, "no cgroup can be made here (needs root, or a delegated subtree)"),
+    "podman": (
+        _can_run_images,
+        "podman does not work here (Debian: podman crun; needs root, and a store of the kind overlay)",
+    ),
     "netns": (_can_make_networks, "may not make network namespaces here (needs root and ip)"),
 }
 

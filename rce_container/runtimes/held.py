@@ -31,6 +31,8 @@ class HeldHandle(Handle):
         self, process: proc.Process, popen: subprocess.Popen[bytes], birth: Birth, nursery: Nursery
     ) -> None:
         super().__init__(process, "", popen)
+        self.complaint = "its namespaces cannot be made"
+        """What is said when there is no holder."""
         self._birth = birth
         self._nursery = nursery
         self._fds: dict[str, int] = {}
@@ -90,7 +92,7 @@ class HeldHandle(Handle):
         with socket.socket(fileno=os.dup(self._fds["tether"])) as tether:
             said, pid = await hear_credentials(tether, 1)
         if not said or not pid:
-            raise StartError("its namespaces cannot be made")
+            raise StartError(self.complaint)
         return pid
 
     def _open_holder(self, pid: int) -> int:

@@ -22,7 +22,7 @@ from rce_container.exceptions import RuntimeUnavailableError, StartError
 from rce_container.network.hosts import hostname
 from rce_container.nursery.mounts import HOME, LOGS
 from rce_container.runtimes.base import SHELL, Order
-from rce_container.runtimes.held import HOLDER
+from rce_container.runtimes.held import HOLDER, HeldHandle
 from rce_container.runtimes.namespace import (
     BUNDLES,
     HOME_BYTES,
@@ -35,11 +35,18 @@ from rce_container.uids import UidPool
 _IMAGE = re.compile(
     r"[a-z0-9][\w.-]*(:[0-9]+)?(/[\w.-]+)*(:[\w.-]+)?(@sha256:[0-9a-f]{64})?", re.ASCII | re.IGNORECASE
 )
+_TRANSPORTS = (
+    *("containers-storage", "dir", "docker-archive", "docker-daemon", "oci", "oci-archive"),
+    *("ostree", "sif", "tarball"),
+)
+STATE = Path("/run/rce/podman")
+"""Where podman keeps its state; podmans that run at the same time each see their own there."""
 _TIMEOUT_S = 20.0
 _DRIVER = "overlay"
 
-# crun refuses machines that have controllers in cgroups of both versions, though it is to leave cgroups
-# alone: the newer version is hidden from it. Locks in files, because those in memory are the whole machine's.
+# Podman's own state is in memory, its locks in files, because those in memory are the whole machine's. crun
+# refuses machines that have controllers in cgroups of both versions, though it is to leave cgroups alone: the
+# newer version is hidden from it.
 _SCRIPT = """
 mount -t tmpfs -o mode=700 tmpfs "$1" && cd "$1" || exit 1
 [ ! -d /sys/fs/cgroup/unified ] || mount -t tmpfs tmpfs /sys/fs/cgroup/unified
@@ -83,6 +90,7 @@ class PodmanRuntime(NamespaceRuntime):
         self, images: Sequence[str] = (), *, home_bytes: int = HOME_BYTES, uids: UidPool | None = None
     ) -> None:
         super().__init__(home_bytes=home_bytes, uids=uids)
+        self.image = images[0] if images else ""
         self._images = tuple(images)
         self._podman = shutil.which("podman") or ""
         self._unshare = shutil.which("unshare") or ""
@@ -130,14 +138,23 @@ class PodmanRuntime(NamespaceRuntime):
         driver, _, root = found.stdout.strip().partition(" ")
         return driver, root
 
+    def start(self, order: Order) -> HeldHandle:
+        """Make the container's namespaces; the environment comes to life by the handle's ``launch``."""
+        handle = super().start(order)
+        if order.image:
+            handle.complaint = (
+                f"podman cannot start the image {order.image} (if it is not there, the machine's operator "
+                "can fetch it: podman pull)"
+            )
+        return handle
+
     def _command(self, order: Order) -> list[str]:
-        state = order.folder.path / "podman"
-        state.mkdir(mode=0o700, exist_ok=True)
+        STATE.mkdir(mode=0o700, parents=True, exist_ok=True)
         podman = {
-            "--root": f"{state}/root",
-            "--runroot": f"{state}/run",
-            "--tmpdir": f"{state}/events",
-            "--runtime-flag": f"root={state}/crun",
+            "--root": f"{STATE}/root",
+            "--runroot": f"{STATE}/run",
+            "--tmpdir": f"{STATE}/events",
+            "--runtime-flag": f"root={STATE}/crun",
             "--cgroup-manager": "cgroupfs",
             "--events-backend": "none",
             "--storage-driver": _DRIVER,
@@ -149,7 +166,7 @@ class PodmanRuntime(NamespaceRuntime):
             "--network": "host" if order.host_network else "none",
         }
         return [
-            *(self._unshare, *_APART, SHELL, "-c", _SCRIPT, "rce-podman", str(state)),
+            *(self._unshare, *_APART, SHELL, "-c", _SCRIPT, "rce-podman", str(STATE)),
             *(self._podman, *chain.from_iterable(podman.items())),
             *("run", *_FIXED, *chain.from_iterable(run.items())),
             *(f"--tmpfs={one},notmpcopyup" for one in _TEMPORARY),
@@ -167,7 +184,7 @@ class PodmanRuntime(NamespaceRuntime):
         mounts = [(path, str(path)) for path in outermost(_paths(order))]
         mounts += [(folder.etc / name, f"/etc/{name}") for name in _OWN_ETC]
         mounts.append((folder.bundles, BUNDLES))
-        image = order.image or (self._images[0] if self._images else "")
+        image = order.image
         if not image:
             root = folder.path / "root"
             root.mkdir(mode=0o755, exist_ok=True)
@@ -180,12 +197,17 @@ class PodmanRuntime(NamespaceRuntime):
                     f"rce-container --image {image}"
                 )
             last = ["--rootfs", f"{image}:O"]
-        elif _IMAGE.fullmatch(image):
+        elif is_image_name(image):
             last = [image]
         else:
             raise StartError(f"{image!r} is neither the name of an image nor the path of a folder")
         options = [f"--volume={source}:{target}:ro" for source, target in mounts]
         return [*options, f"--volume={folder.logs}:{LOGS}:rw", *last]
+
+
+def is_image_name(text: str) -> bool:
+    """Whether podman takes this for an image's name, and not for an option or a place to read one from."""
+    return bool(_IMAGE.fullmatch(text)) and text.partition(":")[0] not in _TRANSPORTS
 
 
 def _paths(order: Order) -> list[Path]:
