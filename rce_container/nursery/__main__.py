@@ -21,7 +21,7 @@ import msgspec
 
 from rce_container.environment.cradle import Cradle
 from rce_container.environment.messages import Boot
-from rce_container.environment.process import OF_ENVIRONMENT, die_before_others
+from rce_container.environment.process import OF_ENVIRONMENT, die_before_others, limit_oneself
 from rce_container.environment.running import run_environment
 from rce_container.nursery import kernel
 from rce_container.nursery.confine import confine
@@ -127,6 +127,7 @@ def _settle(birth: Birth, gifts: Gifts, logs: int) -> Boot:
     os.environ.update(birth.environ)
     show_variables(birth.environ)
     os.chdir(HOME)
+    limit_oneself(birth.boot.rlimits)
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     return msgspec.structs.replace(birth.boot, home=HOME, logs=f"/proc/self/fd/{logs}")
 

@@ -14,6 +14,7 @@ import sys
 import msgspec
 from msgspec import Struct
 
+from rce_container.environment.process import OF_NODES, die_before_others
 from rce_container.nursery import kernel
 from rce_container.nursery.script import open_streams, run_script
 from rce_container.nursery.title import set_title, show_variables
@@ -72,6 +73,7 @@ def _be(script: Script, fds: list[int]) -> None:
     show_variables(script.environ)
     set_title((sys.executable, script.path, *script.arguments), os.path.basename(sys.executable))  # noqa: PTH119
     kernel.set_dumpable(True)
+    die_before_others(OF_NODES)
     os.chdir(script.folder)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     open_streams(unbuffered=bool(script.environ.get("PYTHONUNBUFFERED")))

@@ -1,4 +1,4 @@
-"""``python -m support.sandbox FOLDER look|two``: makes containers and prints what their nodes can see and do.
+"""``python -m support.sandbox FOLDER RUNTIME look|two``: makes containers and prints what their nodes can see and do.
 
 Runs as whatever user it is started by, with a manager of its own. What it prints is JSON: what the machine
 sees of the container, and what each node said of itself.
@@ -75,7 +75,7 @@ print(json.dumps({
     "mounts": [line.split(" - ") for line in lines("/proc/self/mountinfo")],
     "namespaces": {kind: os.readlink("/proc/self/ns/" + kind) for kind in sys.argv[1].split(",")},
     "pids": sorted(int(name) for name in os.listdir("/proc") if name.isdigit()),
-    "core": resource.getrlimit(resource.RLIMIT_CORE)[0],
+    "oom": int(open("/proc/self/oom_score_adj").read()), "core": resource.getrlimit(resource.RLIMIT_CORE)[0],
     "size": {path: os.statvfs(path).f_blocks * os.statvfs(path).f_frsize
              for path in (os.environ["HOME"], "/tmp", "/dev/shm")},
     "home": os.stat(os.environ["HOME"]).st_mode & 0o7777, "cwd": os.getcwd(),
@@ -110,9 +110,9 @@ time.sleep(600)
 """
 
 
-async def look(folder: Path, home_bytes: int) -> dict[str, Any]:
+async def look(folder: Path, runtime: str, home_bytes: int) -> dict[str, Any]:
     """Make a container with a forked node and an executed one, and let both say what they can do."""
-    machine = Machine(folder, "namespace", home_bytes=home_bytes)
+    machine = Machine(folder, runtime, home_bytes=home_bytes)
     nodes = machine.packages / "own" / "nodes"
     (nodes / "forked.py").write_text(NODE)
     (nodes / "executed").write_text(f"#!{sys.executable}\n{NODE}")
@@ -151,9 +151,9 @@ def outside(machine: Machine) -> dict[str, Any]:
     }
 
 
-async def two(folder: Path) -> dict[str, Any]:
+async def two(folder: Path, runtime: str) -> dict[str, Any]:
     """Make two containers, let the manager die, and make a third: whose users are they?"""
-    machine = Machine(folder, "namespace")
+    machine = Machine(folder, runtime)
 
     def users() -> dict[str, int]:
         units = machine.manager._units.values()
@@ -182,9 +182,9 @@ def _uid(pid: int) -> int:
 
 
 async def main() -> None:
-    folder, what = Path(sys.argv[1]), sys.argv[2]
+    folder, runtime, what = Path(sys.argv[1]), sys.argv[2], sys.argv[3]
     folder.mkdir()
-    found = await (look(folder, int(sys.argv[3])) if what == "look" else two(folder))
+    found = await (look(folder, runtime, int(sys.argv[4])) if what == "look" else two(folder, runtime))
     with contextlib.suppress(OSError):
         print(json.dumps(found))  # noqa: T201 - for the test that started it
 

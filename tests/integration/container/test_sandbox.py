@@ -11,11 +11,13 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
+from copy import copy
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from rce_container.environment.process import OF_NODES
 from rce_container.runtimes.namespace import HOME
 from rce_container.uids import FIRST_UID, UIDS
 
@@ -31,6 +33,8 @@ pytestmark = [pytest.mark.needs("bwrap"), pytest.mark.timeout(120)]
 
 class Person:
     """Who runs the engine: how its programs are started, and where it may write."""
+
+    runtime = "namespace"
 
     def __init__(self, name: str, prefix: Sequence[str], python: str, source: Path, folder: Path) -> None:
         self.name = name
@@ -49,7 +53,7 @@ class Person:
             "RCE_SECRET": "the secret of the engine",
         }
         work = tempfile.mkdtemp(dir=self.folder)
-        argv = [*self._prefix, self._python, "-m", "support.sandbox", f"{work}/m", *words]
+        argv = [*self._prefix, self._python, "-m", "support.sandbox", f"{work}/m", self.runtime, *words]
         os.chown(work, self.uid, self.uid)
         done = subprocess.run(
             argv, env=env, cwd="/", capture_output=True, text=True, timeout=100, check=False
@@ -67,6 +71,14 @@ def root_person() -> Iterator[Person]:
     folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
     yield Person("root", (), sys.executable, ROOT, folder)
     shutil.rmtree(folder)
+
+
+@pytest.fixture(scope="session")
+def podman_person(root_person: Person) -> Person:
+    """The same with podman, which has the machine's programs where no image is named."""
+    person = copy(root_person)
+    person.runtime = "podman"
+    return person
 
 
 @pytest.fixture(scope="session")
@@ -113,7 +125,9 @@ def _copy_engine(folder: Path) -> str:
     return str(folder / "venv" / "bin" / "python")
 
 
-@pytest.fixture(scope="session", params=["root", "normal"])
+@pytest.fixture(
+    scope="session", params=["root", "normal", pytest.param("podman", marks=pytest.mark.needs("podman"))]
+)
 def person(request: pytest.FixtureRequest) -> Person:
     found = request.getfixturevalue(f"{request.param}_person")
     assert isinstance(found, Person)
@@ -157,6 +171,7 @@ def test_it_has_no_rights(node: dict[str, Any]) -> None:
         assert status["NoNewPrivs"].strip() == "1"
         assert status["Seccomp"].strip() == "2"
     assert node["core"] == 1
+    assert node["oom"] == OF_NODES
 
 
 def test_every_namespace_is_its_own(node: dict[str, Any]) -> None:
