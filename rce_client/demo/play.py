@@ -89,14 +89,15 @@ class Play:
     def planner_parameters(self) -> dict[str, Any]:
         """What the planner is told of the floor. It is not told of hidden boxes."""
         scenario, grid = self.scenario, self.scenario.grid
-        parameters: dict[str, Any] = {
-            "rows": grid.rows,
-            "columns": grid.columns,
-            "cell_size": grid.cell_size,
-            "seed": self.seed,
-        }
         cells = {"walls": sorted(grid.blocked), "blocked": list(scenario.known_boxes)}
-        return {**parameters, **{name: value for name, value in cells.items() if value}}
+        known = {name: value for name, value in cells.items() if value}
+        return {**self.map_parameters, "seed": self.seed, **known}
+
+    @property
+    def map_parameters(self) -> dict[str, Any]:
+        """Size and cells of the map."""
+        grid = self.scenario.grid
+        return {"rows": grid.rows, "columns": grid.columns, "cell_size": grid.cell_size}
 
     def write_scene(self) -> None:
         """Write the file that the world reads."""

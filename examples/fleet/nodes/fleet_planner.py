@@ -12,10 +12,10 @@ import asyncio
 import re
 import time
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rce.fleet.angles import yaw_of
+from rce.fleet.answers import is_answer, read_answer
 from rce.fleet.coordination.events import (
     BlockedChanged,
     CellBlocked,
@@ -35,10 +35,9 @@ from rce.fleet.coordination.events import (
 )
 from rce.fleet.coordination.planner import FleetPlanner
 from rce.fleet.coordination.settings import FleetSettings
-from rce.fleet.grid import GridMap
 from rce.fleet.move_client import ClientReport, ClientState
-from rce.fleet.movingai import read_map
 from rce.fleet.occupancy import occupancy
+from rce.fleet.parameters import make_grid
 from rce.fleet.revisions import numbered_array
 from rce.ros.errors import MasterError
 from rce.ros.node import Node, run
@@ -64,10 +63,12 @@ class PlannerNode:
     Args:
         node: Running node.
         planner: The planner.
+        takes_answers: Move clients answer on ``goalNodesList`` instead of topics of their own.
     """
 
-    def __init__(self, node: Node, planner: FleetPlanner) -> None:
+    def __init__(self, node: Node, planner: FleetPlanner, *, takes_answers: bool = False) -> None:
         self._node = node
+        self._takes_answers = takes_answers
         self._planner = planner
         self._cells: dict[str, Publisher] = {}
         self._cancels: dict[str, Publisher] = {}
@@ -118,22 +119,48 @@ class PlannerNode:
         node = self._node
         self._cells[robot] = await node.advertise(f"/{robot}/goalNodesList", "std_msgs/Int32MultiArray")
         self._cancels[robot] = await node.advertise(f"/{robot}/cancelGoal", "std_msgs/Bool")
-        await node.subscribe(
-            f"/{robot}/moveClient/status",
-            "fleet/MoveStatus",
-            lambda message: self._take(ReportSeen(robot, _report(message))),
-        )
-        await node.subscribe(
-            f"/{robot}/blockedCells",
-            "std_msgs/Int32MultiArray",
-            lambda message: self._take(ObstacleSeen(robot, tuple(message.data))),
-        )
+        if self._takes_answers:
+            await node.subscribe(
+                f"/{robot}/goalNodesList",
+                "std_msgs/Int32MultiArray",
+                lambda message: self._take_answer(robot, message),
+            )
+        else:
+            await self._hear_apart(robot)
         await node.subscribe(
             f"/{robot}/amcl_pose",
             "geometry_msgs/PoseWithCovarianceStamped",
             lambda message: self._take(_pose(robot, message)),
         )
         node.log.info("%s is here", robot)
+
+    async def _hear_apart(self, robot: str) -> None:
+        """Hear a move client and its robot on a topic for each."""
+        await self._node.subscribe(
+            f"/{robot}/moveClient/status",
+            "fleet/MoveStatus",
+            lambda message: self._take(ReportSeen(robot, _report(message))),
+        )
+        await self._node.subscribe(
+            f"/{robot}/blockedCells",
+            "std_msgs/Int32MultiArray",
+            lambda message: self._take(ObstacleSeen(robot, tuple(message.data))),
+        )
+
+    def _take_answer(self, robot: str, message: Message) -> None:
+        """Take what a move client says; the planner's own lists come back here too."""
+        dimensions = message.layout.dim
+        labels = [dimension.label for dimension in dimensions]
+        if not is_answer(labels):
+            return
+        try:
+            report, blocked = read_answer(labels, [dimension.size for dimension in dimensions], message.data)
+        except ValueError as error:
+            self._node.log.warning("%s: %s", robot, error)
+            return
+        self._take(ReportSeen(robot, report))
+        if blocked:
+            self._take(ObstacleSeen(robot, blocked))
 
     async def _keep_time(self) -> None:
         while await self._node.sleep(TICK):
@@ -255,26 +282,6 @@ async def read_parameters(node: Node) -> dict[str, Any]:
     return values
 
 
-def make_grid(values: Mapping[str, Any]) -> GridMap:
-    """The map that parameters describe.
-
-    Raises:
-        ValueError: They describe none.
-        MapError: The map file cannot be read.
-        OSError: The map file cannot be opened.
-    """
-    size = float(values.get("cell_size", 1.0))
-    if values.get("map"):
-        return read_map(Path(values["map"]), cell_size=size)
-    return GridMap(
-        rows=int(values.get("rows", 8)),
-        columns=int(values.get("columns", 8)),
-        cell_size=size,
-        origin=(float(values.get("origin_x", 0.0)), float(values.get("origin_y", 0.0))),
-        blocked=frozenset(int(cell) for cell in values.get("walls", [])),
-    )
-
-
 async def main() -> None:
     """Steer a fleet until the node is told to stop."""
     async with Node("fleet_planner") as node:
@@ -284,7 +291,10 @@ async def main() -> None:
             seed=int(values.get("seed", 0)),
         )
         planner = FleetPlanner(make_grid(values), settings)
-        await PlannerNode(node, planner).run([int(cell) for cell in values.get("blocked", [])])
+        takes_answers = bool(values.get("answers", False))
+        await PlannerNode(node, planner, takes_answers=takes_answers).run(
+            [int(cell) for cell in values.get("blocked", [])]
+        )
 
 
 if __name__ == "__main__":

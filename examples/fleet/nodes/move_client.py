@@ -11,8 +11,10 @@ import time
 from typing import TYPE_CHECKING
 
 from rce.fleet.angles import quaternion_z
+from rce.fleet.answers import Answer, answer_array, is_answer
 from rce.fleet.grid import GridMap
 from rce.fleet.move_client import ClientReport, GoalState, Instruction, MoveClient, SendGoal, SendStop
+from rce.fleet.parameters import make_grid
 from rce.fleet.revisions import revision_of
 from rce.ros.node import Node, run
 from rce.ros.types import Time
@@ -42,14 +44,24 @@ class MoveClientNode:
         self._goals: Publisher
         self._stops: Publisher
         self._reports: Publisher
+        self._answers = False
 
     async def run(self) -> None:
         """Send the robot along until the node is told to stop."""
         node = self._node
         self._goals = await node.advertise("move_base/goal", "move_base_msgs/MoveBaseActionGoal")
         self._stops = await node.advertise("move_base/cancel", "actionlib_msgs/GoalID")
-        self._reports = await node.advertise("moveClient/status", "fleet/MoveStatus")
-        await node.subscribe("/map", "nav_msgs/OccupancyGrid", self._take_map)
+        values = await node.get_param("~", {})
+        self._answers = bool(values.get("answers", False))
+        if "rows" in values or "map" in values:
+            self._take_grid(make_grid(values))
+        else:
+            await node.subscribe("/map", "nav_msgs/OccupancyGrid", self._take_map)
+        if self._answers:
+            self._reports = await node.advertise("goalNodesList", "std_msgs/Int32MultiArray")
+            await node.subscribe("blockedCells", "std_msgs/Int32MultiArray", self._take_blocked)
+        else:
+            self._reports = await node.advertise("moveClient/status", "fleet/MoveStatus")
         await node.subscribe("goalNodesList", "std_msgs/Int32MultiArray", self._take_cells)
         await node.subscribe("cancelGoal", "std_msgs/Bool", self._take_cancel)
         await node.subscribe("move_base/status", "actionlib_msgs/GoalStatusArray", self._take_states)
@@ -73,13 +85,21 @@ class MoveClientNode:
             cell_size=info.resolution,
             origin=(info.origin.position.x, info.origin.position.y),
         )
+        self._take_grid(grid)
+
+    def _take_grid(self, grid: GridMap) -> None:
         if self._client is None:
             self._client = MoveClient(grid, self._node.namespace.strip("/"), time.time())
 
+    def _take_blocked(self, message: Message) -> None:
+        if self._client is not None:
+            self._report(self._client.report, blocked=tuple(message.data))
+
     def _take_cells(self, message: Message) -> None:
-        if self._client is None:
+        labels = [dimension.label for dimension in message.layout.dim]
+        if self._client is None or is_answer(labels):
             return
-        revision = revision_of([dimension.label for dimension in message.layout.dim])
+        revision = revision_of(labels)
         try:
             self._do(self._client.take_cells(revision, list(message.data), time.time()))
         except ValueError as error:
@@ -128,8 +148,11 @@ class MoveClientNode:
             },
         )
 
-    def _report(self, report: ClientReport) -> None:
+    def _report(self, report: ClientReport, blocked: tuple[int, ...] = ()) -> None:
         self._reported_at = time.time()
+        if self._answers:
+            self._reports.publish(answer_array(Answer(report, blocked)))
+            return
         self._reports.publish(
             revision=report.revision,
             state=report.state.value,
