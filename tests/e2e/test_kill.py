@@ -187,10 +187,12 @@ async def test_containers_end_whole_without_a_manager(runtime: str) -> None:
         await engine.container.kill()
         await until(
             lambda: (
-                not engine.processes_of("rce_container.environment") + engine.processes_of("stringEcho.py")
+                not engine.processes_of("rce-container-shim")
+                + engine.processes_of("rce_container.environment")
+                + engine.processes_of("stringEcho.py")
             ),
             timeout=30,
-            what="environment and nodes are gone",
+            what="shim, environment and nodes are gone",
         )
         left = [path for path in engine.folder.rglob("*") if path.is_socket() and "link" in path.name]
         assert left == []
