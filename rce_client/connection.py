@@ -17,7 +17,7 @@ from enum import Enum
 from typing import TYPE_CHECKING, Any, NoReturn, Self, TypeVar
 
 from rce.protocol.codec import encode
-from rce.protocol.messages import DataMessage, ErrorReport, InterfaceStatus
+from rce.protocol.messages import NO_ID, DataMessage, ErrorReport, InterfaceStatus
 from rce.protocol.stream import Fault
 from rce_client.courier import Courier, Target, Timing
 from rce_client.desired import Desired
@@ -41,7 +41,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 E = TypeVar("E", bound="End")
-
+_MOST_EARLY = 16
+"""Topics of which the last message is kept until the program makes their interface."""
 
 CONNECTING = "looking for the engine"
 """The words of the first report of an attempt; the reports of failures tell what went wrong."""
@@ -106,6 +107,10 @@ class Connection(Requests, OwnInterfaces):
         self._courier = Courier(target, self, timing, limits)
         self._desired = Desired()
         self._ends: dict[str, End] = {}
+        self._early: dict[str, DataMessage] = {}
+        """The last message of each topic that came before its interface was made here, oldest first."""
+        self._withdrawn: set[str] = set()
+        """Own interfaces that were removed; what still comes for them is of no use."""
         self._tasks: asyncio.TaskGroup | None = None
         self._work: set[asyncio.Task[Any]] = set()
         self._waiters: set[asyncio.Future[None]] = set()
@@ -236,6 +241,7 @@ class Connection(Requests, OwnInterfaces):
         """Remove an own interface."""
         if self._ends.get(end.tag) is end:
             del self._ends[end.tag]
+            self._withdrawn.add(end.tag)
             self.active.pop(end.tag, None)
             end.on_closed()
             await self.remove_interface(self.robot_id, end.tag)
@@ -262,6 +268,7 @@ class Connection(Requests, OwnInterfaces):
     def on_lost(self, error: LostError) -> None:
         """Nothing is joined any more, as far as is known here."""
         self.active = dict.fromkeys(self.active, False)
+        self._early.clear()
         for end in list(self._ends.values()):
             end.on_lost()
         self._set_state(State.LOST, str(error))
@@ -273,6 +280,8 @@ class Connection(Requests, OwnInterfaces):
                 end = self._ends.get(event.i_tag)
                 if end is not None:
                     end.deliver(event)
+                else:
+                    self._keep(event)
             case InterfaceStatus():
                 self.active[event.i_tag] = event.status
                 self._notify()
@@ -304,8 +313,23 @@ class Connection(Requests, OwnInterfaces):
             end.on_closed()
             raise InterfaceError(f"interface {end.tag} is there already")
         self._ends[end.tag] = end
+        early = self._early.pop(end.tag, None)
+        if early is not None and end.fits(early):
+            end.deliver(early)
         await self.add_interface(self.robot_id, end.tag, end.type, end.cls)
         return end
+
+    def _keep(self, message: DataMessage) -> None:
+        """Keep what comes for an interface that this program has not made yet.
+
+        The engine gives a robot that returns the latched messages of its interfaces at once, also if another
+        program, or an earlier life of this one, made them.
+        """
+        if message.msg_id == NO_ID and message.i_tag not in self._withdrawn:
+            self._early.pop(message.i_tag, None)
+            self._early[message.i_tag] = message
+            if len(self._early) > _MOST_EARLY:
+                del self._early[next(iter(self._early))]
 
     def _take_error(self, text: str) -> None:
         fault = read_call_fault(text)

@@ -82,6 +82,14 @@ class End(ABC):
     def deliver(self, message: DataMessage) -> None:
         """Take a data message for this end."""
 
+    def fits(self, message: DataMessage) -> bool:
+        """Tell whether a message that came before this end was made is for it."""
+        return (
+            self.role is Role.PUBLISHER
+            and message.type == self.cls
+            and self.raw is isinstance(message.msg, bytes | bytearray | memoryview)
+        )
+
     def on_lost(self) -> None:  # noqa: B027 - most ends need not care
         """The connection ended."""
 

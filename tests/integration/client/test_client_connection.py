@@ -51,6 +51,21 @@ async def test_publisher_and_subscriber(engine: Engine) -> None:
         assert received == ["one", "two"]
 
 
+async def test_a_program_that_is_started_again_gets_the_latched_message(engine: Engine) -> None:
+    async with engine.connection() as conn:
+        await conn.subscriber("hear", STRING)
+        await conn.wait_active("hear", 10)
+        engine.end("hear").port.send(ros_string("kept"), latched=True)
+    async with engine.connection() as conn:
+        await conn.wait_active("hear", 10)  # what was said before has come as well
+        subscriber = await conn.subscriber("hear", STRING)
+        assert (await anext(aiter(subscriber)))["data"] == "kept"
+        await subscriber.close()
+        engine.end("hear").port.send(ros_string("too late"), latched=True)
+        other = await conn.subscriber("hear", "std_msgs/Int32")
+        assert not other._queue
+
+
 async def test_raw_publisher_and_subscriber(engine: Engine) -> None:
     got: asyncio.Queue[bytes] = asyncio.Queue()
     async with engine.connection() as conn:
