@@ -10,10 +10,12 @@ them; neither the machine's mounts nor its own ``podman ps`` ever show it. Image
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
@@ -66,7 +68,7 @@ _TEMPORARY = ("/tmp:mode=1777", f"{HOME}:mode=755")  # noqa: S108 - the containe
 _FIXED = (
     *("--pull=never", "--entrypoint", SHELL, "--workdir=/", "--user=0:0", "--preserve-fds=1"),
     *("--cgroups=disabled", "--cgroupns=private", "--ipc=private", "--read-only", "--read-only-tmpfs=false"),
-    *("--cap-drop=all", "--security-opt=no-new-privileges"),
+    *("--cap-drop=all", "--security-opt=no-new-privileges", "--security-opt=mask=/sys"),
     *("--ulimit=nofile=1024:1024", "--ulimit=nproc=1024:1024"),  # podman's own may be above what is allowed
     *("--no-hosts", "--passwd=false", "--unsetenv-all", "--http-proxy=false", "--image-volume=ignore"),
     *("--systemd=false", "--sdnotify=ignore", "--log-driver=none"),
@@ -123,14 +125,16 @@ class PodmanRuntime(NamespaceRuntime):
     def _find_store(self) -> tuple[str, str]:
         form = "{{.Store.GraphDriverName}} {{.Store.GraphRoot}}"
         try:
-            found = subprocess.run(  # noqa: S603
-                [self._podman, "info", "--format", form],
-                stdin=subprocess.DEVNULL,
-                capture_output=True,
-                text=True,
-                timeout=_TIMEOUT_S,
-                check=True,
-            )
+            with tempfile.TemporaryDirectory() as scratch:  # crun makes a folder here, even to be asked
+                found = subprocess.run(  # noqa: S603
+                    [self._podman, "info", "--format", form],
+                    stdin=subprocess.DEVNULL,
+                    capture_output=True,
+                    text=True,
+                    timeout=_TIMEOUT_S,
+                    check=True,
+                    env={**os.environ, "XDG_RUNTIME_DIR": scratch},
+                )
         except subprocess.CalledProcessError as error:
             raise RuntimeUnavailableError(self.name, error.stderr.strip() or str(error)) from error
         except (OSError, subprocess.TimeoutExpired) as error:
