@@ -25,7 +25,7 @@ class Cloud:
         engine = await children.start("engine", self._engine_argv(), needed=True)
         world = await children.start("world", self._world_argv())
         await children.wait_line(engine, "RCE ready:", START_TIMEOUT)
-        station = await children.start("station", self._station_argv())
+        station = await children.start("station", self._station_argv(), revivable=True)
         uris = await self._graphs(children, world)
         page = await children.wait_line(station, "rce ui ready:", START_TIMEOUT)
         bridges = [
@@ -33,6 +33,7 @@ class Cloud:
                 f"robot{number}",
                 [sys.executable, "-m", "rce_client.ros_bridge", str(play.folder / f"robot{number}.config")],
                 env={"ROS_MASTER_URI": uris[robot]},
+                revivable=True,
             )
             for number, robot in enumerate(play.scenario.robots, start=1)
         ]

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import signal
-import tempfile
-import time
-from collections.abc import Callable, Coroutine, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Coroutine, Iterable
 from dataclasses import fields
 from pathlib import Path
 from random import Random
@@ -20,6 +17,7 @@ import uvloop
 from rce.config.settings import Runtime
 from rce_client.demo.exceptions import DemoError
 from rce_client.demo.floor import draw
+from rce_client.demo.folder import run_folder
 from rce_client.demo.headless import run_headless
 from rce_client.demo.play import CoreKind, Machines, Mode, Play
 from rce_client.demo.ports import ANY, Ports
@@ -90,7 +88,7 @@ def demo(
     try:
         scenario = draw(robots or (ROBOTS if scen is None else ROBOTS_OF_SCEN), seed, world=world, scen=scen)
         ports = _choose_ports(headless, given, _needed_ports(mode, core_uri))
-        with _folder(state_dir) as folder:
+        with run_folder(state_dir) as folder:
             play = Play(
                 scenario,
                 seed,
@@ -133,6 +131,7 @@ async def _headless(play: Play, timeout: float, report: Path | None, show: Calla
 async def _with_page(play: Play, show: Callable[[str], None], *, auto: bool) -> int:
     say(f"starting the fleet, mode {play.mode}")
     async with set_stage(play, show) as stage, aiohttp.ClientSession() as session:
+        stage.children.revive(say)
         typer.echo(f"RCE demo: {stage.page}")
         station = StationApi(session, stage.page)
         rng = Random(play.seed)  # noqa: S311 - draws goals, keeps no secret
@@ -187,18 +186,6 @@ def _choose_ports(headless: bool, given: dict[str, int | None], needed: Iterable
     base = ANY if headless else Ports()
     wished = {name: value for name, value in given.items() if value is not None}
     return Ports(**{name: getattr(base, name) for name in given} | wished).chosen(needed)
-
-
-@contextmanager
-def _folder(state_dir: Path | None) -> Iterator[Path]:
-    """A folder for this run: a new one in ``state_dir``, or one that is removed at the end."""
-    if state_dir is None:
-        with tempfile.TemporaryDirectory(prefix="rce-demo-", ignore_cleanup_errors=True) as folder:
-            yield Path(folder)
-        return
-    state_dir.mkdir(parents=True, exist_ok=True)
-    stamp = time.strftime("demo-%Y%m%d-%H%M%S-")
-    yield Path(tempfile.mkdtemp(prefix=stamp, dir=state_dir.absolute()))
 
 
 def _show_warning(line: str) -> None:

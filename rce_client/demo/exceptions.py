@@ -14,6 +14,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Sequence
 
 
@@ -55,7 +56,21 @@ class ChildDiedError(DemoError):
 
     def __str__(self) -> str:
         said = "".join(f"\n    {line}" for line in self.tail) or " and printed nothing"
-        return f"{self.name} ended with exit code {self.code}{said}"
+        return f"{self.name} {end_of(self.code)}{said}"
+
+
+def end_of(code: int) -> str:
+    """Say in words how a program ended.
+
+    Args:
+        code: Its exit code, negative for a signal.
+    """
+    if code >= 0:
+        return f"ended with exit code {code}"
+    try:
+        return f"was ended by {signal.Signals(-code).name}"
+    except ValueError:
+        return f"was ended by signal {-code}"
 
 
 class NotReadyError(DemoError):

@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from rce.config.resources import examples_dir
 from rce.ros.packages import PackageIndex
@@ -32,10 +33,18 @@ class Machine:
     enter: tuple[str, ...] = ()
 
     async def start(
-        self, children: Children, name: str, argv: Iterable[str], *, needed: bool = False
+        self,
+        children: Children,
+        name: str,
+        argv: Iterable[str],
+        *,
+        needed: bool = False,
+        revivable: bool = False,
     ) -> Program:
         """Start a program here, as a node of this machine's graph."""
-        return await children.start(name, [*self.enter, *argv], env=self._environment(), needed=needed)
+        return await children.start(
+            name, [*self.enter, *argv], env=self._environment(), needed=needed, revivable=revivable
+        )
 
     def _environment(self) -> Mapping[str, str]:
         path = [*PackageIndex.from_environ().path, examples_dir()]
@@ -46,15 +55,14 @@ class Machine:
         }
 
 
-def planner_argv(play: Play) -> list[str]:
-    """The planner, told of the floor by private parameters."""
-    parameters = (f"_{name}:={json.dumps(value)}" for name, value in play.planner_parameters.items())
-    return [*_executable("fleet_planner.py"), *parameters]
+def planner_argv(play: Play, **more: Any) -> list[str]:
+    """The planner, told of the floor by private parameters, and of ``more``."""
+    return [*_executable("fleet_planner.py"), *_parameters({**play.planner_parameters, **more})]
 
 
-def move_client_argv(robot: str) -> list[str]:
-    """The move client of a robot."""
-    return [*_executable("move_client.py"), f"__ns:={robot}"]
+def move_client_argv(robot: str, **parameters: Any) -> list[str]:
+    """The move client of a robot, with private parameters."""
+    return [*_executable("move_client.py"), f"__ns:={robot}", *_parameters(parameters)]
 
 
 def station_argv(play: Play, planner_core: str) -> list[str]:
@@ -74,6 +82,10 @@ def node_names(play: Play) -> frozenset[str]:
     """Global names of all nodes of the demo; a graph may have others."""
     robots = [f"/{robot}/{node}" for robot in play.scenario.robots for node in ("robot", "move_client")]
     return frozenset((*robots, "/fleet_planner", "/operator_station", "/world"))
+
+
+def _parameters(values: Mapping[str, Any]) -> Iterable[str]:
+    return (f"_{name}:={json.dumps(value)}" for name, value in values.items())
 
 
 def _executable(exe: str) -> list[str]:

@@ -38,10 +38,10 @@ class SingleMaster:
         here = Machine("here", uri)
         robots = play.scenario.robots
         world = await here.start(children, "world", world_argv(play, uri, dict.fromkeys(robots, uri)))
-        await here.start(children, "planner", planner_argv(play))
-        station = await here.start(children, "station", station_argv(play, uri))
+        await here.start(children, "planner", planner_argv(play), revivable=True)
+        station = await here.start(children, "station", station_argv(play, uri), revivable=True)
         for number, robot in enumerate(robots, start=1):
-            await here.start(children, f"move_client{number}", move_client_argv(robot))
+            await here.start(children, f"move_client{number}", move_client_argv(robot), revivable=True)
         page = await children.wait_line(station, "rce ui ready:", START_TIMEOUT)
         await children.wait_line(world, "simulation ready:", START_TIMEOUT)
         return page

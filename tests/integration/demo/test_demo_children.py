@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import signal
 import sys
 from pathlib import Path
@@ -49,6 +50,51 @@ async def test_a_program_that_dies_is_named_with_its_last_words(tmp_path: Path) 
         with pytest.raises(ChildDiedError, match="dying ended with exit code 3\n    something is wrong"):
             await asyncio.wait_for(children.while_alive(for_ever()), 20)
     assert not psutil.pid_exists(talker.child.pid)
+
+
+async def test_a_program_that_can_be_is_started_again(tmp_path: Path) -> None:
+    told: asyncio.Queue[str] = asyncio.Queue()
+    async with Children(tmp_path, ignore) as children:
+        talker = await children.start("talker", python(TALKER), revivable=True)
+        await children.wait_line(talker, "talker ready:", 20)
+        children.revive(told.put_nowait)
+        former = talker.child
+        os.kill(former.pid, signal.SIGKILL)
+        work = asyncio.create_task(children.while_alive(for_ever()))
+        assert await told.get() == "talker was ended by SIGKILL; it is started again"
+        async with asyncio.timeout(20):
+            while (tmp_path / "talker.log").read_text().count("talker ready: 42") < 2:
+                await asyncio.sleep(0.05)
+        assert talker.child is not former
+        assert not work.done()
+        work.cancel()
+    assert talker.child.returncode == -signal.SIGTERM
+
+
+async def test_a_program_that_dies_again_and_again_stays_dead(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(children_module, "REVIVAL_FIRST", 0.01)
+    told: list[str] = []
+    async with Children(tmp_path, ignore) as children:
+        children.revive(told.append)
+        await children.start("dying", python(DYING), revivable=True)
+        with pytest.raises(ChildDiedError, match="dying ended with exit code 3"):
+            await asyncio.wait_for(children.while_alive(for_ever()), 30)
+    assert len(told) == children_module.DEATHS_MOST - 1
+
+
+async def test_nothing_is_started_again_while_all_are_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(children_module, "REVIVAL_FIRST", 100.0)
+    told = asyncio.Event()
+    async with Children(tmp_path, ignore) as children:
+        children.revive(lambda _: told.set())
+        dying = await children.start("dying", python(DYING), revivable=True)
+        former = dying.child
+        await told.wait()
+    assert dying.child is former
 
 
 async def test_a_program_that_does_not_get_ready_is_named(tmp_path: Path) -> None:

@@ -1,0 +1,66 @@
+"""Programs of the demo that are killed are started again where that helps; else they end it with a text."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING
+
+import aiohttp
+import psutil
+import pytest
+from support.demo import running_demo
+from support.engine import until
+
+from rce_client.demo.exceptions import StationError
+from rce_client.demo.station import StationApi
+
+if TYPE_CHECKING:
+    from support.demo import Demo
+
+pytestmark = [pytest.mark.e2e, pytest.mark.timeout(200)]
+
+
+def kill(demo: Demo, *words: str) -> None:
+    """Kill the one program of the demo whose command line holds all words."""
+    found = []
+    for child in psutil.Process(demo.process.pid).children():
+        with contextlib.suppress(psutil.ZombieProcess):
+            line = " ".join(child.cmdline())
+            found += [child] if all(word in line for word in words) else []
+    assert len(found) == 1
+    found[0].kill()
+
+
+async def reaches(station: StationApi, robot: str, cell: int) -> None:
+    """Send a robot to a cell, again until the planner knows of it, and wait until it stands there."""
+    async with asyncio.timeout(100):
+        while True:
+            with contextlib.suppress(StationError):
+                for one in (await station.fleet()).robots:
+                    if one.id == robot and one.goal != cell:
+                        await station.set_goal(robot, cell)
+                    if one.id == robot and one.cell == cell and one.state == "arrived":
+                        return
+            await asyncio.sleep(0.5)
+
+
+async def test_killed_bridge_and_station_come_back_and_a_killed_world_is_named() -> None:
+    async with running_demo("--robots", 2, "--no-auto") as demo, aiohttp.ClientSession() as session:
+        station = StationApi(session, demo.page)
+        fleet = await station.fleet()
+        robot = fleet.robots[0]
+        assert fleet.map is not None
+        taken = {one.cell for one in fleet.robots} | set(fleet.blocked)
+        cells = [cell for cell in range(fleet.map.rows * fleet.map.columns) if cell not in taken]
+        kill(demo, "rce_client.ros_bridge", f"{robot.id.lower()}.config")
+        kill(demo, "rce_client.station")
+        await until(
+            lambda: demo.output().count("was ended by SIGKILL; it is started again") == 2,
+            timeout=30,
+            what="the demo tells what it starts again",
+        )
+        await reaches(station, robot.id, cells[0])
+        kill(demo, "rce_client.simulation")
+        assert await asyncio.wait_for(demo.process.wait(), 60) == 1
+        assert "rce demo: world was ended by SIGKILL" in demo.output()
