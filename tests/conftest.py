@@ -107,6 +107,10 @@ _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
         lambda: _runs("/usr/bin/python3", "-c", "import roslaunch, rosmaster, rostest, roswtf"),
         "roslaunch is missing (Debian: ros-core python3-rostest python3-roswtf)",
     ),
+    "ros_msgs": (
+        lambda: _runs("/usr/bin/python3", "-c", "import map_msgs, move_base_msgs, pcl_msgs, stereo_msgs"),
+        "not all of ROS's messages are installed (Debian: python3-map-msgs python3-pcl-msgs ...)",
+    ),
     "rosbag": (
         lambda: shutil.which("rosbag") is not None and _runs("/usr/bin/python3", "-c", "import rosbag"),
         "rosbag is missing (Debian: python3-rosbag)",

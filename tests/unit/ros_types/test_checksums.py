@@ -1,6 +1,7 @@
 """Checksums and definition texts are those of ROS; rosbags and Debian's own ROS are the oracles."""
 
 import json
+import re
 import subprocess
 from functools import cache
 from pathlib import Path
@@ -23,6 +24,30 @@ SYSTEM_PACKAGES = (
     "std_srvs",
     "rosgraph_msgs",
     "roscpp",
+)
+
+DEBIANS_PACKAGES = set(
+    [
+        "actionlib",
+        "actionlib_msgs",
+        "diagnostic_msgs",
+        "geometry_msgs",
+        "map_msgs",
+        "move_base_msgs",
+        "nav_msgs",
+        "pcl_msgs",
+        "roscpp",
+        "rosgraph_msgs",
+        "sensor_msgs",
+        "shape_msgs",
+        "std_msgs",
+        "std_srvs",
+        "stereo_msgs",
+        "tf2_msgs",
+        "topic_tools",
+        "trajectory_msgs",
+        "visualization_msgs",
+    ]
 )
 
 
@@ -168,6 +193,37 @@ def test_checksums_are_those_of_all_installed_ros_services() -> None:
     types = TypeRegistry(PackageIndex(["/usr/share"]))
     for name, (md5sum, _) in classes.items():
         assert types.service(name).md5sum == md5sum, name
+
+
+MD5_OF_HEADER = re.compile(r"struct MD5Sum<.*?return \"([0-9a-f]{32})\"", re.DOTALL)
+"""What gencpp wrote; in a service's header, the first is the service's own."""
+
+
+@pytest.mark.needs("rospy")
+def test_every_installed_definition_has_the_checksum_that_ros_made_of_it() -> None:
+    """Each ``.msg`` and ``.srv`` in ``/usr/share`` is compared with genpy's class and gencpp's header."""
+    types, classes = TypeRegistry(PackageIndex(["/usr/share"])), _system_ros()
+    compared, alone = set(), set()
+    for kind, of in (("msg", types.message), ("srv", types.service)):
+        for file in Path("/usr/share").glob(f"*/{kind}/*.{kind}"):
+            name = f"{file.parts[-3]}/{file.stem}"
+            md5sum, found = of(name).md5sum, []
+            if name in classes[kind]:
+                found.append(classes[kind][name][0])
+            for include in ("/usr/include", *map(str, Path("/usr/include").glob("*-linux-gnu"))):
+                header = Path(include, f"{name}.h")
+                if header.exists() and (written := MD5_OF_HEADER.search(header.read_text())):
+                    found.append(written[1])
+            assert set(found) <= {md5sum}, name
+            (compared if found else alone).add(name)
+    assert {"std_msgs/String", "sensor_msgs/Image", "roscpp/GetLoggers"} <= compared
+    assert not alone, "installed without the classes that ROS makes of them"
+
+
+@pytest.mark.needs("ros_msgs")
+def test_all_message_packages_of_debian_are_compared() -> None:
+    names = {*_system_ros()["msg"], *_system_ros()["srv"]}
+    assert {name.partition("/")[0] for name in names} >= DEBIANS_PACKAGES
 
 
 def test_builtin_definitions_are_those_of_installed_packages() -> None:
