@@ -26,29 +26,27 @@ SYSTEM_PACKAGES = (
     "roscpp",
 )
 
-DEBIANS_PACKAGES = set(
-    [
-        "actionlib",
-        "actionlib_msgs",
-        "diagnostic_msgs",
-        "geometry_msgs",
-        "map_msgs",
-        "move_base_msgs",
-        "nav_msgs",
-        "pcl_msgs",
-        "roscpp",
-        "rosgraph_msgs",
-        "sensor_msgs",
-        "shape_msgs",
-        "std_msgs",
-        "std_srvs",
-        "stereo_msgs",
-        "tf2_msgs",
-        "topic_tools",
-        "trajectory_msgs",
-        "visualization_msgs",
-    ]
-)
+DEBIANS_PACKAGES = {
+    "actionlib",
+    "actionlib_msgs",
+    "diagnostic_msgs",
+    "geometry_msgs",
+    "map_msgs",
+    "move_base_msgs",
+    "nav_msgs",
+    "pcl_msgs",
+    "roscpp",
+    "rosgraph_msgs",
+    "sensor_msgs",
+    "shape_msgs",
+    "std_msgs",
+    "std_srvs",
+    "stereo_msgs",
+    "tf2_msgs",
+    "topic_tools",
+    "trajectory_msgs",
+    "visualization_msgs",
+}
 
 
 @pytest.mark.parametrize(
