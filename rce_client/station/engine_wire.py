@@ -18,9 +18,10 @@ from rce_client.station.fleet_link import (
     SET_GOAL,
     STATE,
     STATE_TOPIC,
+    Ask,
     Listener,
     PlannerAwayError,
-    PlannerService,
+    PlannerWire,
     pose_topic,
 )
 from rce_client.station.respawn import repairs
@@ -28,7 +29,7 @@ from rce_client.station.respawn import repairs
 _SERVICES = (("setGoal", SET_GOAL), ("blockCell", BLOCK_CELL))
 
 
-class EngineWire:
+class EngineWire(PlannerWire):
     """A connection to the fleet's container. Starts the container's nodes again when they ended.
 
     Args:
@@ -38,11 +39,10 @@ class EngineWire:
     def __init__(self, config: ClientConfig) -> None:
         if not config.containers:
             raise ValueError("containers: the fleet's configuration names no container for the planner")
+        super().__init__("the planner's container is not ready yet")
         self._config = config
         self._container = config.containers[0].tag
         self._repairs: asyncio.Queue[Request] = asyncio.Queue()
-        self._new_robots: asyncio.Queue[str] = asyncio.Queue()
-        self._clients: dict[PlannerService, ServiceClient[dict[str, Any]]] = {}
         self._listener: Listener
 
     async def run(self, listener: Listener, ready: Callable[[], Awaitable[None]]) -> None:
@@ -68,26 +68,6 @@ class EngineWire:
             finally:
                 await connection.remove_all()
 
-    def follow(self, robot: str) -> None:
-        """Let a robot's poses come in."""
-        self._new_robots.put_nowait(robot)
-
-    async def call(self, service: PlannerService, request: dict[str, Any]) -> dict[str, Any]:
-        """Ask the planner.
-
-        Raises:
-            PlannerAwayError: There is no answer.
-        """
-        client = self._clients.get(service)
-        if client is None:
-            raise PlannerAwayError("the planner's container is not ready yet")
-        try:
-            return await client(request, timeout=CALL_TIMEOUT_S)
-        except CallError as error:
-            raise PlannerAwayError(f"the planner did not answer: {error}") from error
-        except ClientError as error:
-            raise PlannerAwayError(f"the engine cannot be reached: {error}") from error
-
     def on_engine(self, state: dict[str, Any]) -> None:
         """Take the engine's state; nodes that ended are started again."""
         for request in repairs(self._config, state):
@@ -97,7 +77,7 @@ class EngineWire:
         await connection.subscriber("fleetState", STATE, self._listener.take_state)
         await self._join(connection, "fleetState", "SubscriberInterface", STATE, STATE_TOPIC)
         for tag, service in _SERVICES:
-            self._clients[service] = await connection.service_client(tag, service.cls)
+            self._asks[service] = _asking(await connection.service_client(tag, service.cls))
             await self._join(connection, tag, "ServiceClientInterface", service.cls, service.name)
         for tag in ("fleetState", *(tag for tag, _ in _SERVICES)):
             await connection.wait_active(tag)
@@ -125,3 +105,15 @@ class EngineWire:
             self._listener.take_event(f"connection to the engine lost: {words}", "bad")
         elif state is State.RESTORED:
             self._listener.take_event("connection to the engine is back", "good")
+
+
+def _asking(client: ServiceClient[dict[str, Any]]) -> Ask:
+    async def ask(request: dict[str, Any]) -> dict[str, Any]:
+        try:
+            return await client(request, timeout=CALL_TIMEOUT_S)
+        except CallError as error:
+            raise PlannerAwayError(f"the planner did not answer: {error}") from error
+        except ClientError as error:
+            raise PlannerAwayError(f"the engine cannot be reached: {error}") from error
+
+    return ask

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from rce_client.station.view import FleetView
 from rce_client.station.wishes import CellWish, GoalWish, Wishes
@@ -56,14 +57,29 @@ class Listener(Protocol):
         """Take words on what happened; the tone is ``good``, ``warn`` or ``bad``."""
 
 
-class PlannerWire(Protocol):
-    """A way to the planner: through the engine, or in its own ROS graph."""
+Ask: TypeAlias = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
+"""Calls a service of the planner; raises :class:`PlannerAwayError` if there is no answer."""
 
+
+class PlannerWire(ABC):
+    """A way to the planner: through the engine, or in its own ROS graph.
+
+    Args:
+        away: What is wrong as long as the planner's services are not joined.
+    """
+
+    def __init__(self, away: str) -> None:
+        self._away = away
+        self._new_robots: asyncio.Queue[str] = asyncio.Queue()
+        self._asks: dict[PlannerService, Ask] = {}
+
+    @abstractmethod
     async def run(self, listener: Listener, ready: Callable[[], Awaitable[None]]) -> None:
         """Let state and poses come in until cancelled; call ``ready`` once the planner can be heard."""
 
     def follow(self, robot: str) -> None:
         """Let a robot's poses come in."""
+        self._new_robots.put_nowait(robot)
 
     async def call(self, service: PlannerService, request: dict[str, Any]) -> dict[str, Any]:
         """Ask the planner.
@@ -71,6 +87,10 @@ class PlannerWire(Protocol):
         Raises:
             PlannerAwayError: There is no answer.
         """
+        ask = self._asks.get(service)
+        if ask is None:
+            raise PlannerAwayError(self._away)
+        return await ask(request)
 
 
 class FleetLink:

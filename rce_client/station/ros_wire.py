@@ -17,16 +17,17 @@ from rce_client.station.fleet_link import (
     SET_GOAL,
     STATE,
     STATE_TOPIC,
+    Ask,
     Listener,
     PlannerAwayError,
-    PlannerService,
+    PlannerWire,
     pose_topic,
 )
 
 NODE = "operator_station"
 
 
-class RosWire:
+class RosWire(PlannerWire):
     """A node beside the planner.
 
     Args:
@@ -35,11 +36,10 @@ class RosWire:
     """
 
     def __init__(self, master_uri: str, types: TypeRegistry) -> None:
+        super().__init__("the ROS master cannot be reached yet")
         self._node = Node(
             NODE, argv=(), master_uri=master_uri, types=types, signals=False, master_timeout=None
         )
-        self._new_robots: asyncio.Queue[str] = asyncio.Queue()
-        self._clients: dict[PlannerService, ServiceClient] = {}
         self._heard = asyncio.Event()
 
     async def run(self, listener: Listener, ready: Callable[[], Awaitable[None]]) -> None:
@@ -51,26 +51,21 @@ class RosWire:
 
         async with self._node as node:
             for service in (SET_GOAL, BLOCK_CELL):
-                self._clients[service] = node.service_client(service.name, service.cls)
+                self._asks[service] = _asking(node.service_client(service.name, service.cls))
             await node.subscribe(STATE_TOPIC, STATE, take_state)
             await self._heard.wait()
             await ready()
             while True:
                 await self._follow(listener, await self._new_robots.get())
 
-    def follow(self, robot: str) -> None:
-        """Let a robot's poses come in."""
-        self._new_robots.put_nowait(robot)
+    async def _follow(self, listener: Listener, robot: str) -> None:
+        await self._node.subscribe(
+            pose_topic(robot), POSE, lambda message: listener.take_pose(robot, plain(message))
+        )
 
-    async def call(self, service: PlannerService, request: dict[str, Any]) -> dict[str, Any]:
-        """Ask the planner.
 
-        Raises:
-            PlannerAwayError: There is no answer.
-        """
-        client = self._clients.get(service)
-        if client is None:
-            raise PlannerAwayError("the ROS master cannot be reached yet")
+def _asking(client: ServiceClient) -> Ask:
+    async def ask(request: dict[str, Any]) -> dict[str, Any]:
         try:
             return plain(await client(request, timeout=CALL_TIMEOUT_S))
         except ServiceError as error:
@@ -78,10 +73,7 @@ class RosWire:
         except RosError as error:
             raise PlannerAwayError(f"the planner's ROS graph cannot be reached: {error}") from error
 
-    async def _follow(self, listener: Listener, robot: str) -> None:
-        await self._node.subscribe(
-            pose_topic(robot), POSE, lambda message: listener.take_pose(robot, plain(message))
-        )
+    return ask
 
 
 def plain(message: Message) -> dict[str, Any]:
