@@ -15,6 +15,7 @@ import uvloop
 from rce.config.exceptions import ConfigError, RunDirError, SecretError
 from rce.config.secret import load_secret
 from rce.config.settings import load_settings
+from rce.protocol.quantities import read_memory
 from rce_master.exceptions import MasterError
 from rce_master.master import Master, RunningMaster
 from rce_master.settings import MasterSettings
@@ -50,6 +51,15 @@ def command(
     token_lifetime: Annotated[
         float | None, typer.Option(help="Seconds that an API token is valid [2592000].")
     ] = None,
+    max_slots: Annotated[
+        int | None, typer.Option(help="Slots that one user's containers may take; 0: no limit [0].", min=0)
+    ] = None,
+    max_cpu: Annotated[
+        float | None, typer.Option(help="Cores that one user's containers may ask for; 0: no limit [0].")
+    ] = None,
+    max_memory: Annotated[
+        str | None, typer.Option(help="Memory that one user's containers may ask for, such as 8G [0].")
+    ] = None,
     log_level: Annotated[str, typer.Option(help="debug, info, warning or error.")] = "info",
 ) -> None:
     """Run the Master Task Set: HTTP for clients on 9000, control of task sets on 8080."""
@@ -63,6 +73,9 @@ def command(
         "robot_grace": robot_grace,
         "container_grace": container_grace,
         "token_lifetime": token_lifetime,
+        "max_slots": max_slots,
+        "max_cpu": max_cpu,
+        "max_memory": None if max_memory is None else _memory(max_memory),
     }
     faults: tuple[BaseException, ...] = ()
     try:
@@ -79,7 +92,13 @@ def command(
             tls_key=tls_key,
             allowed_origins=tuple(allow_origin or ()),
             token_lifetime=chosen.token_lifetime,
-            state=StateSettings(robot_grace=chosen.robot_grace, container_grace=chosen.container_grace),
+            state=StateSettings(
+                robot_grace=chosen.robot_grace,
+                container_grace=chosen.container_grace,
+                max_slots=chosen.max_slots,
+                max_cpu=chosen.max_cpu,
+                max_memory=chosen.max_memory,
+            ),
         )
         secret = load_secret(secret_file or engine.secret_file, dev=engine.dev)
         with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
@@ -90,6 +109,13 @@ def command(
         typer.echo(f"rce-master: {fault}", err=True)
     if faults:
         raise typer.Exit(1)
+
+
+def _memory(text: str) -> int:
+    try:
+        return read_memory(text)
+    except ValueError as error:
+        raise typer.BadParameter(f"--max-memory {error}") from None
 
 
 async def _run(settings: MasterSettings, secret: Secret) -> None:

@@ -59,6 +59,7 @@ class Realm:
         self._store = store
         self._clock = clock
         self._jobs: asyncio.Queue[_Job] = asyncio.Queue(MAX_WAITING)
+        self._store_fault = ""
 
     @classmethod
     async def open(
@@ -90,6 +91,16 @@ class Realm:
     def copy_spec(self, endpoint: str) -> tuple[str, EndpointSpec] | None:
         """Tell where a container is being handed over to, and what is desired there; None if it is not."""
         return self.state.copy_spec(endpoint)
+
+    async def check_store(self) -> None:
+        """Tell whether the store works: what was last written was kept, and it is still where it was.
+
+        Raises:
+            StoreError: It does not.
+        """
+        if self._store_fault:
+            raise StoreError(self._store_fault)
+        await self._store.check()
 
     async def submit(self, command: Command) -> None:
         """Do a command; returns when it is stored and everybody was told.
@@ -150,7 +161,9 @@ class Realm:
         try:
             if rows:
                 await self._store.save(rows)
-        except BaseException:
+                self._store_fault = ""
+        except BaseException as error:
+            self._store_fault = str(error) if isinstance(error, StoreError) else self._store_fault
             for changes in reversed(done):
                 changes.revert()
             raise

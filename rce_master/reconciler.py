@@ -26,8 +26,11 @@ from rce_master.exceptions import Refused
 from rce_master.logs import LogReader, LogRequest, read_log
 from rce_master.state import commands
 from rce_master.state.lifecycle import RobotSession
+from rce_master.usage import UsageBook
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rce_master.realm import Realm
     from rce_master.state.changes import Changes, Notice
 
@@ -52,11 +55,11 @@ class Reconciler:
     placed. Listens to the realm, so nothing goes out that is not stored.
 
     Attributes:
-        usage: What each connected task set last told of what it consumes.
+        book: What the connected task sets told of what they consume.
     """
 
     def __init__(self, realm: Realm) -> None:
-        self.usage: dict[str, Usage] = {}
+        self.book = UsageBook()
         self._realm = realm
         self._peers: dict[str, Peer] = {}
         self._arriving: dict[str, Peer] = {}
@@ -92,7 +95,8 @@ class Reconciler:
             case Left():
                 command = commands.RobotLeft(process=process, id=message.id, reason=message.reason)
             case Usage():
-                self.usage[process] = message
+                placed = {e.id for e in self._realm.tables.endpoints.by("task_set", process)}
+                self.book.note(process, message, placed)
                 return
             case _:
                 logger.warning("%s sent a %s, which means nothing here", process, type(message).__name__)
@@ -103,7 +107,7 @@ class Reconciler:
         """Note that a task set's channel ended."""
         if self._peers.get(peer.process) is peer:
             del self._peers[peer.process]
-            self.usage.pop(peer.process, None)
+            self.book.forget(peer.process)
             await self._realm.submit(commands.TaskSetLeft(process=peer.process))
 
     async def read_log(
@@ -122,6 +126,11 @@ class Reconciler:
         """
         request = LogRequest(id_, node, offset, limit, wish)
         return await read_log(self._realm.tables, self._peers, request)
+
+    @property
+    def usage(self) -> Mapping[str, Usage]:
+        """What each connected task set last told of what it consumes, by process name."""
+        return self.book.newest
 
     # To the task sets
 

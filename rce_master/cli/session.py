@@ -60,8 +60,8 @@ async def _token() -> None:
     typer.echo(found.token)
 
 
-def read_password(*, from_stdin: bool, confirm: bool = False) -> str:
-    """Read a password: asked for at a terminal, or the first line of standard input."""
+def read_password(*, from_stdin: bool, confirm: bool = False, what: str = "Password") -> str:
+    """Read a password: asked for at a terminal, or the next line of standard input."""
     if from_stdin:
         return sys.stdin.readline().rstrip("\n")
-    return str(typer.prompt("Password", hide_input=True, confirmation_prompt=confirm))
+    return str(typer.prompt(what, hide_input=True, confirmation_prompt=confirm))

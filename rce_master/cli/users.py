@@ -71,13 +71,22 @@ async def _list(state_dir: Path | None) -> None:
 
 @app.command("passwd")
 def passwd(name: str, password_stdin: PasswordStdin = False, state_dir: StateDir = None) -> None:
-    """Change a user's password."""
-    run(_passwd(name, read_password(from_stdin=password_stdin, confirm=True), state_dir))
+    """Change a user's password; of your own, the old one is asked for first (or is the first line)."""
+    old = read_password(from_stdin=password_stdin, what="Old password") if _is_own(name, state_dir) else ""
+    run(_passwd(name, old, read_password(from_stdin=password_stdin, confirm=True), state_dir))
 
 
-async def _passwd(name: str, password: str, state_dir: Path | None) -> None:
+def _is_own(name: str, state_dir: Path | None) -> bool:
+    """Whether it is the password of the user who is logged in, and is changed over the API."""
+    try:
+        return state_dir is None and credentials.load().user == name
+    except CliError:
+        return False
+
+
+async def _passwd(name: str, old: str, password: str, state_dir: Path | None) -> None:
     async with _directory(state_dir) as users:
-        await users.set_password(name, password)
+        await users.set_password(name, password, old)
     typer.echo(f"changed the password of {name}")
 
 
@@ -96,7 +105,7 @@ async def _remove(name: str, state_dir: Path | None) -> None:
 class _Directory(Protocol):
     async def add(self, name: str, role: str, password: str) -> None: ...
     async def list(self) -> list[dict[str, Any]]: ...
-    async def set_password(self, name: str, password: str) -> None: ...
+    async def set_password(self, name: str, password: str, old: str) -> None: ...
     async def remove(self, name: str) -> None: ...
 
 
@@ -112,8 +121,9 @@ class _ApiDirectory:
     async def list(self) -> list[dict[str, Any]]:
         return list((await self._client.call("GET", "/users"))["users"])
 
-    async def set_password(self, name: str, password: str) -> None:
-        await self._client.call("PUT", f"/users/{name}/password", {"password": password})
+    async def set_password(self, name: str, password: str, old: str) -> None:
+        body = {"password": password, "old_password": old}
+        await self._client.call("PUT", f"/users/{name}/password", body)
 
     async def remove(self, name: str) -> None:
         await self._client.call("DELETE", f"/users/{name}")
@@ -138,7 +148,8 @@ class _StoreDirectory:
             for user in self._state.tables.users
         ]
 
-    async def set_password(self, name: str, password: str) -> None:
+    async def set_password(self, name: str, password: str, old: str) -> None:
+        del old  # whoever may write the folder may do everything
         hashed = await self._authenticator.hash(client_digest(password))
         await self._do(commands.SetPassword(name=name, password=hashed))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rce_master.auth import Authenticator, client_digest, token_digest
-from rce_master.exceptions import Forbidden, NotFound
+from rce_master.exceptions import Forbidden, Invalid, NotFound, WrongCredentials
 from rce_master.http import models
 from rce_master.http.routes import Call, RouteTable
 from rce_master.http.views import Views
@@ -69,7 +69,7 @@ async def remove_user(call: Call) -> None:
 @routes.route(
     "PUT",
     "/users/{name}/password",
-    "Change a password (your own, or anybody's as administrator); ends the user's tokens",
+    "Change a password (your own, or anybody's as administrator); ends the user's tokens and sessions",
     body=models.PasswordIn,
     status=204,
 )
@@ -81,9 +81,22 @@ async def set_password(call: Call) -> None:
         raise Forbidden("only an administrator changes somebody else's password")
     if name not in services.realm.tables.users:
         raise NotFound(f"there is no user {name!r}")
-    digest = client_digest(call.read(models.PasswordIn).password)
+    body = call.read(models.PasswordIn)
+    if name == call.caller.name:
+        await _check_old(call, body.old_password)
+    digest = client_digest(body.password)
     hashed = await services.authenticator.hash(digest)
     await services.realm.submit(commands.SetPassword(name=name, password=hashed))
+
+
+async def _check_old(call: Call, password: str) -> None:
+    """Whoever found a token must not be able to lock its owner out."""
+    if not password:
+        raise Invalid("old_password: is missing; to change your own password, give the one until now")
+    try:
+        await call.services.authenticator.verify(call.caller.name, client_digest(password))
+    except WrongCredentials:
+        raise Forbidden("old_password: is wrong") from None
 
 
 def _views(call: Call) -> Views:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rce.web.openapi import Query
 from rce_master import requests
 from rce_master.exceptions import Invalid
 from rce_master.http import models
 from rce_master.http.routes import OF_USER, Call, RouteTable
-
-if TYPE_CHECKING:
-    from pydantic import BaseModel
 
 routes = RouteTable("control")
 
@@ -41,6 +38,20 @@ async def create_container(call: Call) -> None:
     await _request(call, "CC", {"containerTag": body.tag, "containerData": data})
 
 
+@routes.route(
+    "PATCH",
+    "/containers/{container}",
+    "Change what a container may use, while it runs",
+    body=models.ResizeIn,
+    status=204,
+    query=_QUERY,
+)
+async def resize_container(call: Call) -> None:
+    """Resize a container."""
+    data = call.read(models.ResizeIn).model_dump(exclude_none=True)
+    await _request(call, "RC", {"containerTag": call.path("container"), "containerData": data})
+
+
 @routes.route("DELETE", "/containers/{container}", "Destroy a container", status=204, query=_QUERY)
 async def destroy_container(call: Call) -> None:
     """Destroy a container."""
@@ -53,7 +64,8 @@ async def destroy_container(call: Call) -> None:
 async def add_node(call: Call) -> None:
     """Start a node."""
     body = call.read(models.NodeIn)
-    item = {"containerTag": call.path("container"), "nodeTag": body.tag, **_rest(body)}
+    rest = {_camel(key): value for key, value in body.model_dump(exclude={"tag"}).items()}
+    item = {"containerTag": call.path("container"), "nodeTag": body.tag, **rest}
     await _request(call, "CN", {"addNodes": [item]})
 
 
@@ -150,10 +162,6 @@ async def disconnect(call: Call) -> None:
     """Part two interfaces."""
     pair = {"tagA": call.query("tag_a"), "tagB": call.query("tag_b")}
     await _request(call, "CX", {"disconnect": [pair]})
-
-
-def _rest(body: BaseModel) -> dict[str, Any]:
-    return body.model_dump(exclude={"tag"})
 
 
 def _camel(key: str) -> str:

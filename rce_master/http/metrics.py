@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from prometheus_client import CollectorRegistry, GCCollector, PlatformCollector, ProcessCollector
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.registry import Collector
 
+from rce.control.model import EndpointUsage, InterfaceUsage, NodeUsage
 from rce_master.http.views import Views
+from rce_master.state import capacity
 from rce_master.state.lifecycle import ContainerPhase, RobotSession
+from rce_master.state.records import Container
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -18,21 +21,30 @@ if TYPE_CHECKING:
     from prometheus_client.metrics_core import Metric
 
     from rce.control.messages import Usage
+    from rce_master.state.placement import Room
+    from rce_master.state.records import Endpoint
     from rce_master.state.tables import Tables
+    from rce_master.usage import UsageBook
+
+_NO_USAGE = EndpointUsage()
+
+MAX_SERIES = 50_000
+"""Series of containers, nodes and interfaces in one answer; what is beyond it is counted, not listed."""
 
 
-def make_registry(tables: Tables, usage: Mapping[str, Usage]) -> CollectorRegistry:
+def make_registry(tables: Tables, book: UsageBook) -> CollectorRegistry:
     """Make a registry of our own; the library's global one belongs to whoever embeds us."""
     registry = CollectorRegistry()
     ProcessCollector(registry=registry)
     PlatformCollector(registry=registry)
     GCCollector(registry=registry)
-    registry.register(EngineCollector(tables, usage))
+    registry.register(EngineCollector(tables, book.newest))
+    registry.register(ConsumptionCollector(tables, book))
     return registry
 
 
 class EngineCollector(Collector):
-    """Robots, containers, nodes, connections, task sets and traffic."""
+    """Robots, containers, nodes, connections and task sets."""
 
     def __init__(self, tables: Tables, usage: Mapping[str, Usage]) -> None:
         self._tables = tables
@@ -44,8 +56,6 @@ class EngineCollector(Collector):
         yield from self._states()
         yield from self._connections()
         yield from self._task_sets()
-        yield from self._traffic()
-        yield from self._consumption()
 
     def _states(self) -> Iterator[Metric]:
         tables = self._tables
@@ -80,6 +90,17 @@ class EngineCollector(Collector):
         endpoints = GaugeMetricFamily("rce_task_set_endpoints", "Robots or containers there.", labels=labels)
         cpu = CounterMetricFamily("rce_task_set_cpu_seconds", "CPU time.", labels=labels)
         memory = GaugeMetricFamily("rce_task_set_memory_bytes", "Resident memory.", labels=labels)
+        held = GaugeMetricFamily(
+            "rce_task_set_held_bytes", "Of messages that wait or are incomplete.", labels=labels
+        )
+        shed = CounterMetricFamily(
+            "rce_task_set_shed", "Times that a user held too much and lost the oldest of it.", labels=labels
+        )
+        turned_away = CounterMetricFamily(
+            "rce_task_set_turned_away",
+            "Connections closed because too many did not say who they are.",
+            labels=labels,
+        )
         for task_set in self._tables.task_sets:
             shown = self._views.machine(task_set)
             key = [shown.process, shown.kind]
@@ -87,34 +108,155 @@ class EngineCollector(Collector):
             endpoints.add_metric(key, shown.endpoints)
             cpu.add_metric(key, shown.cpu_s)
             memory.add_metric(key, shown.memory_used)
-        yield from (connected, endpoints, cpu, memory)
+            if (usage := self._usage.get(task_set.process)) is not None:
+                held.add_metric(key, usage.held)
+                shed.add_metric(key, usage.shed)
+                turned_away.add_metric(key, usage.turned_away)
+        yield from (connected, endpoints, cpu, memory, held, shed, turned_away)
 
-    def _traffic(self) -> Iterator[Metric]:
-        labels = ["endpoint", "interface", "direction"]
-        messages = CounterMetricFamily("rce_messages", "Messages; in: from peers.", labels=labels)
-        bytes_ = CounterMetricFamily("rce_message_bytes", "Payload bytes; in: from peers.", labels=labels)
-        dropped = CounterMetricFamily(
-            "rce_messages_dropped", "Messages that a full queue threw away.", labels=labels[:2]
-        )
+
+class ConsumptionCollector(Collector):
+    """Traffic of interfaces, consumption of containers and nodes, promises of machines.
+
+    The labels are names that are desired now and nothing else, so that what a task set tells cannot make
+    more of them, and so that a counter ends with what it counts.
+    """
+
+    def __init__(self, tables: Tables, book: UsageBook) -> None:
+        self._tables = tables
+        self._book = book
+
+    def collect(self) -> Iterator[Metric]:
+        """Make all metrics."""
+        families = _Families(MAX_SERIES)
         for endpoint in self._tables.endpoints:
-            for tag, counters in self._views.usage_of(endpoint).interfaces.items():
-                messages.add_metric([endpoint.id, tag, "in"], counters.messages_in)
-                messages.add_metric([endpoint.id, tag, "out"], counters.messages_out)
-                bytes_.add_metric([endpoint.id, tag, "in"], counters.bytes_in)
-                bytes_.add_metric([endpoint.id, tag, "out"], counters.bytes_out)
-                dropped.add_metric([endpoint.id, tag], counters.dropped)
-        yield from (messages, bytes_, dropped)
+            usage = self._usage_of(endpoint)
+            if isinstance(endpoint, Container):
+                self._container(families, endpoint, usage)
+            for tag in endpoint.interfaces:
+                _interface(families, endpoint.id, tag, usage.interfaces.get(tag))
+        for room in capacity.rooms(self._tables, away=True).values():
+            _machine(families, room)
+        yield from families
+        yield GaugeMetricFamily(
+            "rce_metrics_omitted", "Series that found no room in this answer.", value=families.omitted
+        )
 
-    def _consumption(self) -> Iterator[Metric]:
-        cpu = CounterMetricFamily("rce_container_cpu_seconds", "CPU time.", labels=["container"])
-        memory = GaugeMetricFamily("rce_container_memory_bytes", "Resident memory.", labels=["container"])
-        processes = GaugeMetricFamily("rce_container_processes", "Processes.", labels=["container"])
-        for container in self._tables.containers():
-            usage = self._views.usage_of(container)
-            cpu.add_metric([container.id], usage.cpu_s)
-            memory.add_metric([container.id], usage.memory)
-            processes.add_metric([container.id], usage.processes)
-        yield from (cpu, memory, processes)
+    def _usage_of(self, endpoint: Endpoint) -> EndpointUsage:
+        told = self._book.newest.get(endpoint.task_set)
+        return told.endpoints.get(endpoint.id, _NO_USAGE) if told else _NO_USAGE
+
+    def _container(self, families: _Families, container: Container, usage: EndpointUsage) -> None:
+        for metric in _CONTAINER:
+            metric.add(families, {"container": container.id}, usage)
+        for way, count in (("read", usage.io_read), ("written", usage.io_written)):
+            labels = {"container": container.id, "direction": way}
+            families.counter("rce_container_io_bytes", "Bytes from and to disks.", labels, count)
+        for way, count in (("in", usage.link_in), ("out", usage.link_out)):
+            labels = {"container": container.id, "direction": way}
+            families.counter("rce_container_link_bytes", "Bytes on its links.", labels, count)
+        status = self._tables.container_live(container.id).status
+        reported = {node.tag: node for node in status.nodes} if status else {}
+        for tag in container.nodes:
+            labels = {"container": container.id, "node": tag}
+            consumed = usage.nodes.get(tag, NodeUsage())
+            restarts = reported[tag].restarts if tag in reported else 0
+            families.counter("rce_node_cpu_seconds", "CPU time.", labels, consumed.cpu_s)
+            families.gauge("rce_node_memory_bytes", "Memory in use.", labels, consumed.memory)
+            families.gauge("rce_node_processes", "Processes.", labels, consumed.processes)
+            families.counter("rce_node_restarts", "Starts after an end of its own.", labels, restarts)
+
+
+class _Families:
+    """Metric families by name, with a limit on the series of all of them together."""
+
+    def __init__(self, most: int) -> None:
+        self.omitted = 0
+        self._room = most
+        self._found: dict[str, GaugeMetricFamily | CounterMetricFamily] = {}
+
+    def __iter__(self) -> Iterator[Metric]:
+        return iter(self._found.values())
+
+    def gauge(self, name: str, help_: str, labels: dict[str, str], value: float) -> None:
+        """Add a value that goes up and down."""
+        self._add(GaugeMetricFamily, name, help_, labels, value)
+
+    def counter(self, name: str, help_: str, labels: dict[str, str], value: float) -> None:
+        """Add a value that only grows; ``_total`` is put after its name."""
+        self._add(CounterMetricFamily, name, help_, labels, value)
+
+    def _add(
+        self,
+        kind: type[GaugeMetricFamily | CounterMetricFamily],
+        name: str,
+        help_: str,
+        labels: dict[str, str],
+        value: float,
+    ) -> None:
+        if self._room <= 0:
+            self.omitted += 1
+            return
+        self._room -= 1
+        family = self._found.get(name)
+        if family is None:
+            family = self._found[name] = kind(name, help_, labels=list(labels))
+        family.add_metric(list(labels.values()), value)
+
+
+class _Metric(NamedTuple):
+    """A metric that shows one field of a container's usage."""
+
+    name: str
+    help: str
+    field: str
+    grows: bool = False
+
+    def add(self, families: _Families, labels: dict[str, str], usage: EndpointUsage) -> None:
+        """Add the value of one container."""
+        add = families.counter if self.grows else families.gauge
+        add(self.name, self.help, labels, getattr(usage, self.field))
+
+
+_CONTAINER = (
+    _Metric("rce_container_cpu_seconds", "CPU time.", "cpu_s", grows=True),
+    _Metric(
+        "rce_container_cpu_throttled_seconds", "Time held back by the CPU limit.", "throttled_s", grows=True
+    ),
+    _Metric("rce_container_cpu_limit_cores", "Limit of CPU; 0: none.", "cpu_limit"),
+    _Metric("rce_container_memory_bytes", "Memory in use.", "memory"),
+    _Metric("rce_container_memory_peak_bytes", "The most memory since the start.", "memory_peak"),
+    _Metric("rce_container_memory_limit_bytes", "Limit of memory; 0: none.", "memory_limit"),
+    _Metric("rce_container_oom_kills", "Processes killed for lack of memory.", "oom_kills", grows=True),
+    _Metric("rce_container_processes", "Processes.", "processes"),
+)
+
+
+def _interface(families: _Families, endpoint: str, tag: str, usage: InterfaceUsage | None) -> None:
+    counters = usage or InterfaceUsage()
+    labels = {"endpoint": endpoint, "interface": tag}
+    messages, bytes_ = "Messages; in: from peers.", "Payload bytes; in: from peers."
+    for way in ("in", "out"):
+        both = {**labels, "direction": way}
+        families.counter("rce_messages", messages, both, getattr(counters, f"messages_{way}"))
+        families.counter("rce_message_bytes", bytes_, both, getattr(counters, f"bytes_{way}"))
+    families.counter(
+        "rce_messages_dropped", "Messages that a full queue threw away.", labels, counters.dropped
+    )
+
+
+def _machine(families: _Families, room: Room) -> None:
+    labels = {"process": room.process, "machine": room.machine.name}
+    machine = room.machine
+    for name, there, promised in (
+        ("slots", machine.slots, room.slots),
+        ("cores", machine.cores, room.cpu),
+        ("memory_bytes", machine.memory, room.memory),
+    ):
+        families.gauge(f"rce_machine_{name}", f"What the machine has of {name}.", labels, there)
+        text = f"What its containers are promised of {name}."
+        families.gauge(f"rce_machine_promised_{name}", text, labels, promised)
+    families.gauge("rce_machine_draining", "1 while it is being emptied.", labels, room.draining)
 
 
 def _gauge(name: str, help_: str, label: str, values: Mapping[str, int]) -> GaugeMetricFamily:

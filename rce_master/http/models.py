@@ -8,6 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 Scalar = bool | int | float | str
 Value = Scalar | list[Scalar]
+Amount = int | float | str
+"""An amount as :mod:`rce.protocol.quantities` reads it."""
 
 
 class _In(BaseModel):
@@ -46,6 +48,8 @@ class PasswordIn(_In):
     """A new password."""
 
     password: Annotated[str, Field(repr=False, min_length=1)]
+    old_password: Annotated[str, Field(repr=False)] = ""
+    """The password until now; needed to change one's own."""
 
 
 class ContainerIn(_In):
@@ -54,15 +58,30 @@ class ContainerIn(_In):
     tag: str
     group: str = ""
     group_ip: str = ""
+    network: str = ""
+    """``none``, ``group`` or ``host``."""
+    image: str = ""
     size: int = 1
-    cpu: Annotated[float, Field(strict=False)] = 0.0
-    """Cores."""
-    memory: int = 0
-    """Bytes."""
-    bandwidth: int = 0
-    """Bytes per second."""
+    """Slots."""
+    cpu: Amount = 0.0
+    """Cores, or a text such as ``50%``."""
+    memory: Amount = 0
+    """MB, or a text such as ``256M``."""
+    bandwidth: Amount = 0
+    """Bytes per second, or a text such as ``10Mbit``."""
     special_features: list[str] = []
     """Labels that the machine must have."""
+    wait: bool = False
+    """Wait for room if no machine has any."""
+
+
+class ResizeIn(_In):
+    """What a container may use from now on; null or left out: as before. Zero takes a wish back."""
+
+    size: int | None = None
+    cpu: Amount | None = None
+    memory: Amount | None = None
+    bandwidth: Amount | None = None
 
 
 class NodeIn(_In):
@@ -74,6 +93,16 @@ class NodeIn(_In):
     args: str = ""
     name: str = ""
     namespace: str = ""
+    restart: str = "never"
+    """``never``, ``on-failure`` or ``always``."""
+    max_restarts: int = 5
+    """In a row; 0 for no limit."""
+    after: list[str] = []
+    """Tags of nodes that must be ready before it starts."""
+    heartbeat: str = ""
+    """A topic that it publishes as long as it is well."""
+    heartbeat_timeout: float = 5.0
+    """Seconds."""
 
 
 class ParameterIn(_In):
@@ -135,6 +164,24 @@ class RobotOut(BaseModel):
     interfaces: int
 
 
+class WishOut(BaseModel):
+    """What a container asked for; zero or empty: nothing."""
+
+    size: int
+    """Slots."""
+    cpu: float
+    """Cores."""
+    memory: int
+    """Bytes."""
+    bandwidth: int
+    """Bytes per second."""
+    network: str
+    group: str
+    group_ip: str
+    image: str
+    special_features: list[str]
+
+
 class ContainerOut(BaseModel):
     """A container."""
 
@@ -142,7 +189,8 @@ class ContainerOut(BaseModel):
     user: str
     tag: str
     state: str
-    """``requested``, ``placed``, ``starting``, ``running``, ``failed``, ``stopping`` or ``lost``."""
+    """``requested``, ``placed``, ``starting``, ``running``, ``degraded``, ``failed``, ``stopping``,
+    ``stopped`` or ``lost``."""
     detail: str
     task_set: str
     machine: str
@@ -153,7 +201,10 @@ class ContainerOut(BaseModel):
     cpu_s: float
     """CPU seconds since its start."""
     memory: int
-    """Resident bytes."""
+    """Bytes in use."""
+    wish: WishOut
+    moving_to: str
+    """Task set where its copy is being made, while its machine is drained; else empty."""
 
 
 class NodeOut(BaseModel):
@@ -168,10 +219,17 @@ class NodeOut(BaseModel):
     name: str
     namespace: str
     state: str
-    """``starting``, ``running``, ``stopping``, ``exited``, ``failed``; ``unknown`` until reported."""
+    """``waiting``, ``starting``, ``running``, ``stuck``, ``stopping``, ``exited``, ``failed``; ``unknown``
+    until reported."""
     pid: int
     exit_code: int | None
     detail: str
+    restart: str
+    max_restarts: int
+    after: list[str]
+    heartbeat: str
+    restarts: int
+    """How often it was started again by itself."""
 
 
 class ParameterOut(BaseModel):
@@ -212,6 +270,14 @@ class ConnectionOut(BaseModel):
     """Whether both ends report it as open."""
 
 
+class StayingOut(BaseModel):
+    """A container that a draining machine still has."""
+
+    container: str
+    """``user/tag``."""
+    why: str
+
+
 class MachineOut(BaseModel):
     """A task set and the machine it runs on."""
 
@@ -231,6 +297,18 @@ class MachineOut(BaseModel):
     """CPU seconds of the task set since its start."""
     memory_used: int
     """Resident bytes of the task set."""
+    slots: int
+    """0 if nobody counts."""
+    limits: str
+    networks: list[str]
+    runtimes: list[str]
+    promised_slots: int
+    """What its containers were promised: of slots, cores and bytes."""
+    promised_cores: float
+    promised_memory: int
+    draining: bool
+    staying: list[StayingOut]
+    """Of a draining machine: the containers that it still has."""
 
 
 class UsersOut(BaseModel):

@@ -25,7 +25,15 @@ from rce_master.exceptions import (
     TooManyLogins,
     WrongCredentials,
 )
-from rce_master.http import api_account, api_control, api_packages, api_read, api_stream
+from rce_master.http import (
+    api_account,
+    api_control,
+    api_machines,
+    api_packages,
+    api_read,
+    api_stream,
+    api_usage,
+)
 from rce_master.http.entry import Entry
 from rce_master.http.metrics import make_registry
 from rce_master.http.models import Error
@@ -47,6 +55,8 @@ ROUTES: list[Route] = [
     *api_account.routes,
     *api_read.routes,
     *api_control.routes,
+    *api_machines.routes,
+    *api_usage.routes,
     *api_packages.routes,
     *api_stream.routes,
 ]
@@ -116,13 +126,17 @@ def _health(services: Services) -> Handler:
     async def handle(_: web.Request) -> web.Response:
         tables = services.realm.tables
         connected = sum(tables.is_connected(task_set.process) for task_set in tables.task_sets)
+        try:
+            await services.realm.check_store()
+        except StoreError as error:
+            return web.json_response({"status": str(error), "task_sets": connected}, status=503)
         return web.json_response({"status": "ok", "task_sets": connected})
 
     return handle
 
 
 def _metrics(services: Services) -> Handler:
-    registry = make_registry(services.realm.tables, services.reconciler.usage)
+    registry = make_registry(services.realm.tables, services.reconciler.book)
 
     async def handle(request: web.Request) -> web.Response:
         # The labels name everybody's robots and containers.

@@ -6,12 +6,15 @@ from typing import TYPE_CHECKING
 
 from rce.control.model import EndpointUsage, InterfaceUsage, NodeStatus
 from rce_master.http import models
+from rce_master.state import capacity
+from rce_master.state.records import Container
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rce.control.messages import Usage
-    from rce_master.state.records import Container, Endpoint, Link, Robot, TaskSet, User
+    from rce.control.model import Resources
+    from rce_master.state.records import Endpoint, Link, Robot, TaskSet, User
     from rce_master.state.tables import Tables
 
 _NO_USAGE = EndpointUsage()
@@ -71,6 +74,8 @@ class Views:
             interfaces=len(container.interfaces),
             cpu_s=usage.cpu_s,
             memory=usage.memory,
+            wish=_wish(container.resources),
+            moving_to=move.to if (move := self._tables.moves.get(container.id)) else "",
         )
 
     def nodes(self, container: Container) -> list[models.NodeOut]:
@@ -94,6 +99,11 @@ class Views:
             pid=status.pid if status else 0,
             exit_code=status.exit_code if status else None,
             detail=status.detail if status else "",
+            restart=node.restart.value,
+            max_restarts=node.max_restarts,
+            after=list(node.after),
+            heartbeat=node.heartbeat,
+            restarts=status.restarts if status else 0,
         )
 
     def parameters(self, container: Container) -> list[models.ParameterOut]:
@@ -142,6 +152,7 @@ class Views:
         """Show a task set."""
         usage = self._usage.get(task_set.process)
         machine = task_set.machine
+        room = capacity.room_at(self._tables, task_set)
         return models.MachineOut(
             process=task_set.process,
             kind=task_set.kind.value,
@@ -156,7 +167,31 @@ class Views:
             url=task_set.url,
             cpu_s=usage.cpu_s if usage else 0.0,
             memory_used=usage.memory if usage else 0,
+            slots=machine.slots,
+            limits=machine.limits,
+            networks=list(machine.networks),
+            runtimes=list(machine.runtimes),
+            promised_slots=room.slots,
+            promised_cores=round(room.cpu, 4),
+            promised_memory=room.memory,
+            draining=room.draining,
+            staying=self.staying(task_set) if room.draining else [],
         )
+
+    def staying(self, task_set: TaskSet) -> list[models.StayingOut]:
+        """Show what a draining machine still has, and why."""
+        return [
+            models.StayingOut(container=container.id, why=self._why_it_stays(container))
+            for container in self._tables.endpoints.by("task_set", task_set.process)
+            if isinstance(container, Container)
+        ]
+
+    def _why_it_stays(self, container: Container) -> str:
+        move = self._tables.moves.get(container.id)
+        if move is not None:
+            return f"is being handed over to {move.to}"
+        live = self._tables.container_live(container.id)
+        return live.stays or "its turn comes"
 
     def usage_of(self, endpoint: Endpoint) -> EndpointUsage:
         """Tell what an endpoint consumes."""
@@ -166,6 +201,20 @@ class Views:
     def _open(self, endpoint: str) -> set[int]:
         status = self._tables.live[endpoint].status
         return set(status.connections) if status else set()
+
+
+def _wish(wish: Resources) -> models.WishOut:
+    return models.WishOut(
+        size=wish.size,
+        cpu=wish.cpu,
+        memory=wish.memory,
+        bandwidth=wish.bandwidth,
+        network=wish.network.value,
+        group=wish.group,
+        group_ip=wish.group_ip,
+        image=wish.image,
+        special_features=list(wish.special_features),
+    )
 
 
 def _counters(usage: InterfaceUsage) -> dict[str, int]:

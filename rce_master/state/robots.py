@@ -82,6 +82,16 @@ def leave(tx: Transaction, robot: Robot, reason: str) -> None:
         tx.happen("robot_left", robot.id, reason)
 
 
+def send_away(tx: Transaction, robot: Robot, reason: str) -> None:
+    """End a robot's session. It is absent then, and finds everything again if it can log in anew in time."""
+    leave(tx, robot, reason)
+    if robot.task_set:
+        endpoints.withdraw(tx, robot, reason)
+        tx.put(replace(robot, task_set=""))
+        tx.touch(robot.id)
+        endpoints.touch_dialers(tx, robot.id)
+
+
 def reported(tx: Transaction, robot: Robot, status: EndpointStatus) -> None:
     """Note what its task set reports of a robot."""
     live = tx.tables.robot_live(robot.id)

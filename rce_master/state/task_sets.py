@@ -130,7 +130,12 @@ def left(tx: Transaction, command: TaskSetLeft) -> None:
 
 
 def status_reported(tx: Transaction, command: StatusReported) -> None:
-    """Note what a task set reports of one endpoint; of one that is not placed there it is ignored."""
+    """Note what a task set reports of one endpoint; of one that is not placed there it is ignored.
+
+    So is what comes from a task set after its channel ended.
+    """
+    if not tx.tables.is_connected(command.process):
+        return
     endpoint = tx.tables.endpoints.get(command.status.id)
     move = tx.tables.moves.get(command.status.id)
     if endpoint is not None and endpoint.task_set == command.process:

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from rce.protocol.names import is_name
 from rce_master.exceptions import Conflict, Invalid, NotFound
-from rce_master.state import endpoints, packages
+from rce_master.state import endpoints, packages, robots
 from rce_master.state.records import User, UserRole
 
 if TYPE_CHECKING:
@@ -28,10 +28,12 @@ def add_user(tx: Transaction, command: AddUser) -> None:
 
 
 def set_password(tx: Transaction, command: SetPassword) -> None:
-    """Change a password and end the user's tokens."""
+    """Change a password; end the user's tokens and the sessions of their robots."""
     user = _find(tx, command.name)
     tx.put(replace(user, password=command.password))
     _forget_tokens(tx, user.name)
+    for robot in tx.tables.robots(user.name):
+        robots.send_away(tx, robot, "the password was changed")
     tx.happen("user_password_changed", user.name, user=user.name)
 
 

@@ -41,5 +41,12 @@ class Store(Protocol):
             StoreError: Nothing was written.
         """
 
+    async def check(self) -> None:
+        """Check that it can be used, without writing.
+
+        Raises:
+            StoreError: It cannot.
+        """
+
     async def close(self) -> None:
         """Let go of everything; may be called twice."""

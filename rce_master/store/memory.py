@@ -29,5 +29,8 @@ class MemoryStore:
             else:
                 table[row.key] = row.body
 
+    async def check(self) -> None:
+        """It can always be used."""
+
     async def close(self) -> None:
         """Nothing to let go of."""

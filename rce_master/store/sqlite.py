@@ -89,6 +89,19 @@ class SqliteStore:
             await self._roll_back()
             raise StoreError(f"cannot write the store: {error}") from error
 
+    async def check(self) -> None:
+        """Check that the file is there and can be read.
+
+        Raises:
+            StoreError: It is not, or cannot.
+        """
+        self._check_that_it_is_there()
+        try:
+            async with self._database.execute("SELECT 1 FROM record LIMIT 1") as cursor:
+                await cursor.fetchone()
+        except sqlite3.Error as error:
+            raise StoreError(f"cannot read the store: {error}") from error
+
     async def close(self) -> None:
         """Close the file and unlock the folder."""
         await self._database.close()

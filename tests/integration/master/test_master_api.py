@@ -73,7 +73,8 @@ async def test_users_are_managed_by_administrators(site: Site) -> None:
     await site.api("GET", "/users", token=anna, status=403)
     await site.api("GET", "/machines", token=anna, status=403)
     await site.api("PUT", "/users/testUser/password", {"password": "x"}, token=anna, status=403)
-    await site.api("PUT", "/users/anna/password", {"password": "two"}, token=anna, status=204)
+    for body, status in (({}, 422), ({"old_password": "wrong"}, 403), ({"old_password": "one"}, 204)):
+        await site.api("PUT", "/users/anna/password", {"password": "two", **body}, token=anna, status=status)
     await site.api("GET", "/user", token=anna, status=401)
     anna = await site.login("anna", "two")
     assert [u["name"] for u in (await site.api("GET", "/users"))["users"]] == ["testUser", "anna"]

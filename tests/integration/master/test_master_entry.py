@@ -89,6 +89,8 @@ async def test_health_and_metrics(site: Site) -> None:
         from rce_master.auth import client_digest
 
         await robots.channel.login("testUser", "rob", client_digest("testUser"))
+        interface = {"tag": "i", "type": "SubscriberConverter", "cls": "std_msgs/String"}
+        await site.api("POST", "/endpoints/rob/interfaces", interface, status=204)
         counters = InterfaceUsage(messages_in=7, bytes_out=11, dropped=3)
         robots.channel.send(
             Usage(
@@ -98,7 +100,7 @@ async def test_health_and_metrics(site: Site) -> None:
         while True:
             async with site.session.get(f"{site.url}metrics") as reply:
                 text = await reply.text()
-            if "rce_messages_total" in text and 'interface="i"' in text:
+            if 'interface="i"} 7.0' in text:
                 break
         assert 'rce_robots{session="connected"} 1.0' in text
         assert 'rce_messages_total{direction="in",endpoint="testUser/rob",interface="i"} 7.0' in text

@@ -12,7 +12,7 @@ from rce.control.model import (
     NodeState,
     NodeStatus,
 )
-from rce_master.exceptions import Conflict, InvalidTransition, NotFound
+from rce_master.exceptions import Conflict, Invalid, InvalidTransition, NotFound
 from rce_master.state import commands
 from rce_master.state.core import State
 from rce_master.state.lifecycle import (
@@ -350,3 +350,56 @@ def test_robots_that_do_not_come_back_after_a_restart_expire(world: World) -> No
     new.tick(60)
     assert new.state.tables.robots() == []
     assert new.phase() == "lost"
+
+
+def test_a_new_password_ends_the_sessions_of_the_users_robots(world: World) -> None:
+    world.wired()
+    before = world.spec("rob")
+    changes = world.do(commands.SetPassword(name="anna", password="new"))
+    assert [(w.process, w.id) for w in changes.withdrawals] == [("r1", "anna/rob")]
+    assert world.session() == "absent"
+    world.report("r1", status("rob"))
+    assert world.session() == "absent"
+    world.do(commands.RobotLeft(process="r1", id="anna/rob"))
+    world.do(commands.EndpointGone(process="r1", id="anna/rob"))
+    world.login()
+    after = world.spec("rob")
+    assert after.revision > changes.withdrawals[0].revision
+    assert (after.interfaces, after.connections) == (before.interfaces, before.connections)
+    assert world.session() == "connected"
+
+
+@pytest.mark.parametrize("name", ["", "a b", "x" * 256, "a\n"])
+def test_a_task_set_without_a_usable_name_is_refused(world: World, name: str) -> None:
+    with pytest.raises(Invalid, match="names no task set"):
+        world.robot_set(name)
+    world.robot_set("r1")
+    with pytest.raises(Conflict, match="there is a robot task set 'r1' already"):
+        world.container_set("r1")
+
+
+def test_nodes_that_start_again_are_events(world: World) -> None:
+    world.wired()
+    world.node("c", "n")
+    world.run(nodes=(NodeStatus(tag="n", state=NodeState.RUNNING, pid=1),))
+    waiting = NodeStatus(tag="n", state=NodeState.WAITING, restarts=0, detail="starts again in 1 s")
+    degraded = world.report("c1", status("c", EndpointState.DEGRADED, nodes=(waiting,)))
+    assert kinds(degraded) == ["container_degraded", "node_waiting"]
+    assert world.phase() == "degraded"
+    again = world.run(nodes=(NodeStatus(tag="n", state=NodeState.RUNNING, pid=2, restarts=1),))
+    assert [(h.kind, h.text) for h in again.happenings] == [
+        ("container_running", ""),
+        ("node_restarted", "for the 1st time"),
+        ("node_running", ""),
+    ]
+    stuck = world.run(nodes=(NodeStatus(tag="n", state=NodeState.STUCK, pid=2, restarts=1),))
+    assert kinds(stuck) == ["node_stuck"]
+
+
+def test_a_container_that_its_machine_ended_is_stopped_until_there_is_another(world: World) -> None:
+    world.wired()
+    world.do(commands.SetDraining(machine="c1", draining=True))
+    world.do(commands.EndpointGone(process="c1", id="anna/c"))
+    assert world.phase() == "stopped"
+    world.container_set("c2")
+    assert world.phase() == "placed"

@@ -1,0 +1,75 @@
+"""REST: what is consumed, once or as a stream."""
+
+from __future__ import annotations
+
+import asyncio
+
+from aiohttp import web
+
+from rce.web.openapi import Query
+from rce_master.exceptions import Invalid
+from rce_master.http.routes import OF_USER, Call, RouteTable
+from rce_master.http.usage_models import UsageOut
+from rce_master.http.usage_views import UsageViews
+
+routes = RouteTable("usage")
+
+LEAST_INTERVAL_S, MOST_INTERVAL_S = 1, 3600
+
+
+@routes.route(
+    "GET",
+    "/usage",
+    "Show what containers, nodes and machines consume now, and what could be better",
+    reply=UsageOut,
+    query=(OF_USER,),
+)
+async def show_usage(call: Call) -> UsageOut:
+    """Show what is consumed."""
+    return _usage(call, call.scope)
+
+
+@routes.route(
+    "GET",
+    "/usage/live",
+    "The same again and again, as server-sent events",
+    media="text/event-stream",
+    query=(
+        OF_USER,
+        Query(name="interval", description="Seconds between two, at least 1; default: 2.", type="integer"),
+    ),
+)
+async def stream_usage(call: Call) -> web.StreamResponse:
+    """Stream what is consumed until an end is made of it, or the token is worth nothing any more."""
+    interval = call.number("interval", 2)
+    if not LEAST_INTERVAL_S <= interval <= MOST_INTERVAL_S:
+        raise Invalid(f"query parameter 'interval' must be {LEAST_INTERVAL_S} to {MOST_INTERVAL_S}")
+    scope = call.scope
+    response = web.StreamResponse(
+        headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+    )
+    await response.prepare(call.request)
+    try:
+        await response.write(_frame(_usage(call, scope)))
+        while True:
+            await asyncio.sleep(interval)
+            if not call.is_still_valid:
+                return response
+            await response.write(_frame(_usage(call, scope)))
+    except ConnectionResetError:
+        # The client went away: the only way in which a stream ends from its side.
+        return response
+
+
+def _usage(call: Call, scope: str | None) -> UsageOut:
+    services = call.services
+    views = UsageViews(services.realm.tables, services.reconciler.book)
+    return UsageOut(
+        time=services.clock(),
+        containers=views.containers(scope),
+        machines=views.machines() if call.is_admin else [],
+    )
+
+
+def _frame(usage: UsageOut) -> bytes:
+    return b"event: usage\ndata: %s\n\n" % usage.model_dump_json().encode()

@@ -1,0 +1,134 @@
+"""Makes what the API tells of consumption."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rce.control.model import EndpointUsage, NodeStatus, NodeUsage
+from rce_master import advice
+from rce_master.http import usage_models as models
+from rce_master.state import capacity
+from rce_master.usage import NO_RATES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from rce_master.advice import Advice
+    from rce_master.state.placement import Room
+    from rce_master.state.records import Container
+    from rce_master.state.tables import Tables
+    from rce_master.usage import History, UsageBook
+
+_NOTHING = EndpointUsage()
+_NO_NODE_USAGE = NodeUsage()
+
+
+class UsageViews:
+    """Shows what containers and machines consume, at one moment.
+
+    Args:
+        tables: The state's tables.
+        book: What the task sets told.
+    """
+
+    def __init__(self, tables: Tables, book: UsageBook) -> None:
+        self._tables = tables
+        self._book = book
+        self._rooms = capacity.rooms(tables, away=True)
+
+    def containers(self, scope: str | None) -> list[models.ContainerUsageOut]:
+        """Show the containers of a user, or of all."""
+        return [self._container(container) for container in self._tables.containers(scope)]
+
+    def _container(self, container: Container) -> models.ContainerUsageOut:
+        history = self._book.history(container.task_set, container.id)
+        usage = history.now.usage if history else _NOTHING
+        rates = history.rates if history else NO_RATES
+        nodes = self._nodes(container, history)
+        live, room = self._tables.container_live(container.id), self._rooms.get(container.task_set)
+        return models.ContainerUsageOut(
+            id=container.id,
+            user=container.user,
+            tag=container.tag,
+            state=live.phase.value,
+            machine=room.machine.name if room else "",
+            cpu=round(rates.cpu, 3),
+            cpu_limit=usage.cpu_limit,
+            throttled=round(rates.throttled, 3),
+            cpu_s=usage.cpu_s,
+            throttled_s=usage.throttled_s,
+            memory=usage.memory,
+            memory_peak=max(usage.memory_peak, usage.memory),
+            memory_limit=usage.memory_limit,
+            oom_kills=usage.oom_kills,
+            io_read=usage.io_read,
+            io_written=usage.io_written,
+            io_read_rate=round(rates.io_read),
+            io_written_rate=round(rates.io_written),
+            link_in=usage.link_in,
+            link_out=usage.link_out,
+            link_in_rate=round(rates.link_in),
+            link_out_rate=round(rates.link_out),
+            processes=usage.processes,
+            restarts=sum(node.restarts for node in nodes),
+            nodes=nodes,
+            advice=_shown(self._advice(container, history, room)),
+        )
+
+    @staticmethod
+    def _advice(container: Container, history: History | None, room: Room | None) -> list[Advice]:
+        if history is None:
+            return []
+        return advice.for_container(container.tag, container.resources, history, room)
+
+    def _nodes(self, container: Container, history: History | None) -> list[models.NodeUsageOut]:
+        status = self._tables.container_live(container.id).status
+        reported = {node.tag: node for node in status.nodes} if status else {}
+        return [_node(tag, reported.get(tag), history) for tag in container.nodes]
+
+    def machines(self) -> list[models.MachineUsageOut]:
+        """Show all container machines."""
+        return [
+            self._machine(room, [other for other in self._rooms.values() if other is not room])
+            for room in self._rooms.values()
+        ]
+
+    def _machine(self, room: Room, others: list[Room]) -> models.MachineUsageOut:
+        histories = [
+            history
+            for endpoint in self._tables.endpoints.by("task_set", room.process)
+            if (history := self._book.history(room.process, endpoint.id)) is not None
+        ]
+        return models.MachineUsageOut(
+            process=room.process,
+            machine=room.machine.name,
+            connected=self._tables.is_connected(room.process),
+            draining=room.draining,
+            containers=room.containers,
+            slots=room.machine.slots,
+            promised_slots=room.slots,
+            cores=room.machine.cores,
+            promised_cores=round(room.cpu, 4),
+            cpu=round(sum(history.rates.cpu for history in histories), 3),
+            memory=room.machine.memory,
+            promised_memory=room.memory,
+            memory_used=sum(history.now.usage.memory for history in histories),
+            advice=_shown(advice.for_machine(room, others)),
+        )
+
+
+def _node(tag: str, status: NodeStatus | None, history: History | None) -> models.NodeUsageOut:
+    usage = history.now.usage.nodes.get(tag, _NO_NODE_USAGE) if history else _NO_NODE_USAGE
+    return models.NodeUsageOut(
+        tag=tag,
+        state=status.state.value if status else "unknown",
+        cpu=round(history.node_cpu(tag), 3) if history else 0.0,
+        cpu_s=usage.cpu_s,
+        memory=usage.memory,
+        processes=usage.processes,
+        restarts=status.restarts if status else 0,
+    )
+
+
+def _shown(found: Iterable[Advice]) -> list[models.AdviceOut]:
+    return [models.AdviceOut(about=one.about, text=one.text, command=one.command) for one in found]
