@@ -94,7 +94,10 @@ class CgroupCell(Cell):
             time.sleep(_PAUSE_S)
 
     def remove(self) -> None:
-        """A process that is just dying may still be in it, so this tries for a while."""
+        """A process that is just dying may still be in it, so this tries for a while.
+
+        The folder of the task set goes with its last container.
+        """
         deadline = time.monotonic() + _REMOVE_TIMEOUT_S
         for folder in self._folders:
             while True:
@@ -107,6 +110,7 @@ class CgroupCell(Cell):
                             f"the cgroup {folder} cannot be removed: {error.strerror}"
                         ) from error
                 time.sleep(_PAUSE_S)
+            _drop_if_empty(folder.parent)
 
     def _strike(self, pids: Iterable[int]) -> None:
         if self._has("cgroup.kill"):
@@ -212,9 +216,7 @@ class CgroupLimiter(Limiter):
     def sweep(self, keep: Collection[str]) -> None:
         """Look where this and earlier managers made cells."""
         parents = self._all_parents()
-        marks = {
-            one.name for parent in parents if parent.is_dir() for one in parent.iterdir() if one.is_dir()
-        }
+        marks = {child.name for parent in parents for child in files.children(parent)}
         for mark in sorted(marks - set(keep)):
             cell = self.adopt(mark)
             cell.kill()
@@ -252,7 +254,7 @@ class CgroupLimiter(Limiter):
         return list(dict.fromkeys((*self._parents, *(one for one in former if one.name == self._folder))))
 
     def _make(self, folders: Iterable[Path]) -> None:
-        """Make a container's folders; the end of another container may remove an empty parent meanwhile."""
+        """Make a container's folders; the end of another one may remove an empty parent meanwhile."""
         for attempt in range(_ATTEMPTS):
             try:
                 for parent in self._parents:

@@ -89,7 +89,7 @@ class Cgroup1(CgroupLimiter):
     cell = Cell1
 
     def probe(self) -> None:
-        """Make this task set's folder in each hierarchy."""
+        """Try to make this task set's folder in each hierarchy."""
         found = [one for one in hierarchy.find(self._proc) if one.version == 1]
         places: dict[Path, hierarchy.Hierarchy] = {}
         working: set[str] = set()
@@ -108,8 +108,8 @@ class Cgroup1(CgroupLimiter):
         self._bases = tuple(places)
         self._mounts = tuple(place.mount for place in places.values())
         self._missing = frozenset(CONTROLLERS[name] for name in CONTROLLERS.keys() - working) - {""}
+        self.close()
         if not working & {"memory", "pids", "cpu"}:
-            self.close()
             raise LimitsUnavailableError(reasons[0] if reasons else "no hierarchy of version 1 is mounted")
         if self._missing:
             self.detail = f"of containers' {', '.join(sorted(self._missing))} no limit holds: " + (

@@ -87,7 +87,7 @@ class Cgroup2(CgroupLimiter):
     cell = Cell2
 
     def probe(self) -> None:
-        """Have controllers given to this task set's folder."""
+        """Have controllers given to the cgroups below, and try to make this task set's folder."""
         place = next((one for one in hierarchy.find(self._proc) if one.version == 2), None)  # noqa: PLR2004
         if place is None:
             raise LimitsUnavailableError("no hierarchy of version 2 is mounted")
@@ -105,10 +105,10 @@ class Cgroup2(CgroupLimiter):
             raise LimitsUnavailableError(
                 f"the cgroup {base} may not be used: {error.strerror}; {_HINT}"
             ) from error
-        if not os.access(base / files.PROCS, os.W_OK):
-            files.remove(base / self._folder)
-            raise LimitsUnavailableError(f"no process may be moved within the cgroup {base}; {_HINT}")
         self._bases, self._mounts = (base,), (place.mount,)
+        self.close()
+        if not os.access(base / files.PROCS, os.W_OK):
+            raise LimitsUnavailableError(f"no process may be moved within the cgroup {base}; {_HINT}")
         self._missing = frozenset(CONTROLLERS[name] for name in CONTROLLERS.keys() - set(wanted))
         if self._missing:
             self.detail = (

@@ -51,6 +51,14 @@ def tree(folder: Path) -> Iterator[Path]:
     return (Path(path) for path, _, _ in os.walk(folder, topdown=False))
 
 
+def children(folder: Path) -> list[Path]:
+    """The cgroups in a cgroup; none if it does not exist."""
+    try:
+        return [one for one in folder.iterdir() if one.is_dir()]
+    except OSError:
+        return []
+
+
 def pids(folder: Path) -> list[int]:
     """The processes in a cgroup and below it."""
     return [int(word) for one in tree(folder) for word in read(one / PROCS).split()]

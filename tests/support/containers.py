@@ -46,6 +46,7 @@ from rce_container.bundles.supply import Library
 from rce_container.environment import proc
 from rce_container.folder import Record, StateFolder
 from rce_container.limits import choose_limiter
+from rce_container.limits.files import children
 from rce_container.manager import Manager
 from rce_container.runtimes.base import Runtime
 from rce_container.runtimes.namespace import NamespaceRuntime
@@ -328,7 +329,7 @@ class Machine:
 
     def cells(self) -> list[Path]:
         """The cgroups of this machine's containers."""
-        return [cell for parent in self.cell_parents() for cell in parent.iterdir() if cell.is_dir()]
+        return [cell for parent in self.cell_parents() for cell in children(parent)]
 
     def cell_parents(self) -> list[Path]:
         lines = self.cgroups.read_text().splitlines() if self.cgroups.exists() else ()
@@ -340,7 +341,7 @@ class Machine:
         found += [f"process {one.pid}" for one in self.processes()]
         found += [f"process {one.pid}" for mark in self.marks for one in proc.marked(mark)]
         found += map(str, self.containers)
-        found += map(str, self.cells())
+        found += map(str, [*self.cells(), *self.cell_parents()])
         found += [str(path) for path in (self.folder / "run").rglob("*") if path.is_socket()]
         found += [line for line in Path("/proc/mounts").read_text().splitlines() if str(self.folder) in line]
         return found

@@ -168,10 +168,31 @@ def test_a_container_without_a_cgroup_cannot_be_resized(tree: Tree2) -> None:
     cell.remove()
 
 
-def test_a_parent_that_vanished_is_made_again(tree: Tree2) -> None:
+def test_the_task_set_s_folder_is_there_while_it_has_containers(tree: Tree2) -> None:
     made = limiter(tree)
-    tree.remove(tree.own / "rce-t0")
+    cells = [made.create(mark, LIMITS) for mark in ("m1", "m2")]
+    for cell in cells:
+        assert (tree.own / "rce-t0").is_dir()
+        cell.remove()
+    assert not (tree.own / "rce-t0").exists()
+    made.create("m3", LIMITS)
+    assert text(tree.own / "rce-t0" / "m3", "pids.max") == "32"
+
+
+def test_a_folder_that_vanishes_meanwhile_is_made_again(tree: Tree2, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = limiter(tree)
+    make, spoiled = tree.make, []
+
+    def spoil(folder: Path) -> None:
+        if folder.name == "m1" and not spoiled:
+            spoiled.append(folder)
+            tree.remove(folder.parent)
+            raise FileNotFoundError(2, "No such file or directory", str(folder))
+        make(folder)
+
+    monkeypatch.setattr("rce_container.limits.files.make", spoil)
     made.create("m1", LIMITS)
+    assert spoiled
     assert text(tree.own / "rce-t0" / "m1", "pids.max") == "32"
 
 
