@@ -7,6 +7,7 @@ import os
 import socket
 import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from rce_container.nursery.cradle import Script, encode_script
 
@@ -64,7 +65,17 @@ def fits(argv: Sequence[str], env: Mapping[str, str], own: Mapping[str, str]) ->
         and argv[0] == sys.executable
         and argv[1].endswith(".py")
         and _shaping(env) == _shaping(own)
+        and not _hides_a_module(Path(argv[1]).resolve().parent)
     )
+
+
+def _hides_a_module(folder: Path) -> bool:
+    """Whether a script in this folder would import something from there that is here from elsewhere."""
+    try:
+        names = {path.name.partition(".")[0] for path in folder.iterdir()}
+    except OSError:
+        return True
+    return not names.isdisjoint(sys.modules)
 
 
 def _shaping(env: Mapping[str, str]) -> dict[str, str]:

@@ -38,7 +38,7 @@ SCRIPTS = {
         "import threading\nt = threading.Timer(0.1, print, ['from a thread'])\nt.start()\nprint('main')\n"
     ),
     "main": "import sys\nclass A: pass\nassert sys.modules['__main__'].A is A\nprint(A, __spec__, __doc__)\n",
-    "pickle": "import pickle\nclass A: pass\nprint(type(pickle.loads(pickle.dumps(A()))) is A)\n",
+    "pickled": "import pickle\nclass A: pass\nprint(type(pickle.loads(pickle.dumps(A()))) is A)\n",
     "annotations": "x: int = 1\nprint(__annotations__)\n",
     "unicode": "# -*- coding: latin-1 -*-\nprint(ascii('\xe4'))\n",
     "stdin": "import sys\nprint(repr(sys.stdin.read()))\n",
