@@ -24,16 +24,14 @@ from rce_client.demo.setting import START_TIMEOUT
 
 PLANNER = "planner"
 """Name of the planner's machine."""
-FROM_ROBOT = ("amcl_pose", "moveClient/status", "blockedCells")
-"""What the planner's machine takes of each robot's, in the robot's namespace."""
+FROM_ROBOT = ("amcl_pose", "goalNodesList")
+"""What the planner's machine takes of each robot's, in the robot's namespace; lists are answered there."""
 TO_ROBOT = ("goalNodesList", "cancelGoal")
 """What a robot's machine takes of the planner's, in the robot's namespace."""
-TO_ALL = ("/map",)
-"""What every robot's machine takes of the planner's."""
 
 
 class MultiMaster:
-    """Each robot's machine has its core and move client; discovery and sync run on every machine.
+    """Each robot's machine has its core, map and move client; discovery and sync run on every machine.
 
     The world has none: what it simulates is each robot's hardware, a node that joins the robot's core.
     """
@@ -54,10 +52,14 @@ class MultiMaster:
         outside = Machine("outside", planner.core_uri)
         floor = Machine("floor", planner.core_uri, enter=network.enter_world)
         world = await floor.start(children, "world", world_argv(play, planner.core_uri, uris))
-        station = await outside.start(children, "station", station_argv(play, planner.core_uri))
-        await _machine_of(planner).start(children, "planner", planner_argv(play))
+        station = await outside.start(
+            children, "station", station_argv(play, planner.core_uri), revivable=True
+        )
+        argv = planner_argv(play, answers=True)
+        await _machine_of(planner).start(children, "planner", argv, revivable=True)
         for number, site in enumerate(others, start=1):
-            await _machine_of(site).start(children, f"move_client{number}", move_client_argv(site.name))
+            argv = move_client_argv(site.name, answers=True, **play.map_parameters)
+            await _machine_of(site).start(children, f"move_client{number}", argv, revivable=True)
         await _join_machines(network, robots, children)
         page = await children.wait_line(station, "rce ui ready:", START_TIMEOUT)
         await children.wait_line(world, "simulation ready:", START_TIMEOUT)
@@ -74,7 +76,7 @@ def sync_argv(machine: str, robots: Iterable[str]) -> list[str]:
         # The robots' hardware is a node of another machine, the world.
         topics = [f"/{robot}/{name}" for robot in robots for name in FROM_ROBOT]
         return [*_command("sync"), "--topics", ",".join(topics), "--sync-remote-nodes"]
-    topics = [*(f"/{machine}/{name}" for name in TO_ROBOT), *TO_ALL]
+    topics = [f"/{machine}/{name}" for name in TO_ROBOT]
     return [*_command("sync"), "--topics", ",".join(topics), "--hosts", PLANNER]
 
 
@@ -111,9 +113,13 @@ async def _start_cores(network: Network, children: Children) -> None:
 async def _join_machines(network: Network, robots: Iterable[str], children: Children) -> None:
     """Let machines find each other, and take of each other what they need."""
     discoveries = [
-        await _machine_of(site).start(children, f"discovery-{site.name}", discovery_argv(site, network))
+        await _machine_of(site).start(
+            children, f"discovery-{site.name}", discovery_argv(site, network), revivable=True
+        )
         for site in network.sites
     ]
     for site, discovery in zip(network.sites, discoveries, strict=True):
         await children.wait_line(discovery, "rce discovery ready:", START_TIMEOUT)
-        await _machine_of(site).start(children, f"sync-{site.name}", sync_argv(site.name, robots))
+        await _machine_of(site).start(
+            children, f"sync-{site.name}", sync_argv(site.name, robots), revivable=True
+        )

@@ -16,7 +16,7 @@ from support.demo import run_headless, running_demo
 from support.engine import engine_processes, free_ports, until
 
 from rce.ros.xmlrpc import RpcClient
-from rce_client.demo.exceptions import StationAwayError
+from rce_client.demo.exceptions import StationError
 from rce_client.demo.floor import draw
 from rce_client.demo.station import StationApi
 
@@ -64,18 +64,12 @@ async def test_the_page_of_a_single_core_and_its_end() -> None:
     async with running_demo(*options) as demo, aiohttp.ClientSession() as session:
         station = StationApi(session, demo.page)
 
-        async def state() -> str:
-            with contextlib.suppress(StationAwayError):
-                fleet = await station.fleet()
-                return fleet.robots[0].state if fleet.robots else ""
-            return ""
-
-        await until(lambda: _is(state(), "idle"), timeout=30, what="the robot is in its place")
+        await until(lambda: _is(_state(station), "idle"), timeout=30, what="the robot is in its place")
         (robot,) = (await station.fleet()).robots
         assert robot.pose is not None
         assert robot.cell is not None
         await station.set_goal(robot.id, robot.cell)
-        await until(lambda: _is(state(), "arrived"), timeout=30, what="it has its goal")
+        await until(lambda: _is(_state(station), "arrived"), timeout=30, what="it has its goal")
         news: dict[str, dict[str, Any]] = {}
         async with session.ws_connect(f"{demo.page}api/v1/live") as live, asyncio.timeout(20):
             while not {"engine", "state", "map", "poses"} <= news.keys():
@@ -88,7 +82,11 @@ async def test_the_page_of_a_single_core_and_its_end() -> None:
 
 @pytest.mark.timeout(120)
 async def test_machines_of_many_masters_share_only_what_they_must() -> None:
-    async with running_demo("--mode", "multi", "--robots", 2, "--no-auto") as demo, RpcClient() as rpc:
+    async with (
+        running_demo("--mode", "multi", "--robots", 2, "--no-auto") as demo,
+        RpcClient() as rpc,
+        aiohttp.ClientSession() as session,
+    ):
         (log,) = demo.folder.glob("rce-demo-*/world.log")
         cores = dict(re.findall(r"robot (Robot\d) ROS_MASTER_URI=(\S+)", log.read_text()))
         (planner_log,) = log.parent.glob("core-planner.log")
@@ -98,12 +96,95 @@ async def test_machines_of_many_masters_share_only_what_they_must() -> None:
             state = await rpc.call(cores[machine], "getSystemState", ("/test",), timeout=5)
             return {topic for topic, _ in state[2][0]}
 
-        shared = {f"/Robot{n}/{name}" for n in (1, 2) for name in ("amcl_pose", "moveClient/status")}
-        await until(lambda: _holds(published("planner"), shared), timeout=20, what="the planner hears all")
-        at_robot = {"/map", "/Robot1/goalNodesList", "/Robot1/cancelGoal", "/Robot1/odom"}
+        async def foreign(machine: str) -> set[str]:
+            """What is published at a machine by nodes of others."""
+            own = {"planner": "/fleet_planner", "Robot1": "/Robot1/", "Robot2": "/Robot2/"}
+            state = await rpc.call(cores[machine], "getSystemState", ("/test",), timeout=5)
+            others = [name for node, name in own.items() if node != machine]
+            return {
+                topic for topic, nodes in state[2][0] if any(n.startswith(o) for n in nodes for o in others)
+            }
+
+        heard = {f"/Robot{n}/{name}" for n in (1, 2) for name in ("amcl_pose", "goalNodesList")}
+        await until(lambda: _holds(published("planner"), heard), timeout=20, what="the planner hears all")
+        at_robot = {"/Robot1/goalNodesList", "/Robot1/cancelGoal", "/Robot1/odom"}
         await until(lambda: _holds(published("Robot1"), at_robot), timeout=20, what="the robot hears it")
-        assert not {"/Robot1/odom", "/Robot1/scan", "/Robot1/move_base/goal"} & await published("planner")
-        assert not [topic for topic in await published("Robot1") if topic.startswith(("/Robot2", "/fleet"))]
+        station = StationApi(session, demo.page)
+        await until(lambda: _is(_state(station), "idle"), timeout=30, what="lists are answered")
+        assert await foreign("planner") == heard
+        assert await foreign("Robot1") == {"/Robot1/goalNodesList", "/Robot1/cancelGoal"}
+        assert await foreign("Robot2") == {"/Robot2/goalNodesList", "/Robot2/cancelGoal"}
+
+
+@pytest.mark.timeout(200)
+@pytest.mark.parametrize("mode", ["single", "multi"])
+async def test_a_killed_planner_and_a_killed_move_client_come_back(mode: str) -> None:
+    options = ("--mode", mode, "--robots", 2, "--core-port", free_ports(1)[0], "--no-auto")
+    async with running_demo(*options) as demo, aiohttp.ClientSession() as session:
+        station = StationApi(session, demo.page)
+        await until(lambda: _is(_state(station), "idle"), timeout=40, what="the robot is in its place")
+        fleet = await station.fleet()
+        assert fleet.map is not None
+        taken = {robot.cell for robot in fleet.robots} | set(fleet.blocked)
+        columns, here = fleet.map.columns, fleet.robots[0].cell
+        assert here is not None
+
+        def distance(cell: int) -> int:
+            return abs(cell // columns - here // columns) + abs(cell % columns - here % columns)
+
+        free = [cell for cell in range(fleet.map.rows * columns) if cell not in taken]
+        cells = sorted(free, key=distance)[2:7]
+        for words, cell in (
+            (("fleet_planner.py",), cells[0]),
+            (("move_client.py", "__ns:=Robot1"), cells[-1]),
+        ):
+            await _send(station, "Robot1", cell)
+            _kill(demo.process.pid, *words)
+            await until(
+                lambda cell=cell: _arrives(station, "Robot1", cell),  # type: ignore[misc]
+                timeout=80,
+                what=f"Robot1 is at cell {cell}",
+            )
+        assert demo.output().count("is started again") == 2
+
+
+async def _send(station: StationApi, robot: str, cell: int) -> None:
+    """Send a robot to a cell, as soon as the planner can be asked."""
+    async with asyncio.timeout(30):
+        while True:
+            try:
+                await station.set_goal(robot, cell)
+            except StationError:
+                await asyncio.sleep(0.2)
+            else:
+                return
+
+
+async def _arrives(station: StationApi, robot: str, cell: int) -> bool:
+    with contextlib.suppress(StationError):
+        return any(
+            (one.id, one.cell, one.goal, one.state) == (robot, cell, cell, "arrived")
+            for one in (await station.fleet()).robots
+        )
+    return False
+
+
+def _kill(demo: int, *words: str) -> None:
+    """Kill the one program of a demo whose command line holds all words."""
+    found = []
+    for child in psutil.Process(demo).children():
+        with contextlib.suppress(psutil.ZombieProcess):
+            line = " ".join(child.cmdline())
+            found += [child] if all(word in line for word in words) else []
+    assert len(found) == 1, words
+    found[0].kill()
+
+
+async def _state(station: StationApi) -> str:
+    with contextlib.suppress(StationError):
+        fleet = await station.fleet()
+        return fleet.robots[0].state if fleet.robots else ""
+    return ""
 
 
 @pytest.mark.timeout(120)
