@@ -37,6 +37,12 @@ def segments(folder: Path, name: str) -> list[tuple[int, Path]]:
     return sorted(found)
 
 
+def remove_log(folder: Path, name: str) -> None:
+    """Remove all segments of a log that nobody writes."""
+    for _, path in segments(folder, name):
+        path.unlink(missing_ok=True)
+
+
 class LogWriter:
     """Appends to a log and keeps its size bounded. Goes on where an earlier writer ended.
 

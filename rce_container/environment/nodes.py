@@ -5,13 +5,18 @@ from __future__ import annotations
 import asyncio
 import math
 import os
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 
 from rce.control.model import NodeSpec, NodeStatus
 from rce_container.environment import nodeevents as e
+from rce_container.environment.logs import remove_log
 from rce_container.environment.nodecore import NodesCore
 from rce_container.environment.nodelife import NodeLife, Workshop
 from rce_container.environment.nodelog import NodeLog
+
+MAX_DEPARTED = 50
+"""How many logs are kept of nodes that are gone, while their container lives."""
 
 
 class NodeSet:
@@ -30,6 +35,8 @@ class NodeSet:
         self._lives: dict[str, NodeLife] = {}
         """The newest life of each node, by tag."""
         self._logs: dict[str, NodeLog] = {}
+        self._departed: deque[str] = deque()
+        """Nodes that are gone and whose logs are kept."""
         self._ros_names: dict[str, str] = {}
         """Tags by the names under which nodes registered with the ROS core."""
         self._timer: asyncio.TimerHandle | None = None
@@ -138,6 +145,11 @@ class NodeSet:
         log = self._logs.pop(tag, None)
         if log is not None:
             log.close()
+            self._departed.append(tag)
+        while len(self._departed) > MAX_DEPARTED:
+            oldest = self._departed.popleft()
+            if oldest not in self._logs and oldest not in self._departed:
+                remove_log(self._workshop.logs, oldest)
         self._lives.pop(tag, None)
         self._ros_names = {name: owner for name, owner in self._ros_names.items() if owner != tag}
         if not self._core.statuses:

@@ -1,0 +1,83 @@
+"""The nodes of a container, as far as no process is needed."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rce.control.model import NodeSpec, NodeState
+from rce_container.environment import nodes
+from rce_container.environment.exceptions import NodeError
+from rce_container.environment.nodelife import Workshop
+from rce_container.environment.nodes import NodeSet
+from rce_container.environment.reaper import Reaper
+
+
+def workshop(folder: Path, faults: list[str]) -> Workshop:
+    def outfit(_: NodeSpec) -> Any:
+        raise NodeError("no package 'x'")
+
+    async def why_killed() -> str:
+        return ""
+
+    return Workshop(
+        reaper=Reaper(),
+        outfit=outfit,
+        mark="mark",
+        home=str(folder),
+        logs=folder,
+        interrupt_timeout=1.0,
+        terminate_timeout=1.0,
+        on_change=lambda: None,
+        on_fault=faults.append,
+        why_killed=why_killed,
+    )
+
+
+def spec(tag: str) -> NodeSpec:
+    return NodeSpec(tag=tag, pkg="x", exe="y")
+
+
+async def test_what_cannot_be_started_is_told_and_noted(tmp_path: Path) -> None:
+    faults: list[str] = []
+    async with asyncio.TaskGroup() as tasks:
+        found = NodeSet(workshop(tmp_path, faults), tasks)
+        found.apply([spec("a")])
+        while found.statuses[0].state is not NodeState.FAILED:
+            await asyncio.sleep(0)
+        assert found.is_degraded
+        assert not found.is_settling
+        await found.close()
+    assert faults == ["node a cannot be started: no package 'x'"]
+    text = (tmp_path / "a.000000000000.log").read_text()
+    assert text == "x-- cannot be started: no package 'x' --\n"
+
+
+async def test_logs_of_nodes_that_are_gone_do_not_pile_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(nodes, "MAX_DEPARTED", 3)
+    async with asyncio.TaskGroup() as tasks:
+        found = NodeSet(workshop(tmp_path, []), tasks)
+        for tag in ("a", "stays", "b", "a", "c", "d"):
+            found.apply([spec("stays"), spec(tag)] if tag != "stays" else [spec("stays")])
+            while any(status.state is NodeState.STARTING for status in found.statuses):
+                await asyncio.sleep(0)
+        found.apply([spec("stays")])
+        assert sorted(path.name[0] for path in tmp_path.iterdir()) == ["a", "c", "d", "s"]
+        await found.close()
+
+
+async def test_a_log_that_cannot_be_opened_is_a_fault_of_its_node(tmp_path: Path) -> None:
+    faults: list[str] = []
+    (tmp_path / "a.000000000000.log").mkdir()
+    async with asyncio.TaskGroup() as tasks:
+        found = NodeSet(workshop(tmp_path, faults), tasks)
+        found.apply([spec("a")])
+        while found.statuses[0].state is not NodeState.FAILED:
+            await asyncio.sleep(0)
+        await found.close()
+    assert faults == ["node a cannot be started: its log cannot be opened: Is a directory"]
