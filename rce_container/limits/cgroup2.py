@@ -95,7 +95,7 @@ class Cgroup2(CgroupLimiter):
         offered = files.read(base / "cgroup.controllers").split()
         wanted = [name for name in CONTROLLERS if name in offered]
         if not {"memory", "pids", "cpu"} & set(wanted):
-            if not files.read(place.mount / "cgroup.controllers").strip():
+            if not CONTROLLERS.keys() & set(files.read(place.mount / "cgroup.controllers").split()):
                 raise LimitsUnavailableError("all controllers belong to version 1")
             raise LimitsUnavailableError(f"the cgroup {base} has no controllers; {_HINT}")
         try:

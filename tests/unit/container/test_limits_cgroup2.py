@@ -221,7 +221,7 @@ def test_a_cgroup_without_controllers_is_refused(
 def test_a_machine_with_all_controllers_in_the_first_version_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tree = Tree2(tmp_path, monkeypatch, controllers="", own="user.slice", of_root="")
+    tree = Tree2(tmp_path, monkeypatch, controllers="", own="user.slice", of_root="hugetlb")
     with pytest.raises(LimitsUnavailableError, match="all controllers belong to version 1"):
         limiter(tree)
 
