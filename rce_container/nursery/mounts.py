@@ -17,6 +17,7 @@ TEMPORARY = ("/tmp", "/dev/shm")  # noqa: S108 - the container's own
 _BYTES_PER_FILE = 4096
 """A folder of so many bytes may hold a file for each such piece: empty files take memory too."""
 _FLAGS = Mount.NO_SUID | Mount.NO_DEV
+_READ_ONLY_FROM_NOW_ON = Mount.REMOUNT | Mount.BIND | Mount.READ_ONLY | Mount.NO_SUID | Mount.NO_EXEC
 _HIDDEN = (
     "/proc/acpi",
     "/proc/asound",
@@ -64,7 +65,9 @@ def take_away_logs(owner: int) -> int:
 
 
 def mask_machine() -> None:
-    """Hide what ``/proc`` tells of the machine and nobody inside needs, and let nothing of it be changed."""
+    """Hide what ``/proc`` and ``/sys`` tell of the machine; let nothing of it or of ``/dev`` be changed."""
+    while os.path.ismount("/sys"):
+        unmount("/sys")
     for path in filter(os.path.exists, _HIDDEN):
         if Path(path).is_dir():
             mount(path, _FLAGS | Mount.READ_ONLY | Mount.NO_EXEC, kind="tmpfs", options="size=0,mode=555")
@@ -72,9 +75,10 @@ def mask_machine() -> None:
             _bind_read_only("/dev/null", path)
     for path in filter(os.path.exists, _READ_ONLY):
         _bind_read_only(path, path)
+    mount("/dev", _READ_ONLY_FROM_NOW_ON)
 
 
 def _bind_read_only(source: str, target: str) -> None:
     mount(target, Mount.BIND, source=source)
-    flags = Mount.REMOUNT | Mount.BIND | Mount.READ_ONLY | Mount.NO_SUID | Mount.NO_EXEC
+    flags = _READ_ONLY_FROM_NOW_ON
     mount(target, flags if source == "/dev/null" else flags | Mount.NO_DEV)

@@ -223,7 +223,7 @@ def _mounts(order: Order) -> list[str]:
         *(word for path in (*TEMPORARY, HOME) for word in ("--tmpfs", path)),
         *("--remount-ro", "/dev"),
         *("--ro-bind", str(folder.etc), "/etc"),
-        *(word for name in _ETC for word in ("--ro-bind-try", f"/etc/{name}", f"/etc/{name}")),
+        *(word for name in _etc(order) for word in ("--ro-bind-try", f"/etc/{name}", f"/etc/{name}")),
         *("--bind", str(folder.logs), LOGS),
         *("--dir", "/opt", "--dir", "/opt/rce", "--ro-bind", str(folder.bundles), BUNDLES),
         *read_only_mounts([*interpreter_paths(), *order.packages]),
@@ -272,6 +272,11 @@ def outermost(paths: Iterable[Path], *bound: Path) -> list[Path]:
     return found
 
 
+def _etc(order: Order) -> tuple[str, ...]:
+    """What is the machine's in ``/etc``: with its network also its name servers."""
+    return (*_ETC, "resolv.conf") if order.host_network else _ETC
+
+
 def write_etc(order: Order) -> None:
     """Write the container's own ``/etc``, for its user to read. Its hosts may be known already."""
     etc, host = order.folder.etc, hostname(order.tag)
@@ -281,11 +286,11 @@ def write_etc(order: Order) -> None:
         ("group", f"{USER}:x:{USER_ID}:\n"),
         ("hosts", hosts_text(order.tag)),
         ("hostname", f"{host}\n"),
-        ("nsswitch.conf", "passwd: files\ngroup: files\nhosts: files\n"),
+        ("nsswitch.conf", f"passwd: files\ngroup: files\nhosts: files{' dns' * order.host_network}\n"),
     ):
         (etc / name).write_text(text)
         (etc / name).chmod(0o644)
-    for name in _ETC:
+    for name in _etc(order):
         source = Path("/etc") / name
         if source.is_dir():
             (etc / name).mkdir(exist_ok=True)

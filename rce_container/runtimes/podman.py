@@ -68,7 +68,7 @@ _TEMPORARY = ("/tmp:mode=1777", f"{HOME}:mode=755")  # noqa: S108 - the containe
 _FIXED = (
     *("--pull=never", "--entrypoint", SHELL, "--workdir=/", "--user=0:0", "--preserve-fds=1"),
     *("--cgroups=disabled", "--cgroupns=private", "--ipc=private", "--read-only", "--read-only-tmpfs=false"),
-    *("--cap-drop=all", "--security-opt=no-new-privileges", "--security-opt=mask=/sys"),
+    *("--cap-drop=all", "--security-opt=no-new-privileges"),
     *("--ulimit=nofile=1024:1024", "--ulimit=nproc=1024:1024"),  # podman's own may be above what is allowed
     *("--no-hosts", "--passwd=false", "--unsetenv-all", "--http-proxy=false", "--image-volume=ignore"),
     *("--systemd=false", "--sdnotify=ignore", "--log-driver=none"),

@@ -1,4 +1,4 @@
-"""``python -m support.sandbox FOLDER RUNTIME look|two``: makes containers and prints what their nodes can see and do.
+"""``python -m support.sandbox FOLDER RUNTIME look|two``: makes containers and prints what nodes see and do.
 
 Runs as whatever user it is started by, with a manager of its own. What it prints is JSON: what the machine
 sees of the container, and what each node said of itself.

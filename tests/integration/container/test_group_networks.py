@@ -46,6 +46,7 @@ NODES = {
         "six = '/proc/net/if_inet6'\n"
         "addresses = open(six).read().split() if os.path.exists(six) else []\n"
         "print(json.dumps({'found': found, 'interfaces': interfaces, 'six': addresses[5::6],\n"
+        "                  'servers': os.path.exists('/etc/resolv.conf'),\n"
         "                  'hosts': open('/etc/hosts').read(), 'ip': os.environ['ROS_IP']}), flush=True)\n"
     ),
     "speak.py": (
@@ -232,6 +233,8 @@ async def test_a_container_of_the_machines_network(machine: Machine) -> None:
             )
             await machine.node_is("user/a", "node", NodeState.EXITED)
             server.accept()[0].close()
+            said = json.loads(next(line for line in (await machine.log("user/a", "node")).splitlines()))
+            assert said["servers"] == Path("/etc/resolv.conf").exists()
             status = machine.status("user/a")
             assert status is not None
             assert status.state is EndpointState.RUNNING
