@@ -92,6 +92,7 @@ class BundleCache:
 
         Raises:
             BundleTrouble: It cannot be had now.
+            OSError: Somebody else changed the folder.
         """
         _check_signature(user, bundle)
         path = self._folder / bundle.sha256

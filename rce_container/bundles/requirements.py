@@ -95,6 +95,7 @@ class Installer:
 
         Raises:
             RequirementsTrouble: They cannot be installed.
+            OSError: They cannot be kept.
         """
         wanted = read_requirements((package / FILE_NAME).read_text("utf-8", "replace"))
         if wanted.faults:

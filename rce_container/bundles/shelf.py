@@ -25,6 +25,11 @@ class Shelf:
         self._folder = folder
         self._link = link
 
+    @property
+    def is_there(self) -> bool:
+        """Whether the container still is."""
+        return self._folder.is_dir()
+
     def has(self, sha256: str) -> bool:
         """Tell whether a bundle is there."""
         return (self._folder / sha256).is_dir()

@@ -123,13 +123,14 @@ class Supply:
     async def _bring(self, bundle: BundleSpec) -> None:
         if self._shelf.has(bundle.sha256):
             return
-        tree = await self._library.cache.ensure(self._user, bundle)
-        requirements = await self._install(bundle, tree)
         try:
+            tree = await self._library.cache.ensure(self._user, bundle)
+            requirements = await self._install(bundle, tree)
             await in_thread(self._shelf.place, bundle.sha256, tree, requirements)
             await in_thread(self._shelf.tidy, {one.sha256 for one in self._coming})
         except OSError as error:
-            raise trouble_of(error) from error
+            if self._shelf.is_there:
+                raise trouble_of(error) from error
 
     async def _install(self, bundle: BundleSpec, tree: Path) -> Path | None:
         package = tree / bundle.name

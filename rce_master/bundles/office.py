@@ -131,7 +131,7 @@ class PackageOffice:
         if package_key_key(wish.user, wish.key) not in tables.package_keys:
             raise Forbidden("the key is not registered with your account; run: rce package key register")
         if bundle_key(wish.user, wish.name, wish.version) not in tables.bundles:
-            packages.check_room(tables, wish.user, size, settings.max_packages, settings.max_package_bytes)
+            packages.check_room(tables, settings, wish.user, size)
 
     @contextlib.contextmanager
     def _turn(self, user: str) -> Iterator[None]:

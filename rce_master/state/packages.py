@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from rce.control.model import NodeSpec
     from rce_master.state.changes import Transaction
     from rce_master.state.commands import AddBundle, AddPackageKey, RemoveBundle, RemovePackageKey
+    from rce_master.state.settings import StateSettings
     from rce_master.state.tables import Tables
 
 
@@ -76,26 +77,37 @@ def add_bundle(tx: Transaction, command: AddBundle) -> None:
         raise NotFound(f"there is no user {bundle.user!r}")
     if not check_new(tx.tables, bundle):
         return
-    check_room(tx.tables, bundle.user, bundle.packed, tx.settings.max_packages, tx.settings.max_package_bytes)
+    check_room(tx.tables, tx.settings, bundle.user, bundle.packed, bundle.size)
     tx.put(bundle)
     _touch_users_of(tx, bundle)
     tx.happen("package_pushed", bundle.id)
 
 
-def check_room(tables: Tables, user: str, size: int, most: int, most_bytes: int) -> None:
+def check_room(tables: Tables, settings: StateSettings, user: str, packed: int, size: int = 0) -> None:
     """Check that a user may keep one more version.
+
+    Args:
+        tables: What there is.
+        settings: The limits.
+        user: Whose it is.
+        packed: Bytes of its archive.
+        size: Bytes of its files, as far as they are known.
 
     Raises:
         LimitReached: There are too many, or they are too large.
     """
     kept = tables.bundles.by("user", user)
-    if len(kept) >= most:
-        raise LimitReached(f"you have {most} versions of packages already; remove one first")
-    held = sum(bundle.packed for bundle in kept)
-    if held + size > most_bytes:
-        raise LimitReached(
-            f"your packages would have {held + size} bytes, {most_bytes} are allowed; remove a version first"
-        )
+    if len(kept) >= settings.max_packages:
+        raise LimitReached(f"you have {len(kept)} versions of packages already; remove one first")
+    for what, held, most in (
+        ("archives", packed + sum(bundle.packed for bundle in kept), settings.max_package_bytes),
+        ("files", size + sum(bundle.size for bundle in kept), settings.max_package_size),
+    ):
+        if held > most:
+            raise LimitReached(
+                f"the {what} of your packages would have {held} bytes, {most} are allowed;"
+                " remove a version first"
+            )
 
 
 def remove_bundle(tx: Transaction, command: RemoveBundle) -> None:

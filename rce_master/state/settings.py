@@ -46,6 +46,8 @@ class StateSettings:
     """Versions of packages of one user."""
     max_package_bytes: int = 2 * 2**30
     """All archives of one user's packages together."""
+    max_package_size: int = 8 * 2**30
+    """All files of one user's packages together, on the machines where they are unpacked."""
     max_endpoint_bytes: int = 2 * 2**20
     """What the nodes, parameters and interfaces of one endpoint take when they are written down. A change of
     any of them is stored and sent with all the others."""

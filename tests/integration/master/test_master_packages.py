@@ -209,8 +209,14 @@ async def test_a_users_packages_have_limits(
     settings = StateSettings(max_package_bytes=10)
     async with run_site(state_dir=tmp_path / "master", state=settings) as site:
         log_in(site, tmp_path, monkeypatch)
-        with pytest.raises(ApiError, match="10 are allowed"):
+        with pytest.raises(ApiError, match=r"the archives of your packages .* 10 are allowed"):
             await push(package)
+    settings = StateSettings(max_package_size=11)
+    async with run_site(state_dir=tmp_path / "master", state=settings) as site:
+        log_in(site, tmp_path, monkeypatch)
+        with pytest.raises(ApiError, match=r"the files of your packages .* 11 are allowed"):
+            await push(package)
+        await until(lambda: not stored(tmp_path))
 
 
 async def test_a_restarted_master_has_what_it_had_and_clears_what_it_had_begun(
