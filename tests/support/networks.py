@@ -44,6 +44,15 @@ class NetworkMachine:
         """Switch it on again."""
         _ip("-n", self.namespace, "link", "set", "eth0", "up")
 
+    def add_private_address(self, address: str) -> None:
+        """Give the machine an address that others have no way to."""
+        _ip("-n", self.namespace, "address", "add", f"{address}/32", "dev", "lo")
+
+    def has_way_to(self, address: str) -> bool:
+        """Whether packets for an address would go anywhere."""
+        argv = ["ip", "-n", self.namespace, "route", "get", address]
+        return subprocess.run(argv, check=False, capture_output=True).returncode == 0
+
 
 @contextmanager
 def network(count: int) -> Iterator[list[NetworkMachine]]:

@@ -17,12 +17,23 @@ URI_PARAMETER = "~masteruri"
 """The master's URI as other machines are told."""
 
 
+LAST_HEARTBEAT = "ts_last_heartbeat"
+"""Seconds since 1970; a field of ``LinkState`` in newer releases."""
+
+
 class Announcements:
-    """The topics and services of a discovery node."""
+    """The topics and services of a discovery node.
+
+    Where fkie's messages are installed, theirs are used: newer ones tell of each link's last heartbeat.
+    """
 
     def __init__(self, changes: Publisher, link_stats: Publisher) -> None:
         self._changes = changes
         self._link_stats = link_stats
+        (links,) = (field.message for field in link_stats.type.fields if field.name == "links")
+        self._tells_heartbeats = links is not None and any(
+            field.name == LAST_HEARTBEAT for field in links.fields
+        )
 
     @classmethod
     async def open(
@@ -78,5 +89,9 @@ class Announcements:
         secs, fraction = divmod(now, 1)
         self._link_stats.publish(
             header={"stamp": Time(int(secs), int(fraction * 1e9)), "frame_id": name},
-            links=[{"destination": link.name, "quality": link.quality} for link in links],
+            links=[self._link_state(link, now) for link in links],
         )
+
+    def _link_state(self, link: Link, now: float) -> dict[str, Any]:
+        state: dict[str, Any] = {"destination": link.name, "quality": link.quality}
+        return state | ({LAST_HEARTBEAT: now - link.silence} if self._tells_heartbeats else {})

@@ -102,6 +102,8 @@ class Link(NamedTuple):
     name: str
     quality: float
     """Percent of the expected heartbeats that came; -1 while that cannot be told."""
+    silence: float
+    """Seconds since the last heartbeat."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +161,7 @@ class Neighbourhood:
     def links(self, now: float) -> list[Link]:
         """Return the quality of the links to all masters that are online."""
         return [
-            Link(peer.contact.master_name, self._quality(peer, now))
+            Link(peer.contact.master_name, self._quality(peer, now), now - peer.last_beat)
             for peer in self._peers.values()
             if peer.contact is not None and peer.online
         ]

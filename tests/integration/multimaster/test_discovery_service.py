@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import shutil
 import sys
 from pathlib import Path
 
@@ -71,6 +72,29 @@ async def test_masters_and_changes_are_shown_in_the_graph(neighbourhood: Neighbo
                 assert pair == [STRING, "992ce8a1687cec8c8bd883ec73ca41d1"]
     with pytest.raises(MasterUnreachable):
         await list_masters(a.uri)
+
+
+async def test_installed_messages_of_fkie_win(
+    neighbourhood: Neighbourhood, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Newer ones have a field more: who has them installed would not understand ours."""
+    package = tmp_path / "fkie_multimaster_msgs"
+    shutil.copytree(Path(messages.__file__).with_name("share") / package.name, package)
+    with (package / "msg" / "LinkState.msg").open("a") as definition:
+        definition.write("\nfloat64 ts_last_heartbeat\n")
+    monkeypatch.setenv("RCE_PACKAGE_PATH", str(tmp_path))
+    async with (
+        Core(port=0) as core,
+        Discovery(neighbourhood.settings(core.uri, name="a")),
+        node("watcher", core.uri, types=messages.registry()) as watching,
+        asyncio.timeout(20),
+    ):
+        links = await watching.subscribe("/master_discovery/linkstats", messages.LINK_STATES)
+        async for stats in links:
+            if stats.links:
+                break
+        assert stats.links[0].destination == "a"
+        assert abs(stats.links[0].ts_last_heartbeat - stats.header.stamp.to_sec()) < 5
 
 
 async def test_robot_hosts_find_each_other_without_multicast(neighbourhood: Neighbourhood) -> None:

@@ -167,14 +167,42 @@ async def test_a_killed_discovery_is_noticed_and_taken_back(neighbourhood: Neigh
                 await near.until(lambda graph: "/said" not in graph.topic_types)
 
 
+async def test_a_machine_that_vanished_comes_back_at_other_ports(neighbourhood: Neighbourhood) -> None:
+    """Its master, its discovery and its nodes are others then; of the earlier ones, nothing is left."""
+    from rce.ros.core import Core
+
+    async with neighbourhood.machine(name="near") as near, node("ours", near.uri) as ours:
+        heard = await ours.subscribe("said", STRING)
+        seen = set()
+        for life in ("first", "second"):
+            async with (
+                Core(port=0) as core,
+                node("n", core.uri) as far,
+                _discovery_process(core.uri, neighbourhood.port, "--name", "far") as program,
+            ):
+                publisher = await far.advertise("said", STRING)
+                await near.until(lambda graph, uri=far.uri: graph.publishers("/said") == {"/n": uri})  # type: ignore[misc]
+                await publisher.wait_for_subscribers(timeout=20)
+                publisher.publish(data=life)
+                async with asyncio.timeout(20):
+                    assert (await anext(aiter(heard))).data == life
+                seen |= {master.uri for master in near.discovery.masters if master.name == "far"}
+                program.kill()
+            await near.until(lambda graph: "/n" not in graph.nodes)
+        assert len(seen) == 2
+        assert not any(master.online for master in near.discovery.masters if master.name == "far")
+
+
 @asynccontextmanager
-async def _discovery_process(uri: str, mcast_port: int) -> AsyncIterator[asyncio.subprocess.Process]:
+async def _discovery_process(
+    uri: str, mcast_port: int, *more: str
+) -> AsyncIterator[asyncio.subprocess.Process]:
     program = await asyncio.create_subprocess_exec(
         sys.executable,
         "-c",
         "import typer; from rce.cli.discovery import discovery; typer.run(discovery)",
         *("--master-uri", uri, "--mcast-group", "226.0.0.0@127.0.0.1", "--mcast-port", str(mcast_port)),
-        *("--heartbeat-hz", "10", "--rpc-port", str(free_ports(1)[0])),
+        *("--heartbeat-hz", "10", "--rpc-port", str(free_ports(1)[0]), *more),
         stdout=asyncio.subprocess.DEVNULL,
     )
     try:

@@ -131,8 +131,8 @@ def test_the_quality_of_a_link() -> None:
     for second in range(1, 11):
         if second % 2:
             found.received(HOST, beat(), float(second))
-    ((name, quality),) = found.links(10.0)
-    assert name == "robot"
+    ((name, quality, silence),) = found.links(10.0)
+    assert (name, silence) == ("robot", 1.0)
     assert 40 <= quality <= 60
 
 
