@@ -197,10 +197,10 @@ class Manager:
     async def _adopt_or_prune(self, folder: ContainerFolder) -> None:
         record = folder.read_record()
         process = proc.read(record.pid) if record is not None else None
-        if record is None or process is None or process.start != record.start:
+        runtime = self._runtimes.get(record.runtime, self._runtime) if record is not None else self._runtime
+        if record is None or process is None or process.start != record.start or runtime.is_unborn(record):
             self._tasks.create_task(self._prune(folder), name=f"prune {folder.mark}")
             return
-        runtime = self._runtimes.get(record.runtime, self._runtime)
         if record.group:
             try:
                 self._networks.adopt(EndpointId.parse(record.id), record, folder.hosts)

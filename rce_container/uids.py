@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import pwd
 from pathlib import Path
 
 from rce_container.exceptions import StartError
@@ -11,6 +12,10 @@ from rce_container.exceptions import StartError
 FIRST_UID = 700_000
 UIDS = 10_000
 """The users for containers, unless others are set."""
+
+SUBUIDS = Path("/etc/subuid")
+"""Which users the machine's users may give to user namespaces of theirs: name, first one, count."""
+_COLONS = 2
 
 LOCKS = Path("/run/rce/uids")
 """One lock file for each user that was ever given out, for all engines of the machine."""
@@ -33,6 +38,24 @@ class UidPool:
         self._count = count
         self._folder = folder
         self._next = 0
+
+    def owners(self, subuids: Path = SUBUIDS) -> list[str]:
+        """Who has some of these users already, by the machine's files: names of users."""
+        end = self._first + self._count
+        found = [entry.pw_name for entry in pwd.getpwall() if self._first <= entry.pw_uid < end]
+        try:
+            lines = subuids.read_text().splitlines()
+        except OSError:
+            lines = []
+        for name, first, count in (line.split(":") for line in lines if line.count(":") == _COLONS):
+            if (
+                first.isdigit()
+                and count.isdigit()
+                and int(first) < end
+                and int(first) + int(count) > self._first
+            ):
+                found.append(name)
+        return sorted(set(found))
 
     def take(self) -> tuple[int, int]:
         """Take a user.

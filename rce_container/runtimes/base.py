@@ -1,8 +1,7 @@
 """What a runtime is: the way in which a container's first process is started and all its processes are ended.
 
-Whatever the runtime, a container hangs on a *shim*, a shell in a session of its own that outlives the
-manager. It starts the environment, waits for it, and removes the container's folders after it. After an
-environment that did not end properly it lingers, so that a manager can look at what is left.
+Whatever the runtime, a container hangs on a *shim* (:mod:`rce_container.runtimes.shim`), which outlives the
+manager.
 """
 
 from __future__ import annotations
@@ -13,48 +12,18 @@ import os
 import subprocess
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 import msgspec
 
 from rce_container.environment import proc
-from rce_container.environment.logs import ENVIRONMENT_LOG, segment_path
 from rce_container.environment.messages import Boot, encode
-from rce_container.exceptions import KillError, StartError
+from rce_container.exceptions import KillError
 from rce_container.folder import ContainerFolder, Record
+from rce_container.runtimes.shim import spawn_shim
 
-SHELL = "/bin/sh"
-
-# When all has ended, the shim leaves the container's cgroups BASE/TASK_SET/MARK, each for the one in which
-# the engine is (see rce_container.limits.cgroup2), and removes them: there may be no manager to do it.
-_SHIM = """
-trap : HUP INT TERM
-folder=$1 run=$2 linger=$3 python=$4 sweeper=$5 mark=$6 switch=$7 joined=1 cells=
-shift 7
-[ -z "$switch" ] || exec 9<"$switch"
-while [ "$1" != -- ]; do
-    echo $$ >"$1" || joined=
-    cells="$cells${1%/*}
-"
-    shift
-done
-shift
-[ "$joined" ] && "$@" 9<&- && linger=0
-exec 0</dev/null 1>&2
-[ "$linger" = 0 ] || sleep "$linger"
-[ -z "$sweeper" ] || "$python" -SE "$sweeper" "$mark"
-rm -rf -- "$run" "$folder" 2>/dev/null || { chmod -R u+rwx -- "$folder"; rm -rf -- "$folder"; }
-set -f
-IFS='
-'
-for cell in $cells; do
-    base=${cell%/*/*}
-    echo $$ >"$base/rce-engine/cgroup.procs" || echo $$ >"$base/cgroup.procs"
-    rmdir "$cell" "${cell%/*}"
-done 2>/dev/null
-"""
 _KILL_PAUSE_S = 0.01
 _KILL_TIMEOUT_S = 10.0
 
@@ -203,6 +172,10 @@ class Runtime(ABC):
             StartError: It cannot be started.
         """
 
+    def is_unborn(self, record: Record) -> bool:  # noqa: ARG002
+        """Whether the manager that noted this died before it had noted the environment."""
+        return False
+
     def review(self, packages: Iterable[Path]) -> str:  # noqa: ARG002
         """Say what containers will miss of the package path; empty if nothing."""
         return ""
@@ -252,58 +225,6 @@ class ExecRuntime(Runtime):
         mark = "" if self.isolated else order.folder.mark
         popen, process = spawn_shim(order, argv, env, (order.control, order.links), sweep=not self.isolated)
         return Handle(process, mark, popen)
-
-
-def spawn_shim(
-    order: Order,
-    argv: Sequence[str],
-    env: Mapping[str, str],
-    streams: tuple[int, int],
-    *,
-    sweep: bool = False,
-    keep: Sequence[int] = (),
-) -> tuple[subprocess.Popen[bytes], proc.Process]:
-    """Start a shim: a command is run in the container's cgroups and waited for, and its folders are removed.
-
-    Args:
-        order: The container.
-        argv: The command. If it ends with another code than 0, the folders stay for the grace time.
-        env: Its environment variables.
-        streams: Its standard input and output; standard error is the environment's log.
-        sweep: Whether processes that carry the container's mark may be left, and are to be killed.
-        keep: Descriptors that it inherits.
-
-    Raises:
-        StartError: It cannot be started.
-    """
-    folder = order.folder
-    shim = [SHELL, "-c", _SHIM, "rce-container-shim", str(folder.path), str(folder.run)]
-    shim += [
-        f"{order.boot.grace:g}",
-        sys.executable,
-        proc.__file__ if sweep else "",
-        folder.mark,
-        order.switch,
-    ]
-    shim += [*order.join, "--", *argv]
-    stdin, stdout = streams
-    try:
-        with segment_path(folder.logs, ENVIRONMENT_LOG, 0).open("ab") as log:
-            popen = subprocess.Popen(  # noqa: S603
-                shim,
-                stdin=stdin,
-                stdout=stdout,
-                stderr=log,
-                env=env,
-                pass_fds=keep,
-                start_new_session=True,
-            )
-    except OSError as error:
-        raise StartError(f"cannot start {SHELL}: {error}") from error
-    process = proc.read(popen.pid)
-    if process is None:
-        raise StartError(f"{SHELL} ended at once with code {popen.wait()}")
-    return popen, process
 
 
 def encode_boot(boot: Boot, home: str, logs: str) -> str:

@@ -15,7 +15,8 @@ from rce_container.environment.logs import ENVIRONMENT_LOG, segment_path
 from rce_container.exceptions import StartError
 from rce_container.nursery.keeper import Nursery, hear_credentials
 from rce_container.nursery.messages import FAREWELL, Birth, Gifts
-from rce_container.runtimes.base import SHELL, Handle, Order, Prepare, spawn_shim
+from rce_container.runtimes.base import Handle, Order, Prepare
+from rce_container.runtimes.shim import SHELL, spawn_shim
 
 HOLDER = (SHELL, "-c", f'echo && read -r word && [ "$word" = {FAREWELL.decode().strip()} ]')
 """Says that the namespaces and mounts are there, then waits for the environment's farewell."""

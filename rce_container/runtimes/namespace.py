@@ -23,7 +23,7 @@ from pathlib import Path
 from rce_container.environment.logs import ENVIRONMENT_LOG, segment_path
 from rce_container.environment.messages import Boot
 from rce_container.exceptions import ContainerError, RuntimeUnavailableError, StartError
-from rce_container.folder import ContainerFolder
+from rce_container.folder import ContainerFolder, Record
 from rce_container.network.hosts import hostname, hosts_text
 from rce_container.nursery.confine import USER_ID
 from rce_container.nursery.keeper import Nursery
@@ -82,7 +82,9 @@ class NamespaceRuntime(Runtime):
         self.require()
         _compile()
         self._nursery.close()
-        self._nursery = Nursery(self._filter(), clean_environ(HOME))
+        program, missing = _make_filter()
+        self.detail = "; ".join(filter(None, (missing, self._claimed())))
+        self._nursery = Nursery(program, clean_environ(HOME))
         failures: list[Exception] = []
         trying = threading.Thread(target=self._try, args=(failures,))  # there may be a loop in this one
         trying.start()
@@ -106,12 +108,23 @@ class NamespaceRuntime(Runtime):
         """The same in every container."""
         return BUNDLES
 
+    def is_unborn(self, record: Record) -> bool:
+        """An environment is noted when the nursery has answered."""
+        return not record.environment
+
     def review(self, packages: Iterable[Path]) -> str:
         """As root, containers are users to whom a private folder is closed."""
         closed = [str(path) for path in packages if self._root and _is_closed(path)]
         if not closed:
             return ""
         return f"containers cannot read {', '.join(closed)}: make it readable by everybody (chmod -R o+rX)"
+
+    def _claimed(self) -> str:
+        """Say whose the containers' users are; empty if nobody's."""
+        owners = self._uids.owners() if self._root else []
+        if not owners:
+            return ""
+        return f"users for containers belong to {', '.join(owners)} too: choose others by --first-uid"
 
     def close(self) -> None:
         """End the nursery; the containers live on."""
@@ -139,13 +152,6 @@ class NamespaceRuntime(Runtime):
         finally:
             if lock >= 0:
                 os.close(lock)
-
-    def _filter(self) -> bytes:
-        try:
-            return make_filter()
-        except FilterUnavailableError as error:
-            self.detail = f"system calls of containers are not filtered: {error}"
-            return b""
 
     def _try(self, failures: list[Exception]) -> None:
         try:
@@ -198,6 +204,14 @@ class NamespaceRuntime(Runtime):
             *("--chdir", "/"),
         ]
         return [self._bwrap, *options, "--", *HOLDER]
+
+
+def _make_filter() -> tuple[bytes, str]:
+    """Make the filter of system calls; returns it, or what to say if there is none."""
+    try:
+        return make_filter(), ""
+    except FilterUnavailableError as error:
+        return b"", f"system calls of containers are not filtered: {error}"
 
 
 def interpreter_paths() -> list[Path]:

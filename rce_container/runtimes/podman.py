@@ -23,7 +23,7 @@ from pathlib import Path
 from rce_container.exceptions import RuntimeUnavailableError, StartError
 from rce_container.network.hosts import hostname
 from rce_container.nursery.mounts import HOME, LOGS
-from rce_container.runtimes.base import SHELL, Order
+from rce_container.runtimes.base import Order
 from rce_container.runtimes.held import HOLDER, HeldHandle
 from rce_container.runtimes.namespace import (
     BUNDLES,
@@ -32,6 +32,7 @@ from rce_container.runtimes.namespace import (
     interpreter_paths,
     outermost,
 )
+from rce_container.runtimes.shim import SHELL
 from rce_container.uids import UidPool
 
 _IMAGE = re.compile(

@@ -50,3 +50,11 @@ def test_a_folder_that_cannot_be_used_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(StartError, match="cannot give out users by locks in"):
         UidPool(5000, 1, tmp_path / "file" / "locks").take()
+
+
+def test_users_that_are_somebodys_are_told(tmp_path: Path) -> None:
+    file = tmp_path / "subuid"
+    file.write_text("one:100000:65536\ntwo:4990:11\nthree:5003:5\nnot a line\nfour:x:1\n")
+    assert UidPool(5000, 3, tmp_path).owners(file) == ["two"]
+    assert UidPool(0, 1, tmp_path).owners(file) == ["root"]
+    assert UidPool(4_000_000, 10, tmp_path).owners(tmp_path / "none") == []
