@@ -1,4 +1,4 @@
-"""``rce ps`` and ``rce top``: what is there and what it consumes."""
+"""``rce ps``: what is there."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console, Group
-from rich.live import Live
 from rich.table import Table
 
 from rce_master.cli import credentials
@@ -24,8 +23,14 @@ _COLOURS = {
     "placed": "yellow",
     "requested": "yellow",
     "stopping": "yellow",
+    "waiting": "yellow",
+    "draining": "yellow",
+    "degraded": "yellow",
+    "stopped": "yellow",
+    "stuck": "red",
     "failed": "red",
     "lost": "red",
+    "away": "red",
 }
 
 Everything = dict[str, list[dict[str, Any]]]
@@ -40,30 +45,11 @@ def ps(
 
 async def _ps(as_json: bool) -> None:
     async with ApiClient.of(credentials.load()) as client:
-        found = await fetch(client, "robots", "containers", "nodes", "connections")
+        found = await fetch(client, "robots", "containers", "nodes", "connections", "machines")
     if as_json:
         typer.echo(json.dumps(found, indent=2))
     else:
         Console().print(_overview(found))
-
-
-def top(
-    interval: Annotated[float, typer.Option(help="Seconds between two looks.", min=0.2)] = 1.0,
-) -> None:
-    """Show live what robots, containers and task sets consume; ends with Ctrl-C."""
-    run(_top(interval))
-
-
-async def _top(interval: float) -> None:
-    before: Everything = {}
-    names = ("machines", "containers", "robots", "interfaces")
-    async with ApiClient.of(credentials.load()) as client:
-        with Live(console=Console(), screen=True, auto_refresh=False) as live:
-            while True:
-                now = await fetch(client, *names)
-                live.update(consumption(now, before, interval), refresh=True)
-                before = now
-                await asyncio.sleep(interval)
 
 
 async def fetch(client: ApiClient, *names: str) -> Everything:
@@ -85,16 +71,16 @@ async def _fetch(client: ApiClient, name: str) -> list[dict[str, Any]]:
 def _overview(found: Everything) -> Group:
     robots = Table("robot", "state", "at", "interfaces", box=None)
     for robot in found["robots"]:
-        robots.add_row(robot["id"], _state(robot["state"]), robot["task_set"], str(robot["interfaces"]))
+        robots.add_row(robot["id"], coloured(robot["state"]), robot["task_set"], str(robot["interfaces"]))
     containers = Table("container / node", "state", "at", "detail", box=None)
     for container in found["containers"]:
         containers.add_row(
-            container["id"], _state(container["state"]), container["machine"], container["detail"]
+            container["id"], coloured(container["state"]), _place(container, found), container["detail"]
         )
         for node in found["nodes"]:
             if (node["user"], node["container"]) == (container["user"], container["tag"]):
                 what = f"{node['pkg']}/{node['exe']}"
-                containers.add_row(f"  {node['tag']}", _state(node["state"]), what, node["detail"])
+                containers.add_row(f"  {node['tag']}", coloured(node["state"]), what, node["detail"])
     connections = Table("connection", "", "established", box=None)
     for connection in found["connections"]:
         done = "[green]yes[/]" if connection["established"] else "[yellow]no[/]"
@@ -102,57 +88,15 @@ def _overview(found: Everything) -> Group:
     return Group(robots, "", containers, "", connections)
 
 
-def consumption(now: Everything, before: Everything, interval: float) -> Group:
-    """Lay out what is consumed; rates are differences between two looks."""
-    machines = Table("task set", "kind", "machine", "load", "cpu", "memory", box=None)
-    for machine in now["machines"]:
-        old = _same(before.get("machines", []), machine, "process")
-        machines.add_row(
-            machine["process"] if machine["connected"] else f"[red]{machine['process']} (away)[/]",
-            machine["kind"],
-            machine["machine"],
-            str(machine["endpoints"]),
-            _percent(machine, old, interval),
-            _mebibytes(machine["memory_used"]),
-        )
-    containers = Table("container", "state", "nodes", "cpu", "memory", box=None)
-    for container in now["containers"]:
-        old = _same(before.get("containers", []), container, "id")
-        containers.add_row(
-            container["id"],
-            _state(container["state"]),
-            str(container["nodes"]),
-            _percent(container, old, interval),
-            _mebibytes(container["memory"]),
-        )
-    interfaces = Table("interface", "active", "in/s", "out/s", "dropped", box=None)
-    for interface in now["interfaces"]:
-        old = _same(before.get("interfaces", []), interface, "user", "endpoint", "tag")
-        interfaces.add_row(
-            f"{interface['user']}/{interface['endpoint']}/{interface['tag']}",
-            "[green]yes[/]" if interface["active"] else "[yellow]no[/]",
-            _rate(interface, old, "messages_in", interval),
-            _rate(interface, old, "messages_out", interval),
-            str(interface["dropped"]),
-        )
-    return Group(machines, "", containers, "", interfaces)
+def _place(container: dict[str, Any], found: Everything) -> str:
+    """Where a container is, and where to it goes if its machine is being emptied."""
+    place = str(container["machine"])
+    draining = {machine["process"] for machine in found["machines"] if machine["draining"]}
+    if container["moving_to"]:
+        return f"{place} -> {container['moving_to']}"
+    return f"{place} (draining)" if container["task_set"] in draining else place
 
 
-def _same(items: list[dict[str, Any]], item: dict[str, Any], *keys: str) -> dict[str, Any] | None:
-    return next((other for other in items if all(other[key] == item[key] for key in keys)), None)
-
-
-def _rate(now: dict[str, Any], old: dict[str, Any] | None, key: str, interval: float) -> str:
-    return "" if old is None else f"{max(0.0, (now[key] - old[key]) / interval):.1f}"
-
-
-def _percent(now: dict[str, Any], old: dict[str, Any] | None, interval: float) -> str:
-    return "" if old is None else f"{max(0.0, 100 * (now['cpu_s'] - old['cpu_s']) / interval):.0f} %"
-
-
-def _mebibytes(count: int) -> str:
-    return f"{count / 2**20:.0f} MiB"
-
-
-def _state(state: str) -> str:
+def coloured(state: str) -> str:
+    """Write a state in the colour of how well it is."""
     return f"[{_COLOURS.get(state, 'default')}]{state}[/]"

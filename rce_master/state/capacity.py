@@ -32,7 +32,7 @@ def room_at(tables: Tables, task_set: TaskSet) -> Room:
     room = Room(
         process=task_set.process,
         machine=task_set.machine,
-        name=_name(tables, task_set),
+        alias=_alias(tables, task_set),
         draining=is_draining(tables, task_set),
     )
     for container in (*placed, *coming):
@@ -41,12 +41,12 @@ def room_at(tables: Tables, task_set: TaskSet) -> Room:
     return room
 
 
-def _name(tables: Tables, task_set: TaskSet) -> str:
-    """What people call a machine: its name, or its process where several are on one machine."""
+def _alias(tables: Tables, task_set: TaskSet) -> str:
+    """Tell one task set from others on the same machine: by its process."""
     namesakes = sum(
         s.machine.name == task_set.machine.name and s.kind is TaskSetKind.CONTAINER for s in tables.task_sets
     )
-    return task_set.machine.name if namesakes == 1 else task_set.process
+    return task_set.process if namesakes > 1 else ""
 
 
 def rooms(tables: Tables, *, away: bool = False) -> dict[str, Room]:

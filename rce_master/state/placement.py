@@ -50,13 +50,18 @@ class Room:
     process: str
     """Of its task set."""
     machine: MachineInfo
-    name: str = ""
-    """What people call it; the machine's name if empty."""
+    alias: str = ""
+    """What people call it, if that is not the machine's name."""
     draining: bool = False
     slots: int = 0
     cpu: float = 0.0
     memory: int = 0
     containers: int = 0
+
+    @property
+    def name(self) -> str:
+        """What people call it."""
+        return self.alias or self.machine.name
 
     def need(self, wish: Resources) -> Need:
         """Tell what a container takes here."""
@@ -128,7 +133,7 @@ class Room:
     def why_not(self, wish: Resources) -> str:
         """Say why it does not take a container now; empty if it does."""
         reasons = self.obstacles(wish) or self.shortages(wish)
-        return f"{self.name or self.machine.name} {' and '.join(reasons)}" if reasons else ""
+        return f"{self.name} {' and '.join(reasons)}" if reasons else ""
 
     @property
     def shares(self) -> dict[str, float]:

@@ -1,0 +1,155 @@
+"""``rce machines``, ``rce drain``, ``rce resize``: what containers can run on, and who gets how much."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from rce.protocol.quantities import about, write_cores
+from rce_master.cli import credentials
+from rce_master.cli.client import ApiClient, run
+from rce_master.cli.exceptions import CliError
+
+POLL_S = 0.5
+
+Machine = dict[str, Any]
+
+
+def machines(
+    json_: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
+) -> None:
+    """Show the machines and what is promised of them; administrators only."""
+    run(_machines(json_))
+
+
+async def _machines(as_json: bool) -> None:
+    async with ApiClient.of(credentials.load()) as client:
+        found = (await client.call("GET", "/machines"))["machines"]
+    if as_json:
+        typer.echo(json.dumps(found, indent=2))
+        return
+    console = Console()
+    console.print(overview(found))
+    for machine in found:
+        if machine["detail"]:
+            console.print(f"{machine['process']}: {machine['detail']}", markup=False, highlight=False)
+        _print_staying(machine)
+
+
+def overview(found: list[Machine]) -> Table:
+    """Lay out machines."""
+    names = ("task set", "machine", "state", "containers", "slots", "cores", "memory")
+    table = Table(*names, "limits", "runtime", "labels", box=None)
+    for machine in sorted(found, key=lambda m: (m["kind"], m["machine"], m["process"])):
+        if machine["kind"] == "container":
+            table.add_row(
+                machine["process"],
+                machine["machine"],
+                _state(machine),
+                str(machine["endpoints"]),
+                _of(machine["promised_slots"], machine["slots"]),
+                f"{write_cores(machine['promised_cores'])} of {machine['cores']}",
+                f"{about(machine['promised_memory'])} of {about(machine['memory'])}",
+                machine["limits"],
+                machine["runtime"],
+                " ".join(machine["labels"]),
+            )
+        else:
+            robots = f"{machine['endpoints']} robots"
+            table.add_row(machine["process"], machine["machine"], _state(machine), robots, *[""] * 6)
+    return table
+
+
+def _of(promised: int, there: int) -> str:
+    return f"{promised} of {there}" if there else str(promised)
+
+
+def _state(machine: Machine) -> str:
+    if not machine["connected"]:
+        return "[red]away[/]"
+    return "[yellow]draining[/]" if machine["draining"] else "[green]connected[/]"
+
+
+def _print_staying(machine: Machine) -> None:
+    for item in machine["staying"]:
+        typer.echo(f"  {item['container']} is still at {machine['process']}: {item['why']}")
+
+
+def drain(
+    machine: Annotated[str, typer.Argument(help="Name of the machine, or of its container task set.")],
+    undo: Annotated[bool, typer.Option("--undo", help="Let it take containers again.")] = False,
+    wait: Annotated[
+        bool, typer.Option("--wait", help="Go on until all its containers are elsewhere.")
+    ] = False,
+) -> None:
+    """Give a machine no new containers, and hand over those that it has; administrators only.
+
+    Each container is started elsewhere first and then dropped here. What finds no room elsewhere stays, and
+    goes as soon as there is room.
+    """
+    run(_undrain(machine) if undo else _drain(machine, wait=wait))
+
+
+async def _undrain(machine: str) -> None:
+    async with ApiClient.of(credentials.load()) as client:
+        await client.call("DELETE", f"/machines/{machine}/drain")
+    typer.echo(f"{machine} takes containers again")
+
+
+async def _drain(machine: str, *, wait: bool) -> None:
+    async with ApiClient.of(credentials.load()) as client:
+        found = (await client.call("PUT", f"/machines/{machine}/drain"))["machines"]
+        typer.echo(f"{machine} takes no new containers")
+        said: dict[str, str] = {}
+        while True:
+            _tell_changes(found, said)
+            if not said or not wait:
+                return
+            await asyncio.sleep(POLL_S)
+            everything = (await client.call("GET", "/machines"))["machines"]
+            found = [one for one in everything if machine in (one["process"], one["machine"])]
+            if not any(one["draining"] for one in found):
+                raise CliError(f"{machine} is not drained any more")
+
+
+def _tell_changes(found: list[Machine], said: dict[str, str]) -> None:
+    staying = {item["container"]: item["why"] for machine in found for item in machine["staying"]}
+    for container in [container for container in said if container not in staying]:
+        del said[container]
+        typer.echo(f"{container}: is elsewhere now")
+    for container, why in staying.items():
+        if said.get(container) != why:
+            typer.echo(f"{container}: {why}")
+            said[container] = why
+    if not staying:
+        typer.echo("it is empty")
+
+
+def resize(
+    container: Annotated[str, typer.Argument(help="The container's tag.")],
+    cpu: Annotated[str | None, typer.Option(help="Cores: 0.5 or 50%; 0: no wish.")] = None,
+    memory: Annotated[str | None, typer.Option(help="256 (MB), 256M, 1G; 0: no wish.")] = None,
+    size: Annotated[int | None, typer.Option(help="Slots.", min=1)] = None,
+    bandwidth: Annotated[
+        str | None, typer.Option(help="Of its links: 5M (bytes per second), 10Mbit; 0: no wish.")
+    ] = None,
+    user: Annotated[str, typer.Option(help="Whose container; administrators only.")] = "",
+) -> None:
+    """Change what a container may use, while it runs."""
+    wishes: dict[str, Any] = {"cpu": cpu, "memory": memory, "size": size, "bandwidth": bandwidth}
+    body = {key: value for key, value in wishes.items() if value is not None}
+    if not body:
+        raise typer.BadParameter("give one or more of --cpu, --memory, --size, --bandwidth")
+    run(_resize(container, body, user))
+
+
+async def _resize(container: str, body: dict[str, Any], user: str) -> None:
+    query: dict[str, str | int] = {"user": user} if user else {}
+    async with ApiClient.of(credentials.load()) as client:
+        await client.call("PATCH", f"/containers/{container}", body, query)
+    typer.echo(f"resized {container}: {', '.join(f'{key} {value}' for key, value in body.items())}")

@@ -1,0 +1,209 @@
+"""``rce top``: what machines, containers and nodes consume, live, and what could be better."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from enum import Enum
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.markup import escape
+from rich.table import Table
+
+from rce.protocol.quantities import about
+from rce_master.cli import credentials
+from rce_master.cli.client import ApiClient, run
+from rce_master.cli.show import coloured, fetch
+
+_PIPED_WIDTH = 200
+_FULL, _BUSY = 0.9, 0.75
+
+Usage = dict[str, Any]
+
+
+class Order(Enum):
+    """What containers are sorted by; the most first."""
+
+    CPU = "cpu"
+    MEMORY = "memory"
+    IO = "io"
+    LINK = "link"
+    RESTARTS = "restarts"
+    NAME = "name"
+
+
+def top(
+    interval: Annotated[float, typer.Option(help="Seconds between two looks.", min=0.2)] = 2.0,
+    sort: Annotated[Order, typer.Option(help="What to sort by.")] = Order.CPU,
+    nodes: Annotated[bool, typer.Option("--nodes", help="Show the nodes of each container.")] = False,
+    interfaces: Annotated[bool, typer.Option("--interfaces", help="Show messages of interfaces.")] = False,
+    once: Annotated[bool, typer.Option("--once", help="Print it once; so does a pipe.")] = False,
+) -> None:
+    """Show live what machines and containers consume, and what could be better; ends with Ctrl-C."""
+    once = once or not sys.stdout.isatty()
+    run(_top(interval, Look(sort, nodes=nodes, interfaces=interfaces), once=once))
+
+
+class Look:
+    """How it is laid out, and what was seen before."""
+
+    def __init__(self, sort: Order, *, nodes: bool = False, interfaces: bool = False, user: str = "") -> None:
+        self.sort = sort
+        self.nodes = nodes
+        self.interfaces = interfaces
+        self.user = user
+        """Who looks; commands for containers of others name their user."""
+        self._before: list[Usage] = []
+
+    async def take(self, client: ApiClient, interval: float) -> RenderableType:
+        """Look once.
+
+        Args:
+            client: Asks the master.
+            interval: Seconds since the last look.
+        """
+        usage = await client.call("GET", "/usage")
+        parts: list[RenderableType] = [layout(usage, self)]
+        if self.interfaces:
+            now = (await fetch(client, "interfaces"))["interfaces"]
+            parts += ["", _interfaces(now, self._before, interval)]
+            self._before = now
+        return Group(*parts)
+
+
+async def _top(interval: float, look: Look, *, once: bool) -> None:
+    login = credentials.load()
+    look.user = login.user
+    async with ApiClient.of(login) as client:
+        if once:
+            wide = None if sys.stdout.isatty() else _PIPED_WIDTH
+            Console(width=wide).print(await look.take(client, interval))
+            return
+        with Live(console=Console(), screen=True, auto_refresh=False) as live:
+            while True:
+                live.update(await look.take(client, interval), refresh=True)
+                await asyncio.sleep(interval)
+
+
+def layout(usage: Usage, look: Look) -> Group:
+    """Lay out what ``GET /usage`` gave."""
+    parts: list[RenderableType] = []
+    if usage["machines"]:
+        parts += [_machines(usage["machines"]), ""]
+    parts.append(_containers(usage["containers"], look))
+    advice = [*_advice(usage["machines"], "process"), *_container_advice(usage["containers"], look.user)]
+    if advice:
+        parts += ["", *advice]
+    return Group(*parts)
+
+
+def _machines(machines: list[Usage]) -> Table:
+    table = Table(
+        "machine", "state", "containers", "slots", "cpu", "promised", "memory", "promised", box=None
+    )
+    for machine in sorted(machines, key=lambda m: (m["machine"], m["process"])):
+        state = "draining" if machine["draining"] else "connected"
+        table.add_row(
+            f"{machine['machine']} ({machine['process']})",
+            coloured(state if machine["connected"] else "away"),
+            str(machine["containers"]),
+            f"{machine['promised_slots']} of {machine['slots']}" if machine["slots"] else "",
+            f"{100 * machine['cpu']:.0f} %",
+            _share(machine["promised_cores"], machine["cores"]),
+            about(machine["memory_used"]),
+            _share(machine["promised_memory"], machine["memory"]),
+        )
+    return table
+
+
+def _containers(containers: list[Usage], look: Look) -> Table:
+    names = ("container", "state", "at", "cpu", "of", "memory", "of", "disk in", "out", "link in", "out")
+    table = Table(*names, "procs", "restarts", "oom", box=None)
+    for container in sorted(containers, key=lambda c: _rank(c, look.sort)):
+        table.add_row(
+            escape(container["id"]),
+            coloured(container["state"]),
+            container["machine"],
+            f"{100 * container['cpu']:.0f} %",
+            _share(container["cpu"], container["cpu_limit"]),
+            about(container["memory"]),
+            _share(container["memory"], container["memory_limit"]),
+            *(
+                _rate(container[key])
+                for key in ("io_read_rate", "io_written_rate", "link_in_rate", "link_out_rate")
+            ),
+            str(container["processes"]),
+            _count(container["restarts"]),
+            _count(container["oom_kills"]),
+        )
+        for node in container["nodes"] if look.nodes else ():
+            cells = [f"  {node['tag']}", coloured(node["state"]), "", f"{100 * node['cpu']:.0f} %", ""]
+            cells += [about(node["memory"]), *[""] * 5, str(node["processes"]), _count(node["restarts"])]
+            table.add_row(*cells)
+    return table
+
+
+def _rank(container: Usage, order: Order) -> tuple[float, str]:
+    amounts: dict[Order, float] = {
+        Order.CPU: container["cpu"],
+        Order.MEMORY: container["memory"],
+        Order.IO: container["io_read_rate"] + container["io_written_rate"],
+        Order.LINK: container["link_in_rate"] + container["link_out_rate"],
+        Order.RESTARTS: container["restarts"] + container["oom_kills"],
+        Order.NAME: 0.0,
+    }
+    return -amounts[order], container["id"]
+
+
+def _container_advice(containers: list[Usage], user: str) -> list[str]:
+    lines = []
+    for container in containers:
+        of = "" if container["user"] == user or not user else f" --user {container['user']}"
+        lines += _advice([container], "id", of)
+    return lines
+
+
+def _advice(items: list[Usage], key: str, more: str = "") -> list[str]:
+    lines = []
+    for item in items:
+        for one in item["advice"]:
+            lines.append(f"[yellow]{escape(item[key])}[/] {one['about']}: {escape(one['text'])}")
+            lines.append(f"  [bold]{escape(one['command'])}{more}[/]")
+    return lines
+
+
+def _interfaces(now: list[Usage], before: list[Usage], interval: float) -> Table:
+    old = {(i["user"], i["endpoint"], i["tag"]): i for i in before}
+    table = Table("interface", "active", "in/s", "out/s", "dropped", box=None)
+    for interface in now:
+        last = old.get((interface["user"], interface["endpoint"], interface["tag"]))
+        rates = [
+            "" if last is None else f"{max(0.0, (interface[key] - last[key]) / interval):.1f}"
+            for key in ("messages_in", "messages_out")
+        ]
+        table.add_row(
+            f"{interface['user']}/{interface['endpoint']}/{interface['tag']}",
+            "[green]yes[/]" if interface["active"] else "[yellow]no[/]",
+            *rates,
+            str(interface["dropped"]),
+        )
+    return table
+
+
+def _share(used: float, there: float) -> str:
+    if not there:
+        return ""
+    share = used / there
+    colour = "red" if share > _FULL else "yellow" if share > _BUSY else "default"
+    return f"[{colour}]{share:.0%}[/]"
+
+
+def _rate(count: float) -> str:
+    return f"{about(count)}/s" if count else ""
+
+
+def _count(number: int) -> str:
+    return f"[red]{number}[/]" if number else ""
