@@ -7,13 +7,13 @@ import json
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from rce.protocol.quantities import about, write_cores
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
 from rce_master.cli.exceptions import CliError
+from rce_master.cli.show import console
 
 POLL_S = 0.5
 
@@ -33,11 +33,11 @@ async def _machines(as_json: bool) -> None:
     if as_json:
         typer.echo(json.dumps(found, indent=2))
         return
-    console = Console()
-    console.print(overview(found))
+    screen = console()
+    screen.print(overview(found))
     for machine in found:
         if machine["detail"]:
-            console.print(f"{machine['process']}: {machine['detail']}", markup=False, highlight=False)
+            screen.print(f"{machine['process']}: {machine['detail']}", markup=False, highlight=False)
         _print_staying(machine)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import sys
 from typing import Annotated, Any
 
 import typer
@@ -35,6 +36,13 @@ _COLOURS = {
 
 Everything = dict[str, list[dict[str, Any]]]
 
+_PIPED_WIDTH = 200
+
+
+def console() -> Console:
+    """Make a console that does not squeeze tables where nobody looks at them on a screen."""
+    return Console(width=None if sys.stdout.isatty() else _PIPED_WIDTH)
+
 
 def ps(
     json_: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
@@ -49,7 +57,7 @@ async def _ps(as_json: bool) -> None:
     if as_json:
         typer.echo(json.dumps(found, indent=2))
     else:
-        Console().print(_overview(found))
+        console().print(_overview(found))
 
 
 async def fetch(client: ApiClient, *names: str) -> Everything:

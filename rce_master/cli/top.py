@@ -8,7 +8,7 @@ from enum import Enum
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console, Group, RenderableType
+from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
@@ -16,9 +16,8 @@ from rich.table import Table
 from rce.protocol.quantities import about
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
-from rce_master.cli.show import coloured, fetch
+from rce_master.cli.show import coloured, console, fetch
 
-_PIPED_WIDTH = 200
 _FULL, _BUSY = 0.9, 0.75
 
 Usage = dict[str, Any]
@@ -79,10 +78,9 @@ async def _top(interval: float, look: Look, *, once: bool) -> None:
     look.user = login.user
     async with ApiClient.of(login) as client:
         if once:
-            wide = None if sys.stdout.isatty() else _PIPED_WIDTH
-            Console(width=wide).print(await look.take(client, interval))
+            console().print(await look.take(client, interval))
             return
-        with Live(console=Console(), screen=True, auto_refresh=False) as live:
+        with Live(console=console(), screen=True, auto_refresh=False) as live:
             while True:
                 live.update(await look.take(client, interval), refresh=True)
                 await asyncio.sleep(interval)

@@ -39,6 +39,7 @@ class TaskSet:
     def __init__(self, master: RunningMaster, kind: TaskSetKind, process: str, **hello: Any) -> None:
         self.kind = kind
         self.process = process
+        self.machine = hello.pop("machine", MachineInfo(name="machine", cores=2))
         self.fields = hello
         self.endpoints: tuple[EndpointStatus, ...] = ()
         self.inbox: asyncio.Queue[ToTaskSet] = asyncio.Queue()
@@ -52,7 +53,7 @@ class TaskSet:
             version=CONTROL_VERSION,
             kind=self.kind,
             process=self.process,
-            machine=MachineInfo(name="machine", cores=2),
+            machine=self.machine,
             endpoints=self.endpoints,
             **self.fields,
         )
@@ -126,8 +127,8 @@ class Site:
     def robots(self, process: str = "r1") -> AbstractAsyncContextManager[TaskSet]:
         return self.task_set(TaskSetKind.ROBOT, process, url=f"ws://{process}:9010/")
 
-    def containers(self, process: str = "c1") -> AbstractAsyncContextManager[TaskSet]:
-        return self.task_set(TaskSetKind.CONTAINER, process)
+    def containers(self, process: str = "c1", **fields: Any) -> AbstractAsyncContextManager[TaskSet]:
+        return self.task_set(TaskSetKind.CONTAINER, process, **fields)
 
 
 @asynccontextmanager

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 from rich.console import Console
 
-from rce.control.messages import Put, Usage
-from rce.control.model import EndpointUsage
+from rce.control.messages import Put
 from rce_master.cli import follow, show
 from rce_master.cli.client import ApiClient
 from rce_master.cli.credentials import FILE_VARIABLE, Credentials, load, save
@@ -49,25 +48,18 @@ async def test_events_go_on_where_they_were(site: Site) -> None:
     assert kinds == ["user_added", "container_requested", "container_destroyed"]
 
 
-async def test_top_and_ps_show_what_there_is(site: Site) -> None:
+async def test_ps_shows_what_there_is(site: Site) -> None:
     async with site.containers() as containers, ApiClient(site.url, site.token) as client:
         await client.call("POST", "/containers", {"tag": "c"})
         await client.call("POST", "/containers/c/nodes", {"tag": "n", "pkg": "Test", "exe": "x.py"})
         await containers.get(Put)
-        names = ("machines", "containers", "robots", "interfaces", "nodes", "connections")
-        before = await show.fetch(client, *names)
-        usage = {"testUser/c": EndpointUsage(cpu_s=0.5, memory=5 << 20)}
-        containers.channel.send(Usage(cpu_s=1.0, memory=7 << 20, endpoints=usage))
-        now = await show.fetch(client, *names)
-        while not now["machines"][0]["memory_used"]:
-            now = await show.fetch(client, *names)
-    text = printed(show.consumption(now, before, interval=1.0))
-    assert "50 %" in text
-    assert "100 %" in text
-    assert "5 MiB" in text
-    text = printed(show._overview(now))
-    assert "testUser/c" in text
-    assert "Test/x.py" in text
+        names = ("machines", "containers", "robots", "nodes", "connections")
+        text = printed(show._overview(await show.fetch(client, *names)))
+        assert "testUser/c" in text
+        assert "Test/x.py" in text
+        assert "draining" not in text
+        await client.call("PUT", "/machines/c1/drain")
+        assert "machine (draining)" in printed(show._overview(await show.fetch(client, *names)))
 
 
 async def test_logs_are_printed_whole(
