@@ -198,8 +198,9 @@ class Graph:
 
     def _tell_subscribers(self, topic: str, outcome: Outcome) -> None:
         publishers = list(self._registrations.of(Kind.PUBLISHER, topic).values())
+        arguments = (topic, publishers)  # one object for all: it is written once
         for uri in self._registrations.of(Kind.SUBSCRIBER, topic).values():
-            outcome.calls.append(Call(uri, "publisherUpdate", (topic, publishers)))
+            outcome.calls.append(Call(uri, "publisherUpdate", arguments))
 
     def _tell_of_parameter(self, name: str, besides: str = "") -> Outcome:
         outcome = Outcome.empty()

@@ -10,12 +10,16 @@ from rce.ros.core.events import Call
 from rce.ros.errors import RpcUnreachable, XmlRpcError
 from rce.ros.tasks import TaskScope
 from rce.ros.xmlrpc import RpcClient
+from rce.ros.xmlrpc.codec import encode_call
 from rce.ros.xmlrpc.dispatch import ERROR
 
 _log = logging.getLogger(__name__)
 
 CALL_TIMEOUT = 5.0
 """Seconds that a node may take to answer one call."""
+
+MAX_DOCUMENTS = 32
+"""How many of the newest calls are kept as they are written."""
 
 CALLER = "/master"
 """The name under which a core calls nodes."""
@@ -42,6 +46,7 @@ class Notifier:
         self._on_unwanted = on_unwanted
         self._tasks = tasks
         self._waiting: dict[str, dict[object, Call]] = {}
+        self._documents: dict[tuple[str, int], tuple[tuple[Any, ...], bytes]] = {}
 
     def submit(self, call: Call) -> None:
         """Queue a call; returns at once."""
@@ -60,10 +65,26 @@ class Notifier:
         finally:
             del self._waiting[uri]
 
+    def _written(self, call: Call) -> bytes:
+        """Return a call's document, made once for all nodes that are told the same.
+
+        Raises:
+            MalformedDocument: An argument has no XML-RPC form.
+        """
+        key = (call.method, id(call.arguments))
+        known = self._documents.get(key)
+        if known is not None:  # what is in here keeps its arguments, so their id is theirs alone
+            return known[1]
+        document = encode_call(call.method, (CALLER, *call.arguments))
+        if len(self._documents) >= MAX_DOCUMENTS:
+            del self._documents[next(iter(self._documents))]
+        self._documents[key] = call.arguments, document
+        return document
+
     async def _call(self, call: Call, queue: dict[object, Call]) -> None:
         try:
-            arguments = (CALLER, *call.arguments)
-            answer = await self._client.call(call.uri, call.method, arguments, timeout=CALL_TIMEOUT)
+            document = self._written(call)
+            answer = await self._client.send(call.uri, call.method, document, timeout=CALL_TIMEOUT)
         except RpcUnreachable as error:
             _log.info("%s is not delivered: %s", call.method, error)
             queue.clear()  # nobody is there; who takes the address over registers and learns the state anew

@@ -70,7 +70,22 @@ class RpcClient:
             RemoteFault: The server answered with a fault.
             MalformedDocument: An argument cannot be sent or the answer cannot be read.
         """
-        document = encode_call(method, arguments)
+        return await self.send(uri, method, encode_call(method, arguments), timeout=timeout)
+
+    async def send(self, uri: str, method: str, document: bytes, *, timeout: float = DEFAULT_TIMEOUT) -> Any:
+        """Make a call that was written already, as :meth:`call` does.
+
+        Args:
+            uri: ``http://host:port/``.
+            method: The method's name, for errors.
+            document: The call, by :func:`~rce.ros.xmlrpc.codec.encode_call`.
+            timeout: Seconds for all of it.
+
+        Raises:
+            RpcUnreachable: No answer came, for whatever reason.
+            RemoteFault: The server answered with a fault.
+            MalformedDocument: The answer cannot be read.
+        """
         try:
             async with asyncio.timeout(timeout):
                 answer = await self._exchange(uri, document)
