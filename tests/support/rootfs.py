@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import re
 import shutil
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 _LIBRARY = re.compile(r"(/\S+)(?= \(0x)")
@@ -19,6 +21,18 @@ _STDLIB_LEFT_OUT = (
     "__pycache__",
     "config-*",
 )
+
+
+@contextlib.contextmanager
+def image_of(rootfs: Path) -> Iterator[str]:
+    """Have a root file system as an image in podman's store; gives its name."""
+    name = f"localhost/rce-test-{os.getpid()}-{rootfs.parent.name.lower()}:1"
+    tar = subprocess.run(["tar", "-C", str(rootfs), "-c", "."], capture_output=True, check=True).stdout
+    subprocess.run(["podman", "import", "-q", "-", name], input=tar, capture_output=True, check=True)
+    try:
+        yield name
+    finally:
+        subprocess.run(["podman", "rmi", name], capture_output=True, check=True)
 
 
 def make_rootfs(folder: Path, programs: Iterable[str] = ("sh", "cat"), *, python: bool = False) -> None:

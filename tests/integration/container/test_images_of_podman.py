@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 from support.containers import ECHO, ECHO_INTERFACES, Machine, joined, until
-from support.rootfs import make_rootfs
+from support.rootfs import image_of, make_rootfs
 
 from rce.control.messages import Fault
 from rce.control.model import EndpointState, Network, NodeSpec, NodeState, Resources
@@ -59,11 +59,8 @@ def rootfs() -> Iterator[Path]:
 @pytest.fixture(scope="module")
 def image(rootfs: Path) -> Iterator[str]:
     """The same as an image in podman's store."""
-    name = f"localhost/rce-test-{os.getpid()}:1"
-    tar = subprocess.run(["tar", "-C", str(rootfs), "-c", "."], capture_output=True, check=True).stdout
-    subprocess.run(["podman", "import", "-q", "-", name], input=tar, capture_output=True, check=True)
-    yield name
-    subprocess.run(["podman", "rmi", name], capture_output=True, check=True)
+    with image_of(rootfs) as name:
+        yield name
 
 
 @pytest.fixture
