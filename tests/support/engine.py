@@ -249,9 +249,10 @@ def engine_processes(folder: Path) -> list[psutil.Process]:
 def _environments(folder: Path) -> list[psutil.Process]:
     """The environments that descend from nothing of the engine, because what forked them is gone."""
     found = []
-    for path in folder.rglob("record.json"):
-        with contextlib.suppress(OSError, psutil.NoSuchProcess):
-            pid = json.loads(path.read_bytes()).get("environment", 0)
+    records = [Path(path, "record.json") for path, _, names in os.walk(folder) if "record.json" in names]
+    for record in records:  # folders may vanish at any time
+        with contextlib.suppress(OSError, ValueError, psutil.NoSuchProcess):
+            pid = json.loads(record.read_bytes()).get("environment", 0)
             process = psutil.Process(pid) if pid else None
             if process is not None and "rce_container.environment" in process.cmdline():
                 found.append(process)
