@@ -15,7 +15,7 @@ TIMEOUT = aiohttp.ClientTimeout(total=5)
 
 
 class EngineWatch:
-    """Reads containers, nodes and connections of the operator's user again and again.
+    """Reads containers with what they use, nodes and connections of the operator's user again and again.
 
     Args:
         master: URL of the master.
@@ -54,13 +54,15 @@ class EngineWatch:
         if not self._token:
             async with session.post(self._api / "login", json=self._login) as reply:
                 self._token = (await reply.json())["token"]
-        containers, nodes, connections = [
-            await self._get(session, kind) for kind in ("containers", "nodes", "connections")
+        containers, nodes, connections, usage = [
+            await self._get(session, kind) for kind in ("containers", "nodes", "connections", "usage")
         ]
+        used = {container["id"]: container for container in usage}
         return {
             "containers": [
                 {
                     **{key: container[key] for key in ("tag", "state", "machine", "detail")},
+                    **_used(used.get(container["id"])),
                     "nodes": [
                         {key: node[key] for key in ("tag", "state", "detail")}
                         for node in nodes
@@ -80,5 +82,16 @@ class EngineWatch:
         async with session.get(
             self._api / kind, headers=headers, params={"user": self._login["userID"]}
         ) as reply:
-            found: list[dict[str, Any]] = (await reply.json())[kind]
+            # What is used comes with machines, too; only its containers are of interest here.
+            found: list[dict[str, Any]] = (await reply.json())["containers" if kind == "usage" else kind]
             return found
+
+
+_SHOWN = ("cpu", "cpu_limit", "memory", "memory_limit", "restarts", "oom_kills")
+
+
+def _used(usage: dict[str, Any] | None) -> dict[str, Any]:
+    """What a container uses, and what could be better; without either before the first report."""
+    if usage is None or not usage["memory"]:
+        return {"usage": None, "advice": []}
+    return {"usage": {key: usage[key] for key in _SHOWN}, "advice": usage["advice"]}

@@ -1,23 +1,9 @@
 // The tables beside the map: robots (those in trouble first), the engine, events.
 
+import { element, engineList } from "./engine.js";
 import { colourOf } from "./model.js";
 
 const TROUBLE = new Set(["unreachable", "silent", "stopping"]);
-const TONE = { running: "good", connected: "good", placed: "warn", starting: "warn", requested: "warn", absent: "warn", failed: "bad", lost: "bad", exited: "bad" };
-
-function element(tag, text = "", className = "") {
-  const made = document.createElement(tag);
-  made.textContent = text;
-  if (className) made.className = className;
-  return made;
-}
-
-function stateLine(label, state, detail = "") {
-  const item = element("li");
-  item.append(element("span", `${label} `), element("span", state, TONE[state] ?? "quiet"));
-  if (detail) item.append(element("span", ` ${detail}`, "quiet"));
-  return item;
-}
 
 export class Panel {
   constructor(fleet) {
@@ -70,32 +56,8 @@ export class Panel {
 
   drawEngine() {
     const { engine } = this.fleet;
-    if (engine.error) {
-      this.engine.replaceChildren(element("p", engine.error, "bad"));
-      return;
-    }
-    this.carrier.textContent = engine.graph ? "ROS graph" : "Engine";
-    const list = element("ul");
-    if (engine.graph) {
-      list.append(element("li", engine.graph.uri, "quiet"));
-      for (const node of engine.graph.nodes) {
-        const counts = `${node.publishes} out, ${node.subscribes} in, ${node.serves} services`;
-        list.append(stateLine(node.name, "registered", counts));
-      }
-      this.engine.replaceChildren(list);
-      return;
-    }
-    const containers = [...engine.containers].sort((a, b) => a.tag.localeCompare(b.tag, "en", { numeric: true }));
-    for (const container of containers) {
-      const item = stateLine(container.tag, container.state, container.machine);
-      const nodes = element("ul");
-      for (const node of container.nodes) nodes.append(stateLine(node.tag, node.state, node.detail));
-      item.append(nodes);
-      list.append(item);
-    }
-    const up = engine.connections.filter((connection) => connection.established).length;
-    list.append(stateLine("connections", `${up} of ${engine.connections.length}`, "established"));
-    this.engine.replaceChildren(list);
+    if (!engine.error) this.carrier.textContent = engine.graph ? "ROS graph" : "Engine";
+    this.engine.replaceChildren(engineList(engine));
   }
 
   addEvent(text, tone = "") {

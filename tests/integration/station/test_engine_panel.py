@@ -1,0 +1,109 @@
+"""The engine on the operator's page: what containers use, and advice."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import shutil
+from typing import Any
+
+import pytest
+from aiohttp import web
+from aiohttp.test_utils import TestServer
+
+from rce_client.station.engine_watch import EngineWatch
+from rce_client.station.fleet_link import FleetLink
+from rce_client.station.live import Broadcast
+from rce_client.station.server import Station
+from rce_client.station.view import FleetView
+
+MB = 1 << 20
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+ADVICE = {
+    "about": "too small",
+    "text": "uses 95 MB of its 100 MB of memory",
+    "command": "rce resize c --memory 150M",
+}
+USAGE = {
+    "id": "op/c",
+    "cpu": 0.25,
+    "cpu_limit": 0.5,
+    "memory": 95 * MB,
+    "memory_limit": 100 * MB,
+    "restarts": 2,
+    "oom_kills": 0,
+    "advice": [ADVICE],
+    "processes": 4,
+}
+ANSWERS: dict[str, Any] = {
+    "containers": {
+        "containers": [
+            {"id": "op/c", "tag": "c", "state": "degraded", "machine": "m1", "detail": ""},
+            {"id": "op/d", "tag": "d", "state": "starting", "machine": "m1", "detail": ""},
+        ]
+    },
+    "nodes": {"nodes": [{"container": "c", "tag": "n", "state": "waiting", "detail": "again in 2 s"}]},
+    "connections": {"connections": []},
+    "usage": {"time": 0.0, "containers": [USAGE], "machines": []},
+}
+
+
+async def watched() -> dict[str, Any]:
+    """What the station makes of a master's answers."""
+
+    async def answer(request: web.Request) -> web.Response:
+        name = request.path.rpartition("/")[2]
+        return web.json_response({"token": "t"} if name == "login" else ANSWERS[name])
+
+    app = web.Application()
+    app.router.add_route("*", "/api/v1/{name}", answer)
+    seen: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
+    async with TestServer(app) as server:
+        watch = asyncio.create_task(
+            EngineWatch(str(server.make_url("/")), "op", "x", on_state=seen.put_nowait).run()
+        )
+        try:
+            async with asyncio.timeout(10):
+                return await seen.get()
+        finally:
+            watch.cancel()
+            await asyncio.gather(watch, return_exceptions=True)
+
+
+async def test_what_containers_use_is_read_with_their_state() -> None:
+    first, second = (await watched())["containers"]
+    assert first["usage"] == {key: USAGE[key] for key in first["usage"]}
+    assert first["advice"] == [ADVICE]
+    assert (second["usage"], second["advice"]) == (None, [])
+
+
+@pytest.mark.needs("chromium")
+async def test_the_page_shows_bars_and_advice() -> None:
+    from playwright.async_api import async_playwright
+
+    pages = Broadcast()
+    pages.send("engine", json.dumps({"type": "engine", **await watched()}))
+    view = FleetView()
+    fleet = FleetLink.__new__(FleetLink)  # nobody steers
+    args = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
+    async with TestServer(Station(view, fleet, pages).make_app()) as server, async_playwright() as playwright:
+        browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=args)
+        try:
+            page = await browser.new_page()
+            await page.goto(str(server.make_url("/")))
+            await page.wait_for_selector("#engine meter")
+            meters = await page.eval_on_selector_all(
+                "#engine meter", "all => all.map(m => [m.value / m.max, m.ariaLabel])"
+            )
+            text = await page.inner_text("#engine")
+        finally:
+            await browser.close()
+    assert meters == [[0.5, "CPU: 25 % of 50 %"], [0.95, "Memory: 95 MB of 100 MB"]]
+    for part in (
+        "c degraded m1",
+        "2 restarts",
+        "too small: uses 95 MB",
+        "rce resize c --memory 150M",
+        "n waiting again in 2 s",
+    ):
+        assert part in text
