@@ -8,8 +8,8 @@ import stat
 from pathlib import Path
 from typing import NamedTuple
 
-from rce_container.environment.logs import ENVIRONMENT_LOG, ROSOUT_LOG, segments
-from rce_container.environment.streams import FRAGMENT_BYTES, text_of
+from rce_container.environment.logs.files import ENVIRONMENT_LOG, ROSOUT_LOG, segments
+from rce_container.environment.logs.streams import FRAGMENT_BYTES, text_of
 
 MAX_CHUNK = 1 << 20
 _MIN_FRAGMENTS = 2 * (FRAGMENT_BYTES + 2)
@@ -59,8 +59,8 @@ def read_node_log(folder: Path, tag: str, offset: int, limit: int, letters: byte
         tag: The node.
         offset: As for :func:`read_log`; within a line, the next one is meant.
         limit: Bytes of the log to read at most, though never less than it takes to get on.
-        letters: Of which streams (:func:`rce_container.environment.streams.letters_of`). What is left out is
-            passed over: the text may be empty though the log goes on.
+        letters: Of which streams (:func:`rce_container.environment.logs.streams.letters_of`). What is
+            left out is passed over: the text may be empty though the log goes on.
 
     Raises:
         OSError: As for :func:`read_log`.

@@ -6,8 +6,8 @@ from rce.control.logs import LogStream
 from rce.control.messages import LogChunk, ReadLog
 from rce.protocol.names import EndpointId, is_name
 from rce_container.archive import Kept, LogArchive
-from rce_container.environment.logs import ENVIRONMENT_LOG, ROSOUT_LOG
-from rce_container.environment.streams import letters_of
+from rce_container.environment.logs.files import ENVIRONMENT_LOG, ROSOUT_LOG
+from rce_container.environment.logs.streams import letters_of
 from rce_container.logs import Chunk, read_log, read_node_log
 
 

@@ -28,20 +28,20 @@ from rce.ros.types import TypeRegistry
 from rce.ros.xmlrpc import RpcClient
 from rce_container.environment import messages as m
 from rce_container.environment.bundles import Bundles
-from rce_container.environment.causes import Causes
 from rce_container.environment.channel import Channel, accept
-from rce_container.environment.cradle import Cradle
 from rce_container.environment.exceptions import ChannelError
-from rce_container.environment.heartbeats import Heartbeats
 from rce_container.environment.interfaces import InterfaceMaker, Readiness
-from rce_container.environment.launch import OWN_NODE
-from rce_container.environment.nodelife import Workshop
-from rce_container.environment.nodes import NodeSet
+from rce_container.environment.logs.rosout import RosoutLog
+from rce_container.environment.nodes.causes import Causes
+from rce_container.environment.nodes.cradle import Cradle
+from rce_container.environment.nodes.heartbeats import Heartbeats
+from rce_container.environment.nodes.launch import OWN_NODE
+from rce_container.environment.nodes.node_life import Workshop
+from rce_container.environment.nodes.node_set import NodeSet
+from rce_container.environment.nodes.reaper import Reaper
 from rce_container.environment.parameters import Values, difference, evaluate_all
 from rce_container.environment.process import strike_all
 from rce_container.environment.reach import Operator
-from rce_container.environment.reaper import Reaper
-from rce_container.environment.rosout import RosoutLog
 
 log = logging.getLogger(__name__)
 

@@ -8,10 +8,10 @@ import signal
 import socket
 from pathlib import Path
 
-from rce_container.environment.cradle import Cradle
 from rce_container.environment.environment import Environment
-from rce_container.environment.logs import ENVIRONMENT_LOG, LogWriter
+from rce_container.environment.logs.files import ENVIRONMENT_LOG, LogWriter
 from rce_container.environment.messages import Boot
+from rce_container.environment.nodes.cradle import Cradle
 from rce_container.environment.process import limit_oneself
 
 

@@ -19,8 +19,8 @@ from collections.abc import Sequence
 
 import msgspec
 
-from rce_container.environment.cradle import Cradle
 from rce_container.environment.messages import Boot
+from rce_container.environment.nodes.cradle import Cradle
 from rce_container.environment.process import OF_ENVIRONMENT, die_before_others, limit_oneself
 from rce_container.environment.running import run_environment
 from rce_container.nursery import kernel

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Self
 
 from rce_container.environment import proc
-from rce_container.environment.logs import ENVIRONMENT_LOG, segment_path
+from rce_container.environment.logs.files import ENVIRONMENT_LOG, segment_path
 from rce_container.exceptions import StartError
 from rce_container.nursery.keeper import Nursery, hear_credentials
 from rce_container.nursery.messages import FAREWELL, Birth, Gifts

@@ -20,7 +20,7 @@ import threading
 from collections.abc import Iterable
 from pathlib import Path
 
-from rce_container.environment.logs import ENVIRONMENT_LOG, segment_path
+from rce_container.environment.logs.files import ENVIRONMENT_LOG, segment_path
 from rce_container.environment.messages import Boot
 from rce_container.exceptions import ContainerError, RuntimeUnavailableError, StartError
 from rce_container.folder import ContainerFolder, Record

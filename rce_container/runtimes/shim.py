@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from rce_container.environment import proc
-from rce_container.environment.logs import ENVIRONMENT_LOG, segment_path
+from rce_container.environment.logs.files import ENVIRONMENT_LOG, segment_path
 from rce_container.exceptions import StartError
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce_container.environment.logs import SEGMENTS, LogWriter, segments
+from rce_container.environment.logs.files import SEGMENTS, LogWriter, segments
 from rce_container.logs import read_log
 
 

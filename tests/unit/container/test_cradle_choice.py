@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rce_container.environment.cradle import fits
+from rce_container.environment.nodes.cradle import fits
 
 OWN = {"PATH": "/bin", "PYTHONPATH": "/engine"}
 

@@ -9,8 +9,8 @@ import pytest
 from rce.control.logs import LogStream, LogWish
 from rce.control.messages import ReadLog
 from rce_container.archive import MAX_LIVES, LogArchive
-from rce_container.environment.logs import ENVIRONMENT_LOG, ROSOUT_LOG, LogWriter
-from rce_container.environment.nodelog import NodeLog
+from rce_container.environment.logs.files import ENVIRONMENT_LOG, ROSOUT_LOG, LogWriter
+from rce_container.environment.logs.node_log import NodeLog
 from rce_container.exceptions import StateError
 from rce_container.folder import StateFolder
 from rce_container.reading import read_for

@@ -10,16 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rce.control.model import NodeSpec, NodeState, NodeStatus, RestartPolicy
-from rce_container.environment import nodeevents as e
-from rce_container.environment.life import NEXT, WITH_PROCESS, Happening, after
-from rce_container.environment.nodecore import (
-    BACKOFF_S,
-    FIRST_BEAT_WITHIN_S,
-    LAST_CHANCE_S,
-    WELL_S,
-    NodesCore,
-)
-from rce_container.environment.order import StartOrder, levels, ready_to_end
+from rce_container.environment.nodes import events as e
+from rce_container.environment.nodes.core import BACKOFF_S, FIRST_BEAT_WITHIN_S, NodesCore
+from rce_container.environment.nodes.life import NEXT, WITH_PROCESS, Happening, after
+from rce_container.environment.nodes.order import StartOrder, levels, ready_to_end
+from rce_container.environment.nodes.record import LAST_CHANCE_S, WELL_S
 
 FAILED = "exit code 3"
 

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 
 from rce.control.model import NodeSpec, NodeState
-from rce_container.environment import nodes
 from rce_container.environment.exceptions import NodeError
-from rce_container.environment.nodelife import Workshop
-from rce_container.environment.nodes import NodeSet
-from rce_container.environment.reaper import Reaper
+from rce_container.environment.nodes import node_set
+from rce_container.environment.nodes.node_life import Workshop
+from rce_container.environment.nodes.node_set import NodeSet
+from rce_container.environment.nodes.reaper import Reaper
 
 
 def workshop(folder: Path, faults: list[str]) -> Workshop:
@@ -59,7 +59,7 @@ async def test_what_cannot_be_started_is_told_and_noted(tmp_path: Path) -> None:
 async def test_logs_of_nodes_that_are_gone_do_not_pile_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(nodes, "MAX_DEPARTED", 3)
+    monkeypatch.setattr(node_set, "MAX_DEPARTED", 3)
     async with asyncio.TaskGroup() as tasks:
         found = NodeSet(workshop(tmp_path, []), tasks)
         for tag in ("a", "stays", "b", "a", "c", "d"):

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from rce.control.logs import LogLevel, LogStream
 from rce.ros.logrecord import KIND, Level, LogRecord
 from rce.ros.types import Time, TypeRegistry
-from rce_container.environment import rosout as rosout_module
-from rce_container.environment.logs import ROSOUT_LOG, LogWriter
-from rce_container.environment.nodelog import NodeLog
-from rce_container.environment.rosout import RosoutLog
-from rce_container.environment.streams import FRAGMENT_BYTES, letters_of, whole_characters
+from rce_container.environment.logs import rosout as rosout_module
+from rce_container.environment.logs.files import ROSOUT_LOG, LogWriter
+from rce_container.environment.logs.node_log import NodeLog
+from rce_container.environment.logs.rosout import RosoutLog
+from rce_container.environment.logs.streams import FRAGMENT_BYTES, letters_of, whole_characters
 from rce_container.logs import read_log, read_node_log
 
 OUT, ERR, ROS, ENGINE = LogStream.STDOUT, LogStream.STDERR, LogStream.ROSOUT, LogStream.ENGINE

@@ -1,0 +1,1 @@
+"""The nodes of a container: what is decided about them, and the processes that they are."""

@@ -1,0 +1,121 @@
+"""What can happen to a container's nodes (events), and what is to be done about it (instructions)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from rce.control.model import NodeSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Desire:
+    """Exactly these nodes are desired."""
+
+    specs: tuple[NodeSpec, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """The process that :class:`Launch` asked for runs."""
+
+    tag: str
+    life: int
+    pid: int
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """The process that :class:`Launch` asked for could not be made."""
+
+    tag: str
+    life: int
+    reason: str
+    hopeless: bool
+    """Whether trying again would not help: package or executable is not there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Registered:
+    """A life of a node registered with the ROS core."""
+
+    tag: str
+    life: int
+
+
+@dataclass(frozen=True, slots=True)
+class Lack:
+    """Exactly these nodes cannot be launched yet, with the reason in words, by tag."""
+
+    texts: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Beat:
+    """A message came on a node's heartbeat topic."""
+
+    tag: str
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """All processes of a life of a node are gone."""
+
+    tag: str
+    life: int
+    code: int
+    """As :attr:`subprocess.Popen.returncode`."""
+    reason: str
+    """The end in words."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """Time passed."""
+
+
+Event = Desire | Lack | Made | Refused | Registered | Beat | Ended | Tick
+
+
+@dataclass(frozen=True, slots=True)
+class Launch:
+    """Start a process; answered by :class:`Made` or :class:`Refused`, and in the end :class:`Ended`."""
+
+    tag: str
+    life: int
+    spec: NodeSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Halt:
+    """End a life of a node by escalation; answered by :class:`Ended`."""
+
+    tag: str
+    life: int
+    share: float
+    """The part of the usual patience that there is for it: others wait for their turn."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tell:
+    """Tell the user."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """Write a line to the node's log."""
+
+    tag: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Forget:
+    """Nothing is left of a node that is not desired."""
+
+    tag: str
+
+
+Instruction = Launch | Halt | Tell | Note | Forget

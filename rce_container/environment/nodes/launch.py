@@ -1,0 +1,65 @@
+"""What a node's process is started with: its arguments and its environment."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from rce.ros.substitution import split_arguments
+from rce_container.environment.bundles import Outfit
+from rce_container.environment.exceptions import NodeError
+from rce_container.environment.nodes.system import system_environ
+
+NODE_MARK = "RCE_NODE"
+"""Environment variable that every process of a node carries; its value names one life of one node."""
+
+
+OWN_NODE = "rce_environment"
+"""The environment's own node in the container's graph; a second one of that name would end it."""
+
+
+class Launch(NamedTuple):
+    """How to start a node."""
+
+    argv: list[str]
+    env: dict[str, str]
+    ros_name: str
+    """The global ROS name that it was told to take; empty if it chooses by itself."""
+
+
+def prepare(outfit: Outfit, mark: str) -> Launch:
+    """Work out how to start a node.
+
+    Args:
+        outfit: What it is started with.
+        mark: The value of :data:`NODE_MARK`.
+
+    Raises:
+        NodeError: It cannot be started; the text says what to do.
+    """
+    spec, packages = outfit.spec, outfit.packages
+    environ: Mapping[str, str] = outfit.environ
+    try:
+        package = packages.find(spec.pkg)
+        executable = package.executable(spec.exe)
+        arguments = split_arguments(spec.args, packages, environ)
+    except (LookupError, ValueError, OSError) as error:
+        raise NodeError(str(error)) from error
+    namespace = spec.namespace.strip("/")
+    if package.python == "system":
+        environ = system_environ(environ, package.path)
+    env = {**environ, NODE_MARK: mark}
+    if outfit.python_path:
+        env["PYTHONPATH"] = os.pathsep.join(filter(None, (outfit.python_path, env.get("PYTHONPATH", ""))))
+    if spec.name:
+        arguments.append(f"__name:={spec.name}")
+    if namespace:
+        arguments.append(f"__ns:=/{namespace}")
+        env["ROS_NAMESPACE"] = f"/{namespace}"
+    ros_name = "/" + "/".join(filter(None, (namespace, spec.name))) if spec.name else ""
+    if ros_name == f"/{OWN_NODE}":
+        raise NodeError(
+            f"{ros_name} is the node that joins the container to others; give this one another name"
+        )
+    return Launch([*executable, *arguments], env, ros_name)

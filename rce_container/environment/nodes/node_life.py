@@ -1,0 +1,159 @@
+"""One life of a node: a process group, from its start to the end of all that it started."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+import signal
+from collections.abc import Awaitable, Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from rce.control.model import NodeSpec
+from rce_container.environment.bundles import Outfit
+from rce_container.environment.exceptions import NodeError
+from rce_container.environment.logs.node_log import NodeLog
+from rce_container.environment.logs.pump import Pump
+from rce_container.environment.nodes.events import Ended, Event, Made, Refused
+from rce_container.environment.nodes.launch import NODE_MARK, Launch, prepare
+from rce_container.environment.nodes.reaper import Child, Reaper
+from rce_container.environment.process import strike_all
+
+_PASSING = frozenset({errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE, errno.ETXTBSY, errno.ENOSPC})
+"""Errors for which a start may succeed when it is tried later."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Workshop:
+    """What nodes are made with."""
+
+    reaper: Reaper
+    outfit: Callable[[NodeSpec], Outfit]
+    """Says what a node is started with."""
+    mark: str
+    home: str
+    logs: Path
+    interrupt_timeout: float
+    terminate_timeout: float
+    on_change: Callable[[], None]
+    """Some node's status is another one."""
+    on_fault: Callable[[str], None]
+    """A node failed; a text for the user."""
+    why_killed: Callable[[], Awaitable[str]]
+    """Says why a process ended by SIGKILL just now that nobody here sent; empty if nobody knows."""
+
+
+class NodeLife:
+    """Starts a node's process and waits for its end.
+
+    Args:
+        spec: The node.
+        life: The life's number.
+        workshop: What it is made with.
+        log: Where its output goes.
+        feed: Takes what happens.
+    """
+
+    def __init__(
+        self, spec: NodeSpec, life: int, workshop: Workshop, log: NodeLog, feed: Callable[[Event], None]
+    ) -> None:
+        self.pid = 0
+        """The process, which is also its group and its session; 0 while there is none."""
+        self.ros_name = ""
+        """The global ROS name that it was told to take; empty if it chooses by itself."""
+        self.life = life
+        self._spec = spec
+        self._workshop = workshop
+        self._log = log
+        self._feed = feed
+        self._halted: asyncio.Future[float] = asyncio.get_running_loop().create_future()
+
+    def halt(self, share: float) -> None:
+        """Have it ended by SIGINT, SIGTERM and SIGKILL, with a share of the usual pauses between them."""
+        if not self._halted.done():
+            self._halted.set_result(share)
+
+    async def run(self) -> None:
+        """Live. Tells of the beginning when it is known, and of the end when nothing is left."""
+        mark = f"{self._workshop.mark}.{self._spec.tag}.{self.life}"
+        try:
+            launch = prepare(self._workshop.outfit(self._spec), mark)
+            event = await self._live(launch)
+        except NodeError as error:
+            event = Refused(self._spec.tag, self.life, str(error), hopeless=True)
+        except OSError as error:
+            hopeless = error.errno not in _PASSING
+            event = Refused(self._spec.tag, self.life, _in_words(error), hopeless=hopeless)
+        self.pid = 0
+        self._feed(event)
+
+    async def _live(self, launch: Launch) -> Event:
+        self._log.begin()
+        with ExitStack() as pumps:
+            child = self._start(launch, pumps)
+            try:
+                code, reason = await self._watch(child)
+            finally:
+                child.signal_group(signal.SIGKILL)
+                await strike_all(launch.env[NODE_MARK], variable=NODE_MARK)
+        if code and not self._halted.done() and (words := self._log.last_words):
+            reason += f"; its last words: {words}"
+        return Ended(self._spec.tag, self.life, code, reason)
+
+    def _start(self, launch: Launch, pumps: ExitStack) -> Child:
+        with ExitStack() as ends:
+            stdout = _pipe(self._log.stdout, pumps, ends)
+            stderr = _pipe(self._log.stderr, pumps, ends)
+            child = self._workshop.reaper.spawn(
+                launch.argv, env=launch.env, cwd=self._workshop.home, stdout=stdout, stderr=stderr
+            )
+        self.pid, self.ros_name = child.pid, launch.ros_name
+        self._feed(Made(self._spec.tag, self.life, child.pid))
+        return child
+
+    async def _watch(self, child: Child) -> tuple[int, str]:
+        """Wait until it ended, by itself or because it is to; returns its exit code and the end in words."""
+        await asyncio.wait((child.ended, self._halted), return_when=asyncio.FIRST_COMPLETED)
+        if not child.ended.done():
+            return await self._escalate(child, self._halted.result())
+        code = child.ended.result()
+        cause = await self._workshop.why_killed() if code == -signal.SIGKILL else ""
+        return code, cause or describe_exit(code)
+
+    async def _escalate(self, child: Child, share: float) -> tuple[int, str]:
+        for number, patience in (
+            (signal.SIGINT, self._workshop.interrupt_timeout),
+            (signal.SIGTERM, self._workshop.terminate_timeout),
+        ):
+            child.signal_group(number)
+            done, _ = await asyncio.wait((child.ended,), timeout=patience * share)
+            if done:
+                return child.ended.result(), f"it was told to by {number.name}"
+        child.signal_group(signal.SIGKILL)
+        return await child.ended, "killed, because it did not end on SIGINT and SIGTERM"
+
+
+def _pipe(take: Callable[[bytes], None], pumps: ExitStack, ends: ExitStack) -> int:
+    """Make a pipe; returns the end to write to, which ``ends`` closes, as ``pumps`` do the other."""
+    reading, writing = os.pipe()
+    ends.callback(os.close, writing)
+    pumps.callback(Pump(reading, take).close)
+    return writing
+
+
+def describe_exit(code: int) -> str:
+    """Say in words how a process ended."""
+    if code >= 0:
+        return f"exit code {code}"
+    try:
+        name = signal.Signals(-code).name
+    except ValueError:
+        name = f"signal {-code}"
+    return f"killed by {name}" + (" (by hand, or out of memory)" if code == -signal.SIGKILL else "")
+
+
+def _in_words(error: OSError) -> str:
+    text = error.strerror or str(error)
+    return f"{error.filename}: {text}" if error.filename else text
