@@ -173,6 +173,22 @@ async def test_an_image_that_cannot_be_had_is_told(machine: Machine, folder: Pat
             assert machine.status(f"user/box{number}").state is EndpointState.FAILED
 
 
+async def test_a_program_has_the_images_own_python(folder: Path) -> None:
+    make_rootfs(folder / "root", python=True)
+    folder.chmod(0o755)
+    machine = Machine(folder, "podman", images=[str(folder / "root")])
+    script = machine.packages / "own" / "nodes" / "script"
+    script.write_text("#!/usr/bin/python3\nimport ssl, sys\nprint('runs in', sys.prefix, flush=True)\n")
+    script.chmod(0o755)
+    try:
+        async with machine.engine():
+            await machine.put(BOX, nodes=(own("script"),))
+            await machine.node_is(BOX, "node", NodeState.EXITED)
+            assert "runs in /usr" in await machine.log(BOX, "node")
+    finally:
+        machine.tidy()
+
+
 @pytest.mark.parametrize("victim", ["unshare", "podman", "conmon", "sh", "rce-environment"])
 async def test_whoever_is_killed_nothing_is_left(machine: Machine, victim: str) -> None:
     async with machine.engine(cleanup_timeout=2.0):
