@@ -298,3 +298,4 @@ async def test_statistics_count_what_flowed(make_node: MakeNode) -> None:
             "publications",
             [["/rosout", "rosgraph_msgs/Log"], ["/t", STRING]],
         ]
+        assert await rpc.call(b.uri, "getSubscriptions", ("/x",)) == [1, "subscriptions", [["/t", STRING]]]

@@ -84,7 +84,7 @@ def comparable(method: str, answer: Any) -> Any:
     status, _, value = answer
     if status != 1:
         return "refused"
-    if method in ("getPid", "getUri", "getMasterUri"):
+    if method in ("getPid", "getName", "getUri", "getMasterUri"):
         return status, type(value)
     if method == "getParamNames":
         return status, sorted(name for name in value if not name.startswith(OWN))
@@ -122,6 +122,8 @@ async def test_the_core_answers_as_a_real_one(tmp_path: Path) -> None:
 
 SLAVE_CALLS: list[tuple[str, tuple[Any, ...]]] = [
     ("getPid", ("/x",)),
+    ("getName", ("/x",)),
+    ("getUri", ("/x",)),
     ("getMasterUri", ("/x",)),
     ("requestTopic", ("/x", "/nothing", [["TCPROS"]])),
     ("requestTopic", ("/x", "/peer_out", [["UNKNOWN"]])),

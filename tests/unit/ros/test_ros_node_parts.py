@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -34,6 +36,14 @@ def test_the_command_line_wins_over_the_program_and_the_environment() -> None:
     assert settings.resolver.node_name == "/arg/other"
     assert settings.master_uri == "http://10.0.0.8:2/"
     assert settings.host == "10.0.0.3"
+    assert gather(("__hostname:=mine", "__ip:=10.0.0.3"), environ).host == "mine"
+
+
+def test_a_log_file_is_in_the_folder_of_logs() -> None:
+    environ = {"ROS_LOG_DIR": "/logs"}
+    assert gather(environ=environ).log_file is None
+    assert gather(("__log:=a.log",), environ).log_file == Path("/logs/a.log")
+    assert gather(("__log:=/elsewhere/a.log",), environ).log_file == Path("/elsewhere/a.log")
 
 
 def test_a_host_that_others_can_reach_is_served_on_all_interfaces() -> None:
