@@ -116,11 +116,22 @@ class Desk:
             status, reason = _TOO_MANY, str(error)
         except Refused as error:
             status, reason = _CONFLICT, str(error)
+            self._doubt(process, id_)
         except MasterError as error:
             status, reason = _UNAVAILABLE, str(error)
         except KeyError:
             status, reason = _UNAVAILABLE, "the robot was removed while it logged in"
         return LoginReply(request=login.request, status=status, reason=reason)
+
+    def _doubt(self, process: str, id_: str) -> None:
+        """Look after a robot that wants to come in while it is connected at another task set.
+
+        Its former connection may be dead without anybody having noticed; then the robot's next attempt finds
+        its place free, and not only after the WebSocket's own pings gave up.
+        """
+        robot = self._realm.tables.robot(id_)
+        if robot is not None and robot.task_set != process:
+            self._reconciler.probe(id_)
 
     def _note_leaving(self, process: str, message: ToMaster) -> None:
         """A robot may go before its login is done; its session must not stay connected for ever then."""

@@ -15,6 +15,7 @@ from rce.control.messages import (
     Left,
     LogChunk,
     Notify,
+    Probe,
     Put,
     Status,
     Sync,
@@ -150,6 +151,12 @@ class Reconciler:
             self._sync(changes.arrived)
         for notice in changes.notices:
             self._notify(notice)
+
+    def probe(self, robot: str) -> None:
+        """Have the task set of a robot find out whether the robot is still there."""
+        found = self._realm.tables.robot(robot)
+        if found is not None:
+            self._send(found.task_set, Probe(id=robot))
 
     def _sync(self, process: str) -> None:
         peer = self._peers[process] = self._arriving[process]

@@ -23,6 +23,7 @@ from rce.control.messages import (
     Left,
     MachineInfo,
     Notify,
+    Probe,
     Put,
     Status,
     Sync,
@@ -139,8 +140,16 @@ class RobotTaskSet:
                 await self._sync(message.endpoints)
             case Notify():
                 self._notify(message)
+            case Probe():
+                self._probe(EndpointId.parse(message.id))
             case _:
                 _log.debug("not for a robot task set: %s", type(message).__name__)
+
+    def _probe(self, id_: EndpointId) -> None:
+        """End a robot's connection unless the robot answers: it wants to come in at another task set."""
+        namespace = self._namespaces.get(id_)
+        if namespace is not None and namespace.session is not None and self._tasks is not None:
+            self._tasks.create_task(namespace.session.probe())
 
     async def run(self) -> None:
         """Report what is used, until cancelled; then close everything."""

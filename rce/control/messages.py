@@ -202,6 +202,12 @@ class Notify(_Message, frozen=True, kw_only=True, omit_defaults=True):
     text: str
 
 
+class Probe(_Message, frozen=True, kw_only=True, omit_defaults=True):
+    """Find out whether a robot is still there: it logs in elsewhere. One that is not is :class:`Left`."""
+
+    id: str
+
+
 class LoginReply(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """Answer to :class:`Login`."""
 
@@ -234,7 +240,7 @@ class ReadLog(_Message, frozen=True, kw_only=True, omit_defaults=True):
 
 
 ToMaster = Hello | Status | Gone | Fault | Usage | Login | Left | ClientRequest | LogChunk
-ToTaskSet = Welcome | Refused | Sync | Put | Drop | Notify | LoginReply | ClientReply | ReadLog
+ToTaskSet = Welcome | Refused | Sync | Put | Drop | Notify | Probe | LoginReply | ClientReply | ReadLog
 
 _encoder = msgspec.json.Encoder()
 _to_master: msgspec.json.Decoder[ToMaster] = msgspec.json.Decoder(ToMaster)

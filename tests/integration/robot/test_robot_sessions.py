@@ -10,6 +10,7 @@ import pytest
 from support.cloud import DIGEST, running_cloud
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from rce.control.messages import Probe
 from rce.control.model import EndpointState
 from rce_robot.outbox import OutboxLimits
 from rce_robot.settings import SessionSettings
@@ -97,6 +98,21 @@ async def test_a_dead_connection_makes_room_for_the_robots_new_one(dial: Any) ->
         async with dial(cloud) as alive:
             await cloud.master.changed.until(lambda: ROBOT in cloud.master.inside)
             await (await alive.ping())
+        dead.transport.resume_reading()
+        with pytest.raises(ConnectionClosed):
+            await dead.recv()
+
+
+async def test_a_dead_connection_is_ended_when_its_robot_comes_elsewhere(dial: Any) -> None:
+    settings = SessionSettings(probe_timeout=0.2, drain_timeout=1.0)
+    async with running_cloud(settings) as cloud, dial(cloud) as alive, dial(cloud, robot="other") as dead:
+        dead.transport.pause_reading()
+        assert cloud.master.peer is not None
+        for tag in ("testRobot", "other", "nobody"):
+            cloud.master.peer.send(Probe(id=f"testUser/{tag}"))
+        await cloud.master.changed.until(lambda: cloud.master.left)
+        assert cloud.master.left == ["testUser/other"]
+        await (await alive.ping())
         dead.transport.resume_reading()
         with pytest.raises(ConnectionClosed):
             await dead.recv()

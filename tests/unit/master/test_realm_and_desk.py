@@ -25,6 +25,7 @@ from rce.control.messages import (
     LoginReply,
     MachineInfo,
     Notify,
+    Probe,
     Put,
     Status,
     Sync,
@@ -317,6 +318,22 @@ async def test_logins_that_are_refused_say_why(cloud: Cloud) -> None:
     cloud.store.broken = True
     assert (await robots.login("other")).status == 503
     cloud.store.broken = False
+
+
+async def test_a_robot_that_is_connected_elsewhere_is_looked_after(cloud: Cloud) -> None:
+    first, second = cloud.robots(), cloud.robots("r2")
+    for peer in (first, second):
+        await peer.hello()
+    await first.login()
+    assert (await first.login()).status == 409
+    assert first.inbox.empty(), "its own task set probes it by itself"
+    assert (await second.login(password=client_digest("wrong"))).status == 401
+    assert first.inbox.empty(), "strangers bother nobody"
+    assert (await second.login()).status == 409
+    assert await first.get(Probe) == Probe(id="anna/rob")
+    await first.say(Left(id="anna/rob", reason="it does not answer"))
+    await cloud.flush()
+    assert (await second.login()).status == 200
 
 
 async def test_a_robot_that_leaves_while_it_logs_in_is_not_connected_for_ever(cloud: Cloud) -> None:
