@@ -54,14 +54,15 @@ class EngineWatch:
         if not self._token:
             async with session.post(self._api / "login", json=self._login) as reply:
                 self._token = (await reply.json())["token"]
-        containers, nodes, connections, usage = [
-            await self._get(session, kind) for kind in ("containers", "nodes", "connections", "usage")
+        containers, nodes, connections = [
+            (await self._get(session, kind))[kind] for kind in ("containers", "nodes", "connections")
         ]
-        used = {container["id"]: container for container in usage}
+        usage = await self._get(session, "usage")
+        used = {container["id"]: container for container in usage["containers"]}
         return {
             "containers": [
                 {
-                    **{key: container[key] for key in ("tag", "state", "machine", "detail")},
+                    **{key: container[key] for key in ("tag", "state", "machine", "detail", "moving_to")},
                     **_used(used.get(container["id"])),
                     "nodes": [
                         {key: node[key] for key in ("tag", "state", "detail")}
@@ -75,18 +76,23 @@ class EngineWatch:
                 {key: connection[key] for key in ("tag_a", "tag_b", "established")}
                 for connection in connections
             ],
+            # Administrators see these, others none.
+            "machines": [{key: machine[key] for key in _MACHINE} for machine in usage["machines"]],
         }
 
-    async def _get(self, session: aiohttp.ClientSession, kind: str) -> list[dict[str, Any]]:
+    async def _get(self, session: aiohttp.ClientSession, kind: str) -> dict[str, Any]:
         headers = {"Authorization": f"Bearer {self._token}"}
         async with session.get(
             self._api / kind, headers=headers, params={"user": self._login["userID"]}
         ) as reply:
-            # What is used comes with machines, too; only its containers are of interest here.
-            found: list[dict[str, Any]] = (await reply.json())["containers" if kind == "usage" else kind]
+            found: dict[str, Any] = await reply.json()
             return found
 
 
+_MACHINE = (
+    *("machine", "process", "connected", "draining", "containers"),
+    *("slots", "promised_slots", "cores", "promised_cores", "memory", "promised_memory", "advice"),
+)
 _SHOWN = ("cpu", "cpu_limit", "memory", "memory_limit", "restarts", "oom_kills")
 
 

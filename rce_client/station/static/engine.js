@@ -2,7 +2,7 @@
 
 const TONE = {
   running: "good", connected: "good", placed: "warn", starting: "warn", requested: "warn", waiting: "warn",
-  absent: "warn", degraded: "warn", stopped: "warn", stopping: "warn", failed: "bad", lost: "bad", exited: "bad", stuck: "bad",
+  absent: "warn", draining: "warn", away: "bad", degraded: "warn", stopped: "warn", stopping: "warn", failed: "bad", lost: "bad", exited: "bad", stuck: "bad",
 };
 const NEARLY_FULL = 0.9;
 
@@ -56,12 +56,26 @@ function adviceLine(advice) {
 }
 
 function containerItem(container) {
-  const item = stateLine(container.tag, container.state, container.machine);
+  const place = container.moving_to ? `${container.machine}, is being handed over to ${container.moving_to}` : container.machine;
+  const item = stateLine(container.tag, container.state, place);
   if (container.usage) item.append(uses(container.usage));
   for (const advice of container.advice ?? []) item.append(adviceLine(advice));
   const nodes = element("ul");
   for (const node of container.nodes) nodes.append(stateLine(node.tag, node.state, node.detail));
   item.append(nodes);
+  return item;
+}
+
+// A machine and how much of it is promised.
+function machineItem(machine) {
+  const state = !machine.connected ? "away" : machine.draining ? "draining" : "connected";
+  const item = stateLine(machine.machine, state, `${machine.containers} containers`);
+  if (machine.slots) item.append(bar("Slots", machine.promised_slots, machine.slots, `${machine.promised_slots} of ${machine.slots}`));
+  item.append(
+    bar("Cores", machine.promised_cores, machine.cores, `${machine.promised_cores} of ${machine.cores}`),
+    bar("Memory", machine.promised_memory, machine.memory, `${megabytes(machine.promised_memory)} of ${megabytes(machine.memory)}`),
+  );
+  for (const advice of machine.advice) item.append(adviceLine(advice));
   return item;
 }
 
@@ -81,6 +95,7 @@ function engineItems(engine) {
   return [
     ...containers.map(containerItem),
     stateLine("connections", `${up} of ${engine.connections.length}`, "established"),
+    ...(engine.machines ?? []).map(machineItem),
   ];
 }
 

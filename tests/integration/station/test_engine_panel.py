@@ -35,16 +35,31 @@ USAGE = {
     "advice": [ADVICE],
     "processes": 4,
 }
+MACHINE = {
+    "machine": "m1",
+    "process": "c1",
+    "connected": True,
+    "draining": True,
+    "containers": 2,
+    "slots": 8,
+    "promised_slots": 2,
+    "cores": 4,
+    "promised_cores": 1.5,
+    "memory": 1000 * MB,
+    "promised_memory": 250 * MB,
+    "advice": [],
+    "cpu": 0.1,
+}
 ANSWERS: dict[str, Any] = {
     "containers": {
         "containers": [
-            {"id": "op/c", "tag": "c", "state": "degraded", "machine": "m1", "detail": ""},
-            {"id": "op/d", "tag": "d", "state": "starting", "machine": "m1", "detail": ""},
+            {"id": "op/c", "tag": "c", "state": "degraded", "machine": "m1", "detail": "", "moving_to": ""},
+            {"id": "op/d", "tag": "d", "state": "starting", "machine": "m1", "detail": "", "moving_to": "c2"},
         ]
     },
     "nodes": {"nodes": [{"container": "c", "tag": "n", "state": "waiting", "detail": "again in 2 s"}]},
     "connections": {"connections": []},
-    "usage": {"time": 0.0, "containers": [USAGE], "machines": []},
+    "usage": {"time": 0.0, "containers": [USAGE], "machines": [MACHINE]},
 }
 
 
@@ -75,6 +90,8 @@ async def test_what_containers_use_is_read_with_their_state() -> None:
     assert first["usage"] == {key: USAGE[key] for key in first["usage"]}
     assert first["advice"] == [ADVICE]
     assert (second["usage"], second["advice"]) == (None, [])
+    (machine,) = (await watched())["machines"]
+    assert machine == {key: value for key, value in MACHINE.items() if key != "cpu"}
 
 
 @pytest.mark.needs("chromium")
@@ -98,12 +115,20 @@ async def test_the_page_shows_bars_and_advice() -> None:
             text = await page.inner_text("#engine")
         finally:
             await browser.close()
-    assert meters == [[0.5, "CPU: 25 % of 50 %"], [0.95, "Memory: 95 MB of 100 MB"]]
+    assert meters == [
+        [0.5, "CPU: 25 % of 50 %"],
+        [0.95, "Memory: 95 MB of 100 MB"],
+        [0.25, "Slots: 2 of 8"],
+        [0.375, "Cores: 1.5 of 4"],
+        [0.25, "Memory: 250 MB of 1000 MB"],
+    ]
     for part in (
         "c degraded m1",
         "2 restarts",
         "too small: uses 95 MB",
         "rce resize c --memory 150M",
         "n waiting again in 2 s",
+        "d starting m1, is being handed over to c2",
+        "m1 draining 2 containers",
     ):
         assert part in text
