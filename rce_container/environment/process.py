@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import ctypes
 import resource
 import signal
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -21,6 +21,8 @@ OF_NODES = 600
 _PR_SET_PDEATHSIG = 1
 _PR_SET_DUMPABLE = 4
 _PR_SET_CHILD_SUBREAPER = 36
+_ATTEMPTS = 20
+_ATTEMPT_PAUSE_S = 0.0002
 _STRIKES = 100
 _STRIKE_PAUSE_S = 0.02
 
@@ -38,10 +40,17 @@ def die_before_others(score: int, pid: int | None = None) -> None:
 
     Args:
         score: How much it is offered, and what it starts from then on; see :data:`OF_ENVIRONMENT`.
-        pid: Another process of the same user.
+        pid: Another process of the same user. One that executes a program just now is waited for, briefly.
     """
-    with contextlib.suppress(OSError):  # not Linux, or the process is gone
-        Path(f"/proc/{pid or 'self'}/oom_score_adj").write_text(str(score))
+    for _ in range(_ATTEMPTS):
+        try:
+            Path(f"/proc/{pid or 'self'}/oom_score_adj").write_text(str(score))
+        except PermissionError:  # it is still as closed to others as the one that forked it
+            time.sleep(_ATTEMPT_PAUSE_S)
+        except OSError:  # not Linux, or the process is gone
+            return
+        else:
+            return
 
 
 def limit_oneself(rlimits: Mapping[int, int]) -> None:

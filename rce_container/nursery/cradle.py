@@ -10,6 +10,7 @@ import os
 import signal
 import socket
 import sys
+import time
 
 import msgspec
 from msgspec import Struct
@@ -23,6 +24,8 @@ MAX_PACKET = 1 << 18
 """Bytes."""
 STREAMS = 2
 """Descriptors that come with a script: its standard output and error."""
+
+_PAUSE_S = 0.0002
 
 
 class Script(Struct, frozen=True, kw_only=True):
@@ -57,10 +60,13 @@ def rock(orders: socket.socket) -> None:
 
 def _leave_to_environment(orders: socket.socket) -> None:
     """Go on as a child whose parent ends at once: the environment takes in orphans."""
+    between = os.getpid()
     child = os.fork()
     if child:
         orders.send(b"%d" % child)
         os._exit(0)
+    while os.getppid() == between:  # or a node that asks to die with its parent would die with this one
+        time.sleep(_PAUSE_S)
 
 
 def _be(script: Script, fds: list[int]) -> None:

@@ -75,7 +75,7 @@ print(json.dumps({
     "mounts": [line.split(" - ") for line in lines("/proc/self/mountinfo")],
     "namespaces": {kind: os.readlink("/proc/self/ns/" + kind) for kind in sys.argv[1].split(",")},
     "pids": sorted(int(name) for name in os.listdir("/proc") if name.isdigit()),
-    "oom": int(open("/proc/self/oom_score_adj").read()), "core": resource.getrlimit(resource.RLIMIT_CORE)[0],
+    "core": resource.getrlimit(resource.RLIMIT_CORE)[0],
     "size": {path: os.statvfs(path).f_blocks * os.statvfs(path).f_frsize
              for path in (os.environ["HOME"], "/tmp", "/dev/shm")},
     "home": os.stat(os.environ["HOME"]).st_mode & 0o7777, "cwd": os.getcwd(),
@@ -146,7 +146,7 @@ def outside(machine: Machine) -> dict[str, Any]:
         "status": fields,
         "namespaces": namespaces,
         "logs": unit.folder.logs.stat().st_uid,
-        "node": [node.pid for node in machine.status(BOX).nodes],  # type: ignore[union-attr]
+        "oom": [int(Path(f"/proc/{pid}/oom_score_adj").read_text()) for pid in unit.node_pids.values()],
         "members": [process.pid for process in handle.members(proc.table())],
     }
 

@@ -171,7 +171,7 @@ def test_it_has_no_rights(node: dict[str, Any]) -> None:
         assert status["NoNewPrivs"].strip() == "1"
         assert status["Seccomp"].strip() == "2"
     assert node["core"] == 1
-    assert node["oom"] == OF_NODES
+    assert node["outside"]["oom"] == [OF_NODES]
 
 
 def test_every_namespace_is_its_own(node: dict[str, Any]) -> None:
