@@ -140,12 +140,23 @@ ROBOT_TAGS = ("requestIn", "responseOut", "serviceIn")
 
 async def wire_echo(client: Stranger, *, container: str = "cTag_01", robot: str = "testRobot") -> None:
     """Create a container with ``Test/stringEcho.py`` and wire its topics and its service to the robot."""
-    await client.send("CC", {"containerTag": container})
+    await ask_for_echo(client, container, robot)
+    await client.wait_status(dict.fromkeys(ROBOT_TAGS, True))
+
+
+async def ask_for_echo(
+    client: Stranger, container: str, robot: str, wishes: dict[str, Any] | None = None, **node: Any
+) -> None:
+    """Ask for what :func:`wire_echo` makes, with wishes for its container and more keys for its node.
+
+    May be repeated.
+    """
+    await client.send("CC", {"containerTag": container, "containerData": wishes or {}})
     await client.send(
         "CN",
         {
             "addNodes": [
-                {"containerTag": container, "nodeTag": "echo", "pkg": "Test", "exe": "stringEcho.py"}
+                {"containerTag": container, "nodeTag": "echo", "pkg": "Test", "exe": "stringEcho.py", **node}
             ],
             "addInterfaces": [
                 {
@@ -162,7 +173,6 @@ async def wire_echo(client: Stranger, *, container: str = "cTag_01", robot: str 
     await client.send(
         "CX", {"connect": [{"tagA": f"{robot}/{a}", "tagB": f"{container}/{b}"} for a, b in ECHO_CONNECTIONS]}
     )
-    await client.wait_status(dict.fromkeys(ROBOT_TAGS, True))
 
 
 async def check_echo(client: Stranger, text: str) -> None:

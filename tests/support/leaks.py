@@ -1,0 +1,164 @@
+"""Counts what an engine left on its machine: processes, mounts, cgroups, networks, sockets, folders.
+
+Only what can belong to one engine is counted, told by its folder and by names that only its containers have:
+others may work on the same machine.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections import Counter
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from rce_container.environment import proc
+from rce_container.limits import files
+
+CGROUPS = Path("/sys/fs/cgroup")
+INTERFACES = Path("/sys/class/net")
+
+
+class Footprint(NamedTuple):
+    """What a process holds."""
+
+    fds: int
+    networks: int
+    """Descriptors of network namespaces."""
+    memory: int
+    """Resident bytes."""
+
+
+class Traces:
+    """All that was ever seen of one engine. Call :meth:`look` often: what dies early was seen, too.
+
+    Args:
+        folder: In the command lines or environment variables of its programs; holds all of its files.
+        words: Further words that only its processes have in their command lines, such as a container's tag.
+    """
+
+    def __init__(self, folder: Path, *words: str) -> None:
+        self._folder = folder
+        self._needles = [os.fsencode(folder), *map(str.encode, words)]
+        self._seen: dict[int, int] = {}
+        """Start times by pid."""
+        self._marks: set[str] = set()
+        self._tokens: set[str] = set()
+
+    def look(self) -> list[proc.Process]:
+        """Find all of its processes that run now, and remember all that there is."""
+        self._note_names()
+        table = proc.table()
+        roots = [pid for pid in table if self._is_ours(pid)]
+        roots += [pid for cell in self.cgroups() for pid in files.pids(cell)]
+        found = {one.pid: one for root in roots for one in proc.descendants(root, table)}
+        found.pop(os.getpid(), None)
+        self._seen.update((one.pid, one.start) for one in found.values())
+        return list(found.values())
+
+    def processes(self) -> list[proc.Process]:
+        """All of its processes that run now, those included that can only be told by having been seen."""
+        self.look()
+        known = (proc.read(pid) for pid in self._seen)
+        return [one for one in known if one is not None and one.start == self._seen[one.pid]]
+
+    def cgroups(self) -> list[Path]:
+        """Its cgroups, in every hierarchy."""
+        return [path for path in task_set_cgroups() if path.name.removeprefix("rce-") in self._tokens]
+
+    def left(self, but: Collection[int] = ()) -> list[str]:
+        """All that should be gone once its containers are.
+
+        Args:
+            but: Processes that may stay, by pid: its programs, if they run.
+        """
+        self._note_names()
+        found = [f"process {_describe(one.pid)}" for one in self.processes() if one.pid not in but]
+        found += [f"cgroup {path}" for path in self.cgroups()]
+        found += [f"mount {line}" for line in self._mounts()]
+        found += [f"interface {path.name}" for path in INTERFACES.iterdir() if path.name[1:] in self._marks]
+        return found + [f"file {path}" for path in self._files()]
+
+    def _note_names(self) -> None:
+        for path in _walk(self._folder):
+            if path.parent.name == "containers" or path.parent.name.startswith("c-"):
+                self._marks.add(path.name)
+            if path.name == "run" and path.is_file():
+                with contextlib.suppress(OSError):
+                    self._tokens.add(path.read_text())
+
+    def _is_ours(self, pid: int) -> bool:
+        needles = [*self._needles, *(f"{proc.MARK}={mark}".encode() for mark in self._marks)]
+        for name in ("cmdline", "environ"):
+            with contextlib.suppress(OSError):
+                text = Path(f"/proc/{pid}/{name}").read_bytes()
+                if pid != os.getpid() and any(needle in text for needle in needles):
+                    return True
+        return False
+
+    def _mounts(self) -> list[str]:
+        needles = [str(self._folder), *self._marks]
+        lines = Path("/proc/self/mountinfo").read_text().splitlines()
+        return [line for line in lines if any(needle in line for needle in needles)]
+
+    def _files(self) -> Iterator[Path]:
+        """What of containers is still in folders of state, and sockets. Logs are kept."""
+        for path in _walk(self._folder):
+            of_container = path.name in self._marks and "logs" not in path.parts
+            if of_container or (path.is_socket() and "link" in path.name) or path.suffix == ".new":
+                yield path
+
+
+def footprint(pid: int) -> Footprint:
+    """Look at a process's descriptors and memory."""
+    kinds: Counter[str] = Counter()
+    with contextlib.suppress(OSError):
+        for entry in Path(f"/proc/{pid}/fd").iterdir():
+            with contextlib.suppress(OSError):
+                kinds[str(entry.readlink()).partition(":")[0]] += 1
+    process = proc.read(pid)
+    return Footprint(kinds.total(), kinds["net"], process.resident if process is not None else 0)
+
+
+def task_set_cgroups() -> Iterator[Path]:
+    """The cgroups of all container task sets of the machine that have some."""
+    for parent, folders, _ in os.walk(CGROUPS):
+        ours = [name for name in folders if name.startswith("rce-") and name != "rce-engine"]
+        yield from (Path(parent, name) for name in ours)
+        folders[:] = [name for name in folders if name not in ours]
+
+
+def sweep_cgroups(folder: Path) -> None:
+    """Kill what is left in the cgroups of an engine that a test has ended, and remove them."""
+    traces = Traces(folder)
+    traces.look()
+    for cgroup in traces.cgroups():
+        for pid in files.pids(cgroup):
+            process = proc.read(pid)
+            if process is not None:
+                proc.kill(process)
+        with contextlib.suppress(OSError):
+            files.drop(cgroup)
+
+
+def sweep_empty_cgroups() -> None:
+    """Remove what killed test runs left: cgroups of task sets without any container.
+
+    Those of task sets that run are not harmed: they make it again with their next container.
+    """
+    for cgroup in task_set_cgroups():
+        with contextlib.suppress(OSError):
+            cgroup.rmdir()
+
+
+def _walk(folder: Path) -> Iterator[Path]:
+    """All that is in a folder; what vanishes meanwhile is left out."""
+    for parent, folders, names in os.walk(folder):
+        yield from (Path(parent, name) for name in (*folders, *names))
+
+
+def _describe(pid: int) -> str:
+    with contextlib.suppress(OSError):
+        return f"{pid} {Path(f'/proc/{pid}/cmdline').read_bytes()[:200].replace(bytes(1), b' ').decode()}"
+    return str(pid)
