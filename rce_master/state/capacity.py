@@ -16,6 +16,8 @@ from rce_master.state.placement import Room
 from rce_master.state.records import Container, TaskSet, UserRole, tombstone_key
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rce_master.state.changes import Transaction
     from rce_master.state.tables import Tables
 
@@ -35,10 +37,7 @@ def room_at(tables: Tables, task_set: TaskSet) -> Room:
         alias=_alias(tables, task_set),
         draining=is_draining(tables, task_set),
     )
-    for container in (*placed, *coming):
-        if container is not None:
-            room = room.with_(container.resources)
-    return room
+    return room.filled(container.resources for container in (*placed, *coming) if container is not None)
 
 
 def _alias(tables: Tables, task_set: TaskSet) -> str:
@@ -153,13 +152,16 @@ def _check_privileges(wish: Resources) -> None:
 
 def _check_sums(tx: Transaction, wishes: list[Resources]) -> None:
     settings = tx.settings
-    sums: list[tuple[float, float, str]] = [
-        (sum(max(1, w.size) for w in wishes), settings.max_slots, "slots"),
-        (sum(w.cpu for w in wishes), settings.max_cpu, "cores"),
-        (sum(w.memory for w in wishes) / MEGABYTE, settings.max_memory / MEGABYTE, "MB of memory"),
+    sums: list[tuple[float, Callable[[Resources], float], str]] = [
+        (settings.max_slots, lambda wish: max(1, wish.size), "slots"),
+        (settings.max_cpu, lambda wish: wish.cpu, "cores"),
+        (settings.max_memory / MEGABYTE, lambda wish: wish.memory / MEGABYTE, "MB of memory"),
     ]
-    for asked, most, what in sums:
-        if most and asked > most + 1e-6:
+    for most, amount, what in sums:
+        if not most:
+            continue
+        asked = sum(map(amount, wishes))
+        if asked > most + 1e-6:
             raise LimitReached(
                 f"your containers would have {write_cores(asked)} {what} in all, and you may have "
                 f"{write_cores(most)}; make others smaller (rce resize) or destroy them"

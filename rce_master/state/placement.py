@@ -63,11 +63,33 @@ class Room:
         """What people call it."""
         return self.alias or self.machine.name
 
+    def filled(self, wishes: Iterable[Resources]) -> Room:
+        """Tell what it is like with more containers; as :meth:`with_` for each, but quick for many."""
+        slots = memory = containers = 0
+        cpu, share = 0.0, self._share
+        for wish in wishes:
+            size = wish.size if wish.size > 1 else 1
+            slots += size
+            cpu += wish.cpu
+            memory += wish.memory or size * share
+            containers += 1
+        return replace(
+            self,
+            slots=self.slots + slots,
+            cpu=self.cpu + cpu,
+            memory=self.memory + memory,
+            containers=self.containers + containers,
+        )
+
+    @property
+    def _share(self) -> int:
+        """A slot's share of the memory, in bytes."""
+        return self.machine.memory // self.machine.slots if self.machine.slots else 0
+
     def need(self, wish: Resources) -> Need:
         """Tell what a container takes here."""
         slots = max(1, wish.size)
-        share = self.machine.memory // self.machine.slots if self.machine.slots else 0
-        return Need(slots=slots, cpu=wish.cpu, memory=wish.memory or slots * share)
+        return Need(slots=slots, cpu=wish.cpu, memory=wish.memory or slots * self._share)
 
     def with_(self, wish: Resources) -> Room:
         """Tell what it is like with one more container."""

@@ -137,6 +137,17 @@ def test_no_machine_is_ever_promised_more_than_it_has(rooms: list[Room], wishes:
         assert found[chosen.process].without(wish).load == pytest.approx(chosen.load)
 
 
+@given(ROOMS, st.lists(WISHES, max_size=9))
+def test_filling_a_machine_at_once_is_filling_it_one_by_one(
+    rooms: list[Room], wishes: list[Resources]
+) -> None:
+    for each in rooms:
+        filled = each
+        for wish in wishes:
+            filled = filled.with_(wish)
+        assert each.filled(wishes) == filled
+
+
 @given(ROOMS, WISHES, st.randoms())
 def test_the_choice_does_not_depend_on_the_order(rooms: list[Room], wish: Resources, random: Any) -> None:
     shuffled = list(rooms)
