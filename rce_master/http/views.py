@@ -65,7 +65,7 @@ class Views:
             user=container.user,
             tag=container.tag,
             state=live.phase.value,
-            detail=live.status.detail if live.status else "",
+            detail=(live.status.detail if live.status else "") or live.stays,
             task_set=container.task_set,
             machine=task_set.machine.name if task_set else "",
             revision=container.revision,

@@ -68,7 +68,7 @@ class Room:
         slots = memory = containers = 0
         cpu, share = 0.0, self._share
         for wish in wishes:
-            size = wish.size if wish.size > 1 else 1
+            size = max(1, wish.size)
             slots += size
             cpu += wish.cpu
             memory += wish.memory or size * share

@@ -98,7 +98,7 @@ def tell_waiting(tx: Transaction) -> None:
 
 def _tell(tx: Transaction, container: Container, why: str) -> None:
     text = f"container {container.tag!r} waits for a machine and starts as soon as one takes it: {why}"
-    tx.put(replace(tx.tables.container_live(container.id), told=True))
+    tx.put(replace(tx.tables.container_live(container.id), told=True, stays=why))
     tx.notify(container.user, text)
     tx.happen("container_waiting", container.id, text)
 

@@ -239,7 +239,8 @@ class ContainerLive(Struct, frozen=True, kw_only=True):
     told: bool = False
     """Whether its user was told that there is nowhere to place it."""
     stays: str = ""
-    """Why it is still at a machine that is draining, as operators were told."""
+    """Why it waits for a machine, as its user was told, or is still at one that is draining, as operators
+    were."""
     rest_until: float = 0.0
     """When a move of it that failed may be tried again."""
 

@@ -84,7 +84,9 @@ async def test_amounts_are_read_and_out_of_capacity_is_a_conflict(site: Site) ->
         reply = await site.api("POST", "/containers", {"tag": "d", "memory": "lots"}, status=422)
         assert "data.containerData.memory: must be a number of MB such as 256" in reply["error"]
         await site.api("POST", "/containers", {"tag": "d", "cpu": 4, "wait": True}, status=204)
-        assert (await container(site, "d"))["state"] == "requested"
+        shown = await container(site, "d")
+        assert shown["state"] == "requested"
+        assert shown["detail"] == "m1 has 1.5 of 2 cores free, 4 needed"
         (machine,) = (await site.api("GET", "/machines"))["machines"]
         assert (machine["promised_cores"], machine["promised_slots"], machine["slots"]) == (0.5, 2, 8)
 
