@@ -16,6 +16,7 @@ import pytest
 from rce.ros.actions import ActionClient, ActionServer, GoalFailed, GoalState, ServerGoal, SimpleActionServer
 from rce.ros.core import Core
 from rce.ros.node import Node
+from rce.ros.types import Time
 
 pytestmark = [pytest.mark.needs("actionlib"), pytest.mark.timeout(300)]
 
@@ -259,6 +260,33 @@ async def choose(goal: ServerGoal) -> dict[str, Any] | None:
         return None
     goal.accept()
     return await answer(goal)
+
+
+@asynccontextmanager
+async def ticking(core: Core, speed: float) -> AsyncIterator[None]:
+    """Let time be simulated, and pass so many times as fast."""
+    core.set_param("/use_sim_time", True)
+    async with Node("world", argv=[], master_uri=core.uri) as world:
+        clock = await world.advertise("/clock", "rosgraph_msgs/Clock")
+
+        async def tick() -> None:
+            seconds = 1000.0
+            while True:
+                clock.publish(clock=Time.from_sec(seconds))
+                await asyncio.sleep(0.01)
+                seconds += 0.01 * speed
+
+        ticks = asyncio.create_task(tick())
+        try:
+            yield
+        finally:
+            ticks.cancel()
+            await asyncio.wait([ticks])
+
+
+async def test_real_clients_in_simulated_time(core: Core, node: Node, peer: Peer) -> None:
+    async with ticking(core, speed=5.0):
+        await test_real_clients_at_our_servers(node, peer)
 
 
 async def test_real_clients_at_our_servers(node: Node, peer: Peer) -> None:
