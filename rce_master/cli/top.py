@@ -118,7 +118,19 @@ def _machines(machines: list[Usage]) -> Table:
 
 
 def _containers(containers: list[Usage], look: Look) -> Table:
-    names = ("container", "state", "at", "cpu", "of", "memory", "of", "disk in", "out", "link in", "out")
+    names = (
+        "container",
+        "state",
+        "at",
+        "cpu",
+        "of limit",
+        "memory",
+        "of limit",
+        "disk in",
+        "out",
+        "link in",
+        "out",
+    )
     table = Table(*names, "procs", "restarts", "oom", box=None)
     for container in sorted(containers, key=lambda c: _rank(c, look.sort)):
         table.add_row(
