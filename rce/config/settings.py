@@ -90,7 +90,7 @@ class MasterSettings(Strict):
     max_cpu: Annotated[float, BeforeValidator(_as_cores)] = 0.0
     """Cores that the containers of one user may ask for together."""
     max_memory: Annotated[int, BeforeValidator(_as_bytes)] = 0
-    """Bytes that the containers of one user may ask for together; written in MB, or as a text such as ``8G``."""
+    """Bytes that the containers of one user may ask for together; written in MB or as a text (``8G``)."""
 
 
 class RobotSettings(Strict):
