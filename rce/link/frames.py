@@ -186,6 +186,10 @@ class _Message:
         self.view.release()
         return self.first._replace(payload=self._buffer.getvalue())
 
+    def discard(self) -> None:
+        """Let go of the buffer, which complains if it is freed while it is looked into."""
+        self.view.release()
+
 
 class FrameReader:
     """Turns bytes into frames: fill :meth:`get_buffer`, then tell :meth:`advance` how much was filled.
@@ -255,6 +259,13 @@ class FrameReader:
             frames += self.advance(count)
             rest = rest[count:]
         return frames
+
+    def close(self) -> None:
+        """Forget the messages that did not become complete. The reader cannot be used any more."""
+        for message in {*self._unfinished.values(), *([self._current] if self._current else [])}:
+            message.discard()
+        self._unfinished.clear()
+        self._current = None
 
     def _parse(self) -> list[Frame]:
         frames: list[Frame] = []
@@ -327,6 +338,7 @@ class FrameReader:
         message = self._unfinished.pop(channel, None)
         if message is None:
             raise ProtocolError("ABORT without an unfinished message")
+        message.discard()
         self._unfinished_bytes -= message.total
 
     def _compact(self) -> None:

@@ -247,6 +247,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         if self._timer is not None:
             self._timer.cancel()
         self._transport = None
+        self._reader.close()
         self._closed.set_result(None)
         self._on_closed(self)
 

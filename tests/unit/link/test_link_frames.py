@@ -207,3 +207,16 @@ def test_missing_says_what_must_come() -> None:
     assert reader.missing == HEADER.size - 10
     reader.feed(hello[10:30])
     assert reader.missing == len(hello) - 30
+
+
+def test_a_closed_reader_lets_go_of_incomplete_messages() -> None:
+    reader = FrameReader(LinkLimits())
+    for channel in (1, 2):
+        frame = Frame(FrameType.DATA, channel, payload=b"\0" * 50_000)
+        reader.feed(pack_header(frame, 20_000, 50_000) + bytes(20_000))
+    reader.feed(pack_fragment(1, 20_000, 50_000) + bytes(100))
+    views = [message.view for message in reader._unfinished.values()]
+    reader.close()
+    for view in views:
+        with pytest.raises(ValueError, match="released"):
+            len(view)
