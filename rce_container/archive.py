@@ -82,7 +82,8 @@ class LogArchive:
                 _write(folder, Life(id=id_, mark=mark, began=now))
                 folder.mkdir(mode=0o700)
         except OSError as error:
-            raise StateError(f"cannot make {error.filename}: {error.strerror}") from error
+            self._remove(folder)
+            raise StateError(f"cannot make {error.filename or folder}: {error.strerror}") from error
         return folder
 
     def end(self, id_: str, mark: str, reason: str, now: float) -> None:
@@ -176,9 +177,28 @@ def _read(folder: Path) -> Life | None:
 
 def _write(folder: Path, life: Life) -> None:
     """Write a life's record, atomically."""
-    temporary = folder.with_name(f"{folder.name}.new")
-    temporary.write_bytes(msgspec.json.encode(life))
-    temporary.replace(_record(folder))
+    write_whole(_record(folder), folder.with_name(f"{folder.name}.new"), msgspec.json.encode(life))
+
+
+def write_whole(path: Path, temporary: Path, data: bytes) -> None:
+    """Write a file whole or not at all.
+
+    Args:
+        path: The file.
+        temporary: Holds the data until it is there; beside the file.
+        data: All of it.
+
+    Raises:
+        OSError: It cannot be written; names a file. What was there before still is.
+    """
+    try:
+        temporary.write_bytes(data)
+        temporary.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        error.filename = error.filename or str(path)
+        raise
 
 
 def _size(folder: Path) -> int:

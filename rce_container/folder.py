@@ -23,7 +23,7 @@ from typing import Self
 import msgspec
 from msgspec import Struct
 
-from rce_container.archive import LOG_DAYS, LOG_SPACE, LogArchive
+from rce_container.archive import LOG_DAYS, LOG_SPACE, LogArchive, write_whole
 from rce_container.exceptions import StateError
 
 _MARK = re.compile(r"[0-9a-f]{12}")
@@ -110,10 +110,8 @@ class ContainerFolder:
         Raises:
             StateError: It cannot be written.
         """
-        temporary = self.path / "record.new"
         try:
-            temporary.write_bytes(msgspec.json.encode(record))
-            temporary.replace(self.path / "record.json")
+            write_whole(self.path / "record.json", self.path / "record.new", msgspec.json.encode(record))
         except OSError as error:
             raise StateError(f"cannot write {error.filename}: {error.strerror}") from error
 
@@ -242,6 +240,7 @@ class StateFolder:
         try:
             folder.make()
         except StateError as error:
+            folder.remove()
             self.archive.end(id_, mark, str(error), time.time())
             raise
         return folder

@@ -301,7 +301,7 @@ class Manager:
             limits = limits_of(self._core.resources(id_), self._settings)
             cell = self._limiter.create(folder.mark, limits)
             handle = self._launch(id_, folder, runtime, cell)
-        except ContainerError as error:
+        except (ContainerError, OSError) as error:  # disk, descriptors or memory of this machine ran out
             self._tasks.create_task(self._remove_cell(folder.mark), name=f"cell of {id_}")
             self._tasks.create_task(self._networks.detach(folder.mark), name=f"network of {id_}")
             folder.remove()

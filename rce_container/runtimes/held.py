@@ -53,22 +53,24 @@ class HeldHandle(Handle):
         Raises:
             StartError: It cannot be started.
         """
-        tether, theirs = socket.socketpair()
-        with theirs, contextlib.ExitStack() as undo:
-            undo.callback(tether.close)
-            tether.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
-            streams = (theirs.fileno(), theirs.fileno())
-            keep = () if lock < 0 else (lock,)
-            popen, process = spawn_shim(order, argv, {"PATH": os.defpath}, streams, keep=keep)
-            undo.pop_all()
-        handle = cls(process, popen, birth, nursery)
         log = segment_path(order.folder.logs, ENVIRONMENT_LOG, 0)
-        handle._fds = {
-            "tether": tether.detach(),
-            "control": os.dup(order.control),
-            "links": os.dup(order.links),
-            "log": os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC),
-        }
+        try:
+            tether, theirs = socket.socketpair()
+            with theirs, contextlib.ExitStack() as undo:
+                tether.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
+                fds = {"tether": tether.detach()}
+                undo.callback(_close_all, fds)
+                fds["control"] = os.dup(order.control)
+                fds["links"] = os.dup(order.links)
+                fds["log"] = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666)
+                streams = (theirs.fileno(), theirs.fileno())
+                keep = () if lock < 0 else (lock,)
+                popen, process = spawn_shim(order, argv, {"PATH": os.defpath}, streams, keep=keep)
+                undo.pop_all()
+        except OSError as error:
+            raise StartError(f"its processes cannot be started: {error}") from error
+        handle = cls(process, popen, birth, nursery)
+        handle._fds = fds
         return handle
 
     async def launch(self, prepare: Prepare | None = None) -> None:
@@ -109,9 +111,13 @@ class HeldHandle(Handle):
         return holder
 
     def _close(self) -> None:
-        for fd in self._fds.values():
-            os.close(fd)
-        self._fds.clear()
+        _close_all(self._fds)
+
+
+def _close_all(fds: dict[str, int]) -> None:
+    for fd in fds.values():
+        os.close(fd)
+    fds.clear()
 
 
 def _descends(pid: int, ancestor: int) -> bool:

@@ -135,7 +135,10 @@ class NamespaceRuntime(Runtime):
         return self._start(order)
 
     def _start(self, order: Order, check: tuple[str, ...] = ()) -> HeldHandle:
-        write_etc(order)
+        try:
+            write_etc(order)
+        except OSError as error:
+            raise StartError(f"its /etc cannot be written: {error}") from error
         uid, lock = self._uids.take() if self._root else (0, -1)
         birth = Birth(
             boot=order.boot,

@@ -26,6 +26,8 @@ LONGEST_PAUSE_S = 0.4
 SETTLE_S = 60.0
 MASTER_AND_MANAGER = 0.25
 """How often the victim is one of the two programs, and not a process below them."""
+DESTROYED = 0.5
+"""How often a container that is there is destroyed, and not resized."""
 TWICE = 0.25
 """How often another one is killed right after."""
 FD_SLACK = 3
@@ -93,13 +95,14 @@ class Chaos:
     async def _act(self) -> None:
         one = self.dice.choice(self.customers)
         if not one.wants:
-            act = one.create()
-        elif self.dice.random() < 0.5:
-            act = one.destroy()
+            self.story.append(f"create {one.container}")
+            await one.create()
+        elif self.dice.random() < DESTROYED:
+            self.story.append(f"destroy {one.container}")
+            await one.destroy()
         else:
-            act = one.resize(self.dice.randrange(128, 512))
-        self.story.append(f"{act.__name__} {one.container}")
-        await act
+            self.story.append(f"resize {one.container}")
+            await one.resize(self.dice.randrange(128, 512))
 
     async def _strike(self) -> None:
         if self.dice.random() < MASTER_AND_MANAGER:

@@ -23,6 +23,8 @@ from rce_container.environment.process import strike_all
 
 _PASSING = frozenset({errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE, errno.ETXTBSY, errno.ENOSPC})
 """Errors for which a start may succeed when it is tried later."""
+_LONGEST_FIRST_LINE = 256
+"""Bytes that the kernel reads of it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -156,4 +158,20 @@ def describe_exit(code: int) -> str:
 
 def _in_words(error: OSError) -> str:
     text = error.strerror or str(error)
-    return f"{error.filename}: {text}" if error.filename else text
+    if not error.filename:
+        return text
+    if error.errno == errno.ENOENT and (interpreter := _interpreter(error.filename)):
+        text = f"the interpreter {interpreter} of its first line does not exist here"
+    elif error.errno == errno.ENOEXEC:
+        text += "; if it is a script, its first line must name its interpreter, as in #!/usr/bin/env python3"
+    return f"{error.filename}: {text}"
+
+
+def _interpreter(script: str) -> str:
+    """What the first line of a script names; empty if there is none."""
+    try:
+        with Path(script).open("rb") as file:
+            line = file.readline(_LONGEST_FIRST_LINE)
+    except OSError:
+        return ""
+    return line[2:].strip().decode(errors="replace") if line.startswith(b"#!") else ""
