@@ -56,11 +56,10 @@ def test_received_messages_are_summed_over_topics_and_connections() -> None:
 def test_a_robots_machine_takes_nothing_of_other_robots() -> None:
     argv = sync_argv("Robot1", ["Robot1", "Robot2"])
     assert argv[argv.index("--hosts") + 1] == PLANNER
-    assert argv[argv.index("--topics") + 1] == "/Robot1/goalNodesList,/Robot1/cancelGoal,/map"
+    assert argv[argv.index("--topics") + 1] == "/Robot1/goalNodesList,/Robot1/cancelGoal"
 
 
 def test_the_planners_machine_takes_little_of_every_robot() -> None:
     argv = sync_argv(PLANNER, ["Robot1", "Robot2"])
     topics = argv[argv.index("--topics") + 1].split(",")
-    assert topics[:3] == ["/Robot1/amcl_pose", "/Robot1/moveClient/status", "/Robot1/blockedCells"]
-    assert len(topics) == 6
+    assert topics == [f"/Robot{n}/{name}" for n in (1, 2) for name in ("amcl_pose", "goalNodesList")]
