@@ -22,6 +22,7 @@ from msgspec import Struct
 from rce.protocol.names import EndpointId
 from rce_container.exceptions import StateError
 from rce_container.logs import last_line
+from rce_container.writing import write_whole
 
 log = logging.getLogger(__name__)
 
@@ -177,28 +178,7 @@ def _read(folder: Path) -> Life | None:
 
 def _write(folder: Path, life: Life) -> None:
     """Write a life's record, atomically."""
-    write_whole(_record(folder), folder.with_name(f"{folder.name}.new"), msgspec.json.encode(life))
-
-
-def write_whole(path: Path, temporary: Path, data: bytes) -> None:
-    """Write a file whole or not at all.
-
-    Args:
-        path: The file.
-        temporary: Holds the data until it is there; beside the file.
-        data: All of it.
-
-    Raises:
-        OSError: It cannot be written; names a file. What was there before still is.
-    """
-    try:
-        temporary.write_bytes(data)
-        temporary.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        error.filename = error.filename or str(path)
-        raise
+    write_whole(_record(folder), msgspec.json.encode(life))
 
 
 def _size(folder: Path) -> int:

@@ -23,8 +23,9 @@ from typing import Self
 import msgspec
 from msgspec import Struct
 
-from rce_container.archive import LOG_DAYS, LOG_SPACE, LogArchive, write_whole
+from rce_container.archive import LOG_DAYS, LOG_SPACE, LogArchive
 from rce_container.exceptions import StateError
+from rce_container.writing import write_whole
 
 _MARK = re.compile(r"[0-9a-f]{12}")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,127}")
@@ -111,7 +112,7 @@ class ContainerFolder:
             StateError: It cannot be written.
         """
         try:
-            write_whole(self.path / "record.json", self.path / "record.new", msgspec.json.encode(record))
+            write_whole(self.path / "record.json", msgspec.json.encode(record))
         except OSError as error:
             raise StateError(f"cannot write {error.filename}: {error.strerror}") from error
 
@@ -168,26 +169,30 @@ class StateFolder:
 
     def __enter__(self) -> Self:
         try:
+            self._take()
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def _take(self) -> None:
+        try:
             self._containers.mkdir(mode=0o700, parents=True, exist_ok=True)
             self._lock = os.open(self._state / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._run = self._run_base / f"c-{self.token}"
+            self._run.mkdir(mode=0o700, parents=True, exist_ok=True)
         except BlockingIOError as error:
-            self.__exit__()
             raise StateError(
                 f"another rce-container uses {self._state}; give this one its own --state-dir"
             ) from error
         except OSError as error:
-            self.__exit__()
             raise StateError(f"cannot use the state directory {self._state}: {error}") from error
-        self._run = self._run_base / f"c-{self.token}"
-        self._run.mkdir(mode=0o700, parents=True, exist_ok=True)
         longest = len(os.fsencode(self._run / ("0" * 12) / "control.sock"))
         if longest > _MAX_SOCKET_PATH:
-            self.__exit__()
             raise StateError(
                 f"the path {self._run} is too long for sockets; set XDG_RUNTIME_DIR to a shorter one"
             )
-        return self
 
     def __exit__(self, *_: object) -> None:
         with contextlib.suppress(OSError):
@@ -205,7 +210,7 @@ class StateFolder:
         if wish:
             if not _NAME.fullmatch(wish):
                 raise StateError(f"{wish!r} cannot name a task set: use letters, digits, '_', '-' and '.'")
-            (self._state / "name").write_text(wish)
+            self._keep(self._state / "name", wish)
         return self._word("name", f"container-{secrets.token_hex(4)}")
 
     @property
@@ -258,10 +263,16 @@ class StateFolder:
     def _word(self, file: str, default: str) -> str:
         path = self._state / file
         try:
-            word = path.read_text().strip()
+            word = path.read_text(errors="replace").strip()
         except OSError:
             word = ""
         if not _NAME.fullmatch(word):
             word = default
-            path.write_text(word)
+            self._keep(path, word)
         return word
+
+    def _keep(self, path: Path, word: str) -> None:
+        try:
+            write_whole(path, word.encode())
+        except OSError as error:
+            raise StateError(f"cannot write {path}: {error.strerror}") from error

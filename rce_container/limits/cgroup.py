@@ -20,6 +20,7 @@ from rce_container.exceptions import KillError, LimitError
 from rce_container.limits import files, hierarchy
 from rce_container.limits.base import Cell, Limiter, Limits, in_megabytes
 from rce_container.limits.rlimit import rlimits_of
+from rce_container.writing import write_whole
 
 PERIOD_US = 100_000
 """A CPU limit holds over each period of this length."""
@@ -225,7 +226,7 @@ class CgroupLimiter(Limiter):
             if parent not in self._parents:
                 _drop_if_empty(parent)
         kept = [parent for parent in parents if parent in self._parents or parent.is_dir()]
-        self._ledger.write_text("".join(f"{parent}\n" for parent in kept))
+        write_whole(self._ledger, "".join(f"{parent}\n" for parent in kept).encode())
 
     def close(self) -> None:
         """Remove this task set's folders, if nothing is in them."""

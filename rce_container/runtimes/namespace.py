@@ -52,6 +52,10 @@ _ETC = (
     "ros",
 )
 _PROBE_TIMEOUT_S = 20.0
+_NO_USER_NAMESPACES = (
+    " (a normal user needs user namespaces for that; see the sysctls user.max_user_namespaces, "
+    "kernel.unprivileged_userns_clone and kernel.apparmor_restrict_unprivileged_userns)"
+)
 _READ_BY_OTHERS = stat.S_IROTH | stat.S_IXOTH
 
 
@@ -151,10 +155,13 @@ class NamespaceRuntime(Runtime):
             check=check,
         )
         try:
-            return HeldHandle.start(self._command(order), order, birth, self._nursery, lock)
+            handle = HeldHandle.start(self._command(order), order, birth, self._nursery, lock)
         finally:
             if lock >= 0:
                 os.close(lock)
+        if not self._root:
+            handle.complaint += _NO_USER_NAMESPACES
+        return handle
 
     def _try(self, failures: list[Exception]) -> None:
         try:
