@@ -1,9 +1,10 @@
-"""Machines that lack something, or have what the dead left: ``rce-container`` tells what to do, or does it."""
+"""Machines that lack something, or have what the dead left: ``rce-container`` says what to do, or does it."""
 
 from __future__ import annotations
 
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -65,8 +66,10 @@ async def test_user_namespaces_are_forbidden(container: Program, folder: Path) -
     words = "a normal user needs user namespaces for that; see the sysctls user.max_user_namespaces"
     assert words in container.output()
     assert "containers are NOT isolated" in container.output()
-    await container.kill()
-    await until(lambda: not Traces(folder).processes(), what="the program in bubblewrap has ended")
+    (inner,) = [one for one in Traces(folder).look() if one.parent == container.pid]
+    os.kill(inner.pid, signal.SIGTERM)
+    assert container.process is not None
+    assert await container.process.wait() == 0
     container.argv += ["--runtime", "namespace"]
     assert words in await refuses(container)
 
@@ -104,13 +107,10 @@ async def test_what_a_crash_left_is_removed_and_nobody_else_is_harmed(
     run = next(path for path in folder.rglob(f"c-{token}"))
     me = proc.read(os.getpid())
     assert me is not None
-    records = {
-        "0" * 12: "",
-        "1" * 12: json.dumps(
-            {"id": "u/b", "mark": "1" * 12, "runtime": "process", "pid": me.pid, "start": 1}
-        ),
-        "2" * 12: json.dumps({"id": "u/b", "mark": "2" * 12, "runtime": "gone", "pid": 1 << 22, "start": 1}),
-    }
+    one, other, third = (number * 12 for number in "012")
+    reused = {"id": "u/b", "mark": other, "runtime": "process", "pid": me.pid, "start": 1}
+    gone = {"id": "u/b", "mark": third, "runtime": "of old", "pid": 1 << 22, "start": 1}
+    records = {one: "", other: json.dumps(reused), third: json.dumps(gone)}
     for mark, record in records.items():
         for parent in (state / "containers", run):
             (parent / mark / "home").mkdir(parents=True)
