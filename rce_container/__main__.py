@@ -27,6 +27,7 @@ from rce.cli.options import (
 from rce.config.exceptions import RunDirError, SecretError
 from rce.config.secret import load_secret
 from rce.control.limits import MEGABYTE
+from rce.guard.files import raise_file_limit
 from rce_container.app import AUTO, RUNTIMES, App, package_path
 from rce_container.archive import LOG_DAYS, LOG_SPACE
 from rce_container.bundles.requirements import InstallerSettings
@@ -139,6 +140,7 @@ def container(
 ) -> None:
     """Run a container task set: makes the containers of the master at MASTER_IP on this machine."""
     start_logging(verbose=verbose)
+    raise_file_limit()
     settings = ContainerSettings(
         machine=machine or socket.gethostname(),
         packages=package_path(package_path_ or ()),

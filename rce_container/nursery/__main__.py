@@ -6,6 +6,7 @@ event loop, and knows no secret: all that it ever held is in every environment's
 
 from __future__ import annotations
 
+import array
 import contextlib
 import gc
 import importlib
@@ -62,15 +63,28 @@ def main() -> None:
 
 def _wait(orders: socket.socket) -> tuple[Birth, Gifts] | None:
     """Fork a child for each order. Returns in the children, and with nothing when the manager is gone."""
+    packet = bytearray(MAX_PACKET)
     while True:
-        packet, fds, _, _ = socket.recv_fds(orders, MAX_PACKET, _GIFTS)
-        if not packet:
+        size, fds = _receive(orders, packet)
+        if not size:
             return None
         child = os.fork() if len(fds) == _GIFTS else -1
         if child == 0:
-            return decode_birth(packet), Gifts(*fds)
+            return decode_birth(memoryview(packet)[:size]), Gifts(*fds)
+        packet[:size] = bytes(size)  # the next container shall not find who came before
         for fd in fds:
             os.close(fd)
+
+
+def _receive(orders: socket.socket, packet: bytearray) -> tuple[int, array.array[int]]:
+    """Wait for an order; returns its size and its descriptors."""
+    fds = array.array("i")
+    room = socket.CMSG_SPACE(_GIFTS * fds.itemsize)
+    size, ancillary, _, _ = orders.recvmsg_into((packet,), room)
+    for level, kind, data in ancillary:
+        if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
+            fds.frombytes(data[: len(data) - len(data) % fds.itemsize])
+    return size, fds
 
 
 def _live(birth: Birth, gifts: Gifts, program: bytes) -> None:

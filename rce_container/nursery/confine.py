@@ -14,6 +14,7 @@ import resource
 import select
 from pathlib import Path
 
+from rce_container.environment.process import limit_oneself
 from rce_container.nursery import kernel, mounts
 from rce_container.nursery.kernel import Namespaces
 from rce_container.nursery.messages import Birth, Gifts
@@ -22,7 +23,19 @@ USER_ID = 1000
 """User and group inside."""
 
 _JOINED = Namespaces.MOUNT | Namespaces.PID | Namespaces.IPC | Namespaces.UTS | Namespaces.CGROUP
-_ONE_USER_ONLY = "sys/user/max_user_namespaces"
+_COUNTED = {"max_user_namespaces": 0, "max_inotify_instances": 32, "max_inotify_watches": 8192}
+"""What the kernel counts in a user namespace, and how much of it is to be had: of the machine's user who made
+the namespace it is taken too."""
+_RLIMITS = {
+    resource.RLIMIT_RTPRIO: 0,
+    resource.RLIMIT_NICE: 0,
+    resource.RLIMIT_SIGPENDING: 4096,
+    resource.RLIMIT_MSGQUEUE: 1 << 18,
+}
+"""What the engine's user may have, and containers not, or not as much: priority over all others, and what is
+counted for each user of the machine. Numbers are those of ``setrlimit(2)``."""
+_FILES = 4096
+"""How many files a process may have open if it does not ask for more, which it may."""
 _NO_CORE = 1
 """The one size by which the kernel gives a core neither to a file nor to a program of the machine."""
 
@@ -102,14 +115,19 @@ def _become_user(procfs: int, owner: int) -> None:
         os._exit(0)
     os.close(made)
     os.close(map_)
+    # Whoever makes the namespace pays for what is counted in it: not root, who would pay for all containers.
+    kernel.keep_rights_as_another_user()
+    os.setegid(owner)
+    os.seteuid(owner)
     kernel.unshare(Namespaces.USER)
     os.write(make, b"u")
     if not os.read(mapped, 1):
         raise PermissionError("the user namespace was not mapped")
     os.close(make)
     os.close(mapped)
-    with contextlib.suppress(FileNotFoundError):  # a kernel without that setting has no such namespaces
-        _write(procfs, _ONE_USER_ONLY, "0")
+    for name, count in _COUNTED.items():
+        with contextlib.suppress(FileNotFoundError):  # a kernel without that setting has no such thing
+            _write(procfs, f"sys/user/{name}", str(count))
     os.setresgid(USER_ID, USER_ID, USER_ID)
     os.setresuid(USER_ID, USER_ID, USER_ID)
 
@@ -118,11 +136,24 @@ def _give_up(program: bytes) -> None:
     os.setsid()
     os.umask(0o022)
     resource.setrlimit(resource.RLIMIT_CORE, (_NO_CORE, _NO_CORE))
+    limit_oneself(_RLIMITS)
+    _leave_files_to_others()
     kernel.give_up_capabilities()
     kernel.take_in_orphans()
     kernel.set_dumpable(False)
     if program:
         kernel.filter_calls(program)
+
+
+def _leave_files_to_others() -> None:
+    """Allow half as many open files as the engine has.
+
+    Descriptors that wait in sockets are counted for a user of the machine. Where that is the engine's own,
+    containers must come to the end of theirs before it does.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    half = hard // 2 if hard != resource.RLIM_INFINITY else hard
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(soft, half, _FILES), half))
 
 
 def _write(folder: int, name: str, text: str) -> None:

@@ -33,6 +33,7 @@ class Mount(IntFlag):
     NO_EXEC = 8
     REMOUNT = 32
     BIND = 4096
+    RECURSIVE = 16384
 
 
 class _Prctl(IntEnum):
@@ -40,12 +41,14 @@ class _Prctl(IntEnum):
     SET_NAME = 15
     SET_SECCOMP = 22
     CAPBSET_DROP = 24
+    SET_SECUREBITS = 28
     SET_CHILD_SUBREAPER = 36
     SET_NO_NEW_PRIVS = 38
     CAP_AMBIENT = 47
 
 
 _CAP_AMBIENT_CLEAR_ALL = 4
+_SECBIT_NO_SETUID_FIXUP = 4
 _CAPABILITY_VERSION_3 = 0x2008_0522
 _MNT_DETACH = 2
 _NS_GET_USERNS = 0xB701
@@ -106,6 +109,11 @@ def set_name(name: str) -> None:
     """Set what the process is called in lists; 15 bytes of it are kept."""
     text = ctypes.create_string_buffer(os.fsencode(name))
     _prctl(_Prctl.SET_NAME, ctypes.addressof(text))
+
+
+def keep_rights_as_another_user() -> None:
+    """Change users from now on without a loss of capabilities; a new user namespace ends that."""
+    _prctl(_Prctl.SET_SECUREBITS, _SECBIT_NO_SETUID_FIXUP)
 
 
 def give_up_capabilities() -> None:

@@ -17,23 +17,33 @@ TEMPORARY = ("/tmp", "/dev/shm")  # noqa: S108 - the container's own
 _BYTES_PER_FILE = 4096
 """A folder of so many bytes may hold a file for each such piece: empty files take memory too."""
 _FLAGS = Mount.NO_SUID | Mount.NO_DEV
+_TERMINALS = 32
+"""The machine has some thousands, for all."""
 _READ_ONLY_FROM_NOW_ON = Mount.REMOUNT | Mount.BIND | Mount.READ_ONLY | Mount.NO_SUID | Mount.NO_EXEC
 _HIDDEN = (
     "/proc/acpi",
     "/proc/asound",
+    "/proc/cmdline",
     "/proc/config.gz",
+    "/proc/diskstats",
     "/proc/driver",
+    "/proc/interrupts",
     "/proc/kallsyms",
     "/proc/kcore",
     "/proc/key-users",
     "/proc/keys",
     "/proc/kmsg",
     "/proc/latency_stats",
+    "/proc/mdstat",
     "/proc/modules",
     "/proc/mtrr",
+    "/proc/partitions",
     "/proc/sched_debug",
+    "/proc/schedstat",
     "/proc/scsi",
     "/proc/slabinfo",
+    "/proc/softirqs",
+    "/proc/swaps",
     "/proc/timer_list",
     "/proc/timer_stats",
     "/proc/vmallocinfo",
@@ -45,7 +55,8 @@ def limit(path: str, size: int, owner: int, mode: int) -> None:
     """Bound a folder that lives in memory, and give it to a user.
 
     Args:
-        path: A tmpfs.
+        path: A tmpfs. What is in it already leads to mounts of what must stay where it is, as it is: the
+            engine's modules, if they lie below that path.
         size: Bytes.
         owner: User and group.
         mode: Permissions.
@@ -54,6 +65,8 @@ def limit(path: str, size: int, owner: int, mode: int) -> None:
     mount(path, Mount.REMOUNT | _FLAGS, options=options)
     os.chown(path, owner, owner)
     os.chmod(path, mode)  # noqa: PTH101 - like its neighbours
+    for entry in os.scandir(path):
+        _fasten(entry.path)
 
 
 def take_away_logs(owner: int) -> int:
@@ -76,6 +89,15 @@ def mask_machine() -> None:
     for path in filter(os.path.exists, _READ_ONLY):
         _bind_read_only(path, path)
     mount("/dev", _READ_ONLY_FROM_NOW_ON)
+    terminals = f"max={_TERMINALS},ptmxmode=666,mode=620"
+    mount("/dev/pts", Mount.REMOUNT | Mount.NO_SUID | Mount.NO_EXEC, options=terminals)
+
+
+def _fasten(path: str) -> None:
+    """Let nobody rename a folder that leads to mounts, or put anything beside them."""
+    if not os.path.ismount(path):
+        mount(path, Mount.BIND | Mount.RECURSIVE, source=path)
+        mount(path, _READ_ONLY_FROM_NOW_ON | Mount.NO_DEV)
 
 
 def _bind_read_only(source: str, target: str) -> None:

@@ -43,17 +43,17 @@ _MAKES_NAMESPACES = sum(kind.value for kind in Namespaces) | _NAMESPACE_TIME
 _FILES = """
 access chdir chmod chown chown32 close close_range copy_file_range creat dup dup2 dup3 execve execveat
 faccessat faccessat2 fadvise64 fadvise64_64 fallocate fchdir fchmod fchmodat fchmodat2 fchown fchown32
-fchownat fcntl fcntl64 fdatasync fgetxattr flistxattr flock fremovexattr fsetxattr fstat fstat64 fstatat64
+fchownat fdatasync fgetxattr flistxattr flock fremovexattr fsetxattr fstat fstat64 fstatat64
 fstatfs fstatfs64 fsync ftruncate ftruncate64 futimesat getcwd getdents getdents64 getxattr
 inotify_add_watch inotify_init inotify_init1 inotify_rm_watch ioctl lchown lchown32 lgetxattr link linkat
-listxattr llistxattr _llseek lremovexattr lseek lsetxattr lstat lstat64 memfd_create mkdir mkdirat mknod
+listxattr llistxattr _llseek lremovexattr lseek lsetxattr lstat lstat64 mkdir mkdirat mknod
 mknodat newfstatat open openat openat2 pipe pipe2 pread64 preadv preadv2 pwrite64 pwritev pwritev2 read
 readahead readlink readlinkat readv removexattr rename renameat renameat2 rmdir sendfile sendfile64 setxattr
-splice stat stat64 statfs statfs64 statx symlink symlinkat sync sync_file_range syncfs tee truncate
+splice stat stat64 statfs statfs64 statx symlink symlinkat sync_file_range tee truncate
 truncate64 umask unlink unlinkat utime utimensat utimensat_time64 utimes vmsplice write writev
 """
 _MEMORY = """
-brk get_mempolicy madvise mbind membarrier mincore mlock mlock2 mlockall mmap mmap2 mprotect mremap mseal
+brk get_mempolicy madvise mbind membarrier mincore mlock mlock2 mlockall mprotect mremap mseal
 msync munlock munlockall munmap pkey_alloc pkey_free pkey_mprotect process_madvise remap_file_pages
 set_mempolicy set_mempolicy_home_node
 """
@@ -75,16 +75,15 @@ sysinfo tgkill time times tkill ugetrlimit uname vfork wait4 waitid waitpid
 _WAITING = """
 alarm clock_getres clock_getres_time64 clock_gettime clock_gettime64 clock_nanosleep clock_nanosleep_time64
 epoll_create epoll_create1 epoll_ctl epoll_ctl_old epoll_pwait epoll_pwait2 epoll_wait epoll_wait_old
-eventfd eventfd2 getitimer gettimeofday io_cancel io_destroy io_getevents io_pgetevents io_pgetevents_time64
-io_setup io_submit nanosleep pause poll ppoll ppoll_time64 pselect6 pselect6_time64 select setitimer
-timer_create timer_delete timer_getoverrun timer_gettime timer_gettime64 timer_settime timer_settime64
-timerfd_create timerfd_gettime timerfd_gettime64 timerfd_settime timerfd_settime64
+eventfd eventfd2 getitimer gettimeofday nanosleep pause poll ppoll ppoll_time64 pselect6 pselect6_time64
+select setitimer timer_create timer_delete timer_getoverrun timer_gettime timer_gettime64 timer_settime
+timer_settime64 timerfd_create timerfd_gettime timerfd_gettime64 timerfd_settime timerfd_settime64
 """
 _TALKING = """
 accept accept4 bind connect getpeername getsockname getsockopt listen mq_getsetattr mq_notify mq_open
 mq_timedreceive mq_timedreceive_time64 mq_timedsend mq_timedsend_time64 mq_unlink msgctl msgget msgrcv
 msgsnd recv recvfrom recvmmsg recvmmsg_time64 recvmsg semctl semget semop semtimedop semtimedop_time64 send
-sendmmsg sendmsg sendto setsockopt shmat shmctl shmdt shmget shutdown
+sendmmsg sendmsg sendto setsockopt shmat shmctl shmdt shutdown
 """
 
 ALLOWED = tuple(f"{_FILES} {_MEMORY} {_PROCESSES} {_WAITING} {_TALKING}".split())
@@ -94,11 +93,20 @@ _FAMILIES = (socket.AF_UNIX, socket.AF_INET, socket.AF_INET6)
 _PERSONALITIES = (0x0, 0x8, 0x2_0000, 0x2_0008, _LOW_HALF)
 """Linux, with 32-bit addresses, with an old version's number, and the question which one it is."""
 
+_HUGE = {"mmap": (3, 0x4_0000), "mmap2": (3, 0x4_0000), "memfd_create": (1, 0x4), "shmget": (2, 0o4000)}
+"""Where each call is told to take huge pages: the machine has a few for all, and no limit counts them."""
+_FILE_COMMANDS_BELOW = 64
+_FILE_COMMANDS = range(1025, 1039)
+"""What ``fcntl`` may be told: leases (1024) are not on it, by which an owner holds up all who open a file."""
+
 CONDITIONAL = (
     *(Rule(call, (_word(0, family),)) for call in ("socket", "socketpair") for family in _FAMILIES),
     Rule("socket", (_word(0, socket.AF_NETLINK), _word(2, _NETLINK_ROUTE))),
     Rule("clone", (Match(0, _MAKES_NAMESPACES, 0),)),
     Rule("unshare", (Match(0, _MAKES_NAMESPACES, 0),)),
+    *(Rule(call, (Match(argument, flag, 0),)) for call, (argument, flag) in _HUGE.items()),
+    *(Rule(call, (Match(1, _LOW_HALF ^ (_FILE_COMMANDS_BELOW - 1), 0),)) for call in ("fcntl", "fcntl64")),
+    *(Rule(call, (_word(1, code),)) for call in ("fcntl", "fcntl64") for code in _FILE_COMMANDS),
     *(Rule("personality", (_word(0, personality),)) for personality in _PERSONALITIES),
 )
 """Calls that are allowed with some arguments. A socket of netlink is what lists a machine's addresses."""
@@ -116,6 +124,10 @@ uselib userfaultfd vhangup vm86 vm86old
 REFUSED = tuple(_REFUSED.split())
 """Calls that are known, and denied."""
 
+PRETENDED = ("sync", "syncfs")
+"""Calls that do nothing and succeed: nothing of a container is on a disk, and the disks are others'."""
+
 INVISIBLE = errno.ENOSYS
-"""What a call answers that is not known. ``clone3`` is such a one: its flags lie where no filter can look."""
+"""What a call answers that is not known. ``clone3`` is such a one: its flags lie where no filter can look. So
+is ``io_setup``: the machine has a number of those contexts for all."""
 DENIED = errno.EPERM

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from rce_container.seccomp.calls import ALLOWED, CONDITIONAL, DENIED, INVISIBLE, REFUSED, Match
+from rce_container.seccomp.calls import ALLOWED, CONDITIONAL, DENIED, INVISIBLE, PRETENDED, REFUSED, Match
 
 LIBRARY = "libseccomp.so.2"
 
@@ -77,6 +77,8 @@ def _translate(library: ctypes.CDLL, context: ctypes.c_void_p) -> bytes:
         add(_ALLOW, rule.call, rule.matches)
     for call in REFUSED:
         add(_ERRNO | DENIED, call)
+    for call in PRETENDED:
+        add(_ERRNO, call)
     with tempfile.TemporaryFile() as file:
         _check(library.seccomp_export_bpf, context, file.fileno())
         return os.pread(file.fileno(), os.fstat(file.fileno()).st_size, 0)

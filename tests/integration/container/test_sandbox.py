@@ -3,74 +3,21 @@
 from __future__ import annotations
 
 import errno
-import json
-import os
-import pwd
-import shutil
-import subprocess
-import sys
-import tempfile
-from collections.abc import Iterator, Sequence
 from copy import copy
-from pathlib import Path
 from typing import Any
 
 import pytest
+from support.persons import Person
 
 from rce_container.environment.process import OF_NODES
 from rce_container.runtimes.namespace import HOME
 from rce_container.uids import FIRST_UID, UIDS
 
-ROOT = Path(__file__).parents[3]
-USER = "rce-test"
-SYSTEM_PYTHON = "/usr/bin/python3"
 HOME_BYTES = 4 << 20
 NO_CAPABILITIES = "0" * 16
 REFUSED = (errno.EPERM, errno.ENOSYS, errno.EACCES)
 
 pytestmark = [pytest.mark.needs("bwrap"), pytest.mark.timeout(120)]
-
-
-class Person:
-    """Who runs the engine: how its programs are started, and where it may write."""
-
-    runtime = "namespace"
-
-    def __init__(self, name: str, prefix: Sequence[str], python: str, source: Path, folder: Path) -> None:
-        self.name = name
-        self.uid = pwd.getpwnam(name).pw_uid
-        self.folder = folder
-        self._prefix = prefix
-        self._python = python
-        self._source = source
-
-    def run(self, *words: str) -> dict[str, Any]:
-        """Run :mod:`support.sandbox`; returns what it found."""
-        env = {
-            "PATH": "/usr/local/bin:/usr/bin:/bin",
-            "PYTHONPATH": f"{self._source}:{self._source / 'tests'}",
-            "XDG_RUNTIME_DIR": str(self.folder),
-            "RCE_SECRET": "the secret of the engine",
-        }
-        work = tempfile.mkdtemp(dir=self.folder)
-        argv = [*self._prefix, self._python, "-m", "support.sandbox", f"{work}/m", self.runtime, *words]
-        os.chown(work, self.uid, self.uid)
-        done = subprocess.run(
-            argv, env=env, cwd="/", capture_output=True, text=True, timeout=100, check=False
-        )
-        assert done.returncode == 0, done.stderr
-        found = json.loads(done.stdout.splitlines()[-1])
-        assert isinstance(found, dict)
-        return found
-
-
-@pytest.fixture(scope="session")
-def root_person() -> Iterator[Person]:
-    if os.geteuid() != 0:
-        pytest.skip("needs root")
-    folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
-    yield Person("root", (), sys.executable, ROOT, folder)
-    shutil.rmtree(folder)
 
 
 @pytest.fixture(scope="session")
@@ -79,50 +26,6 @@ def podman_person(root_person: Person) -> Person:
     person = copy(root_person)
     person.runtime = "podman"
     return person
-
-
-@pytest.fixture(scope="session")
-def normal_person() -> Iterator[Person]:
-    """A user with a Python of their own: the engine's may lie where nobody else can read it."""
-    if os.geteuid() != 0:
-        name = pwd.getpwuid(os.geteuid()).pw_name
-        folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
-        yield Person(name, (), sys.executable, ROOT, folder)
-        shutil.rmtree(folder)
-        return
-    wanted = f"{sys.version_info.major}.{sys.version_info.minor}"
-    version = "import sys; print('%d.%d' % sys.version_info[:2])"
-    found = subprocess.run([SYSTEM_PYTHON, "-c", version], capture_output=True, text=True, check=False)
-    if found.stdout.strip() != wanted:
-        pytest.skip(
-            f"{SYSTEM_PYTHON} is no Python {wanted}, so it cannot use the packages that are installed"
-        )
-    subprocess.run(["useradd", "--system", "--no-create-home", USER], check=False, capture_output=True)
-    folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
-    folder.chmod(0o755)
-    python = _copy_engine(folder)
-    home = folder / "home"
-    home.mkdir()
-    person = pwd.getpwnam(USER)
-    os.chown(home, person.pw_uid, person.pw_gid)
-    prefix = ("setpriv", f"--reuid={person.pw_uid}", f"--regid={person.pw_gid}", "--clear-groups")
-    yield Person(USER, prefix, python, folder / "source", home)
-    shutil.rmtree(folder)
-    subprocess.run(["userdel", USER], check=False, capture_output=True)
-
-
-def _copy_engine(folder: Path) -> str:
-    """Copy the engine with all that it imports; returns a Python that finds it."""
-    subprocess.run([SYSTEM_PYTHON, "-m", "venv", "--without-pip", folder / "venv"], check=True)
-    (site,) = (folder / "venv" / "lib").glob("python*/site-packages")
-    source = next(path for path in map(Path, sys.path) if path.name == "site-packages" and path.is_dir())
-    site.rmdir()
-    if subprocess.run(["cp", "-al", source, site], capture_output=True, check=False).returncode:
-        shutil.rmtree(site, ignore_errors=True)
-        subprocess.run(["cp", "-a", source, site], check=True)
-    for name in ("rce", "rce_container", "examples", "configs", "tests/support"):
-        shutil.copytree(ROOT / name, folder / "source" / name, ignore=shutil.ignore_patterns("__pycache__"))
-    return str(folder / "venv" / "bin" / "python")
 
 
 @pytest.fixture(

@@ -11,7 +11,7 @@ import struct
 import pytest
 
 from rce_container.nursery.kernel import Namespaces
-from rce_container.seccomp.calls import ALLOWED, CONDITIONAL, REFUSED
+from rce_container.seccomp.calls import ALLOWED, CONDITIONAL, PRETENDED, REFUSED
 from rce_container.seccomp.library import LIBRARY, FilterUnavailableError, make_filter
 
 ARCHITECTURES = {"x86_64": 0xC000_003E, "aarch64": 0xC000_00B7}
@@ -110,11 +110,44 @@ def test_sockets_are_of_a_few_families(program: bytes, family: int, protocol: in
     assert (verdict(program, "socket", family, 2, protocol) == ALLOW) is allowed
 
 
+@pytest.mark.parametrize("call", PRETENDED)
+def test_disks_are_not_made_to_write(program: bytes, call: str) -> None:
+    assert verdict(program, call) == 0x5_0000, "it succeeds and does nothing"
+
+
+@pytest.mark.parametrize(
+    ("call", "arguments", "allowed"),
+    [
+        ("mmap", (0, 4096, 3, 0x22), True),
+        ("mmap", (0, 4096, 3, 0x4_0022), False),
+        ("memfd_create", (0, 3), True),
+        ("memfd_create", (0, 4), False),
+        ("shmget", (0, 4096, 0o1600), True),
+        ("shmget", (0, 4096, 0o5600), False),
+    ],
+)
+def test_huge_pages_are_not_to_be_had(
+    program: bytes, call: str, arguments: tuple[int, ...], allowed: bool
+) -> None:
+    assert (verdict(program, call, *arguments) == ALLOW) is allowed
+
+
+@pytest.mark.parametrize("command", [0, 4, 6, 7, 38, 1025, 1030, 1032, 1033, 1038])
+def test_files_can_be_controlled(program: bytes, command: int) -> None:
+    assert verdict(program, "fcntl", 3, command) == ALLOW
+    assert verdict(program, "fcntl", 3, command | 1 << 40) == ALLOW, "the kernel does not look there"
+
+
+@pytest.mark.parametrize("command", [1024, 1024 | 1 << 40, 64, 2048])
+def test_files_cannot_be_leased(program: bytes, command: int) -> None:
+    assert verdict(program, "fcntl", 3, command) == INVISIBLE
+
+
 def test_another_architectures_calls_kill(program: bytes) -> None:
     other = next(name for name in ARCHITECTURES if name != platform.machine())
     assert verdict(program, "read", machine=other) == KILL
 
 
 def test_no_call_is_listed_twice() -> None:
-    calls = (*ALLOWED, *REFUSED, *{rule.call for rule in CONDITIONAL})
+    calls = (*ALLOWED, *REFUSED, *PRETENDED, *{rule.call for rule in CONDITIONAL})
     assert len(calls) == len(set(calls))
