@@ -1,10 +1,11 @@
 """Machines that are to be emptied: they take no new containers, and those they have are handed over.
 
 A container is *handed over* by a move: a copy of it, with its nodes and parameters but without interfaces and
-connections, is made at another machine while the container goes on; once all nodes of the copy are up, the
-copy becomes the container, gets the interfaces and connections, and the former one is dropped. One container
-at a time moves away from a machine; those in the network of one group move together. What finds room nowhere
-stays where it is, and is looked at again at every tick.
+connections, is made at another machine while the container goes on; once the copy's nodes are up, the copy
+becomes the container, gets the interfaces and connections, and the former one is dropped. A node that is not up
+in the container need not be up in the copy: one that is none of ROS never registers. One container at a time
+moves away from a machine; those in the network of one group move together. What finds room nowhere stays where
+it is, and is looked at again at every tick.
 
 A drain outlives a restart of the master. A move does not: the copy is dropped, and the move begins anew.
 """
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from rce_master.state.tables import Tables
 
 _NOT_YET = frozenset({NodeState.WAITING, NodeState.STARTING})
+_UP = frozenset({NodeState.RUNNING, NodeState.EXITED})
 
 
 def set_draining(tx: Transaction, command: SetDraining) -> None:
@@ -173,7 +175,10 @@ def reported(tx: Transaction, move: Move, status: EndpointStatus) -> None:
 def _is_ready(tx: Transaction, move: Move) -> bool:
     """Whether the copy does as well as the container does."""
     status, former = move.status, tx.tables.container_live(move.id).status
-    if status is None or any(node.state in _NOT_YET for node in status.nodes):
+    if status is None:
+        return False
+    no_further = {n.tag for n in former.nodes if n.state not in _UP} if former is not None else set()
+    if any(node.state in _NOT_YET and node.tag not in no_further for node in status.nodes):
         return False
     if status.state is EndpointState.DEGRADED:
         return former is None or former.state is not EndpointState.RUNNING

@@ -86,6 +86,21 @@ def test_a_copy_is_made_first_and_takes_over_when_it_is_up(two: World) -> None:
     assert (at(two, "d"), moves(two)) == ("c2", {})
 
 
+def test_a_copy_need_not_be_better_than_the_container(two: World) -> None:
+    two.node("c", "silent")
+    running, starting = NodeState.RUNNING, NodeState.STARTING
+
+    def nodes(n: NodeState, silent: NodeState) -> tuple[NodeStatus, ...]:
+        return NodeStatus(tag="n", state=n), NodeStatus(tag="silent", state=silent)
+
+    report(two, "c", "c1", nodes=nodes(running, starting))
+    drain(two)
+    report(two, "c", "c2", nodes=nodes(starting, starting))
+    assert at(two, "c") == "c1", "n is not up yet"
+    report(two, "c", "c2", nodes=nodes(running, starting))
+    assert at(two, "c") == "c2", "a node that is none of ROS never registers, there neither"
+
+
 def test_a_draining_machine_takes_nothing_new(two: World) -> None:
     drain(two)
     two.container("new")
