@@ -2,7 +2,7 @@
 
 const TONE = {
   running: "good", connected: "good", placed: "warn", starting: "warn", requested: "warn", waiting: "warn",
-  absent: "warn", draining: "warn", away: "bad", degraded: "warn", stopped: "warn", stopping: "warn", failed: "bad", lost: "bad", exited: "bad", stuck: "bad",
+  absent: "warn", draining: "warn", away: "bad", degraded: "warn", stopped: "warn", stopping: "warn", failed: "bad", lost: "bad", stuck: "bad",
 };
 const NEARLY_FULL = 0.9;
 
@@ -43,8 +43,8 @@ function uses(usage) {
   const memory = usage.memory_limit ? `${megabytes(usage.memory)} of ${megabytes(usage.memory_limit)}` : megabytes(usage.memory);
   found.append(bar("CPU", usage.cpu, usage.cpu_limit, cpu), bar("Memory", usage.memory, usage.memory_limit, memory));
   const troubles = [];
-  if (usage.restarts) troubles.push(`${usage.restarts} restarts`);
-  if (usage.oom_kills) troubles.push(`${usage.oom_kills} times out of memory`);
+  if (usage.restarts) troubles.push(usage.restarts === 1 ? "1 restart" : `${usage.restarts} restarts`);
+  if (usage.oom_kills) troubles.push(usage.oom_kills === 1 ? "once out of memory" : `${usage.oom_kills} times out of memory`);
   if (troubles.length) found.append(element("div", troubles.join(", "), "use warn"));
   return found;
 }
