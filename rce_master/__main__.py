@@ -15,6 +15,7 @@ import uvloop
 from rce.config.exceptions import ConfigError, RunDirError, SecretError
 from rce.config.secret import load_secret
 from rce.config.settings import load_settings
+from rce.guard.files import raise_file_limit
 from rce.protocol.quantities import read_memory
 from rce_master.exceptions import MasterError
 from rce_master.master import Master, RunningMaster
@@ -77,6 +78,7 @@ def command(
         "max_cpu": max_cpu,
         "max_memory": None if max_memory is None else _memory(max_memory),
     }
+    raise_file_limit()
     faults: tuple[BaseException, ...] = ()
     try:
         engine = load_settings(config)
