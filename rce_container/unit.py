@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import msgspec
 
-from rce.control.model import EndpointSpec, EndpointStatus, InterfaceUsage, LinkAddress, NodeStatus
+from rce.control.model import EndpointSpec, EndpointStatus, LinkAddress, NodeStatus
 from rce.link.handover import Doorman, HandoverSender
 from rce.link.tasks import TaskScope
 from rce.protocol.names import EndpointId
@@ -79,8 +79,8 @@ class Unit:
         self.folder = folder
         self.handle = handle
         self.warden = warden
-        self.counters: dict[str, InterfaceUsage] = {}
-        """The interfaces' counters, as the environment said last."""
+        self.counters = m.Counters()
+        """What went through links and interfaces, as the environment said last."""
         self.status: EndpointStatus | None = None
         """What the environment reported last."""
         self.reported = asyncio.Event()
@@ -240,8 +240,8 @@ class Unit:
                     self._report(status)
                 case m.Fault(text=text):
                     self._office.feed(events.Faulted(self.id, self.mark, text))
-                case m.Counters(interfaces=interfaces):
-                    self.counters = interfaces
+                case m.Counters() as counters:
+                    self.counters = counters
                 case m.Killed(request=number):
                     channel.send(m.encode(m.Cause(request=number, text=self.warden.claim())))
                 case m.Dial() as request:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-from rce.control.model import EndpointUsage, InterfaceUsage, NodeUsage
+from rce.control.model import EndpointUsage, NodeUsage
 from rce_container.environment import proc
+from rce_container.environment.messages import Counters
 from rce_container.limits import Cell
 from rce_container.runtimes.base import Handle
 
@@ -21,7 +22,7 @@ class Subject(NamedTuple):
     cell: Cell
     nodes: Mapping[str, int]
     """The pid of each node's first process, as the machine sees it, by tag."""
-    interfaces: Mapping[str, InterfaceUsage]
+    counters: Counters
 
 
 class UsageMeter:
@@ -59,7 +60,7 @@ class UsageMeter:
         if memory is None:
             memory = sum(map(self._share, own))
         return EndpointUsage(
-            interfaces=dict(subject.interfaces),
+            interfaces=subject.counters.interfaces,
             nodes=self._measure_nodes(subject.nodes, own),
             cpu_s=round(cpu_s, 3),
             throttled_s=round(counted.throttled_s, 3),
@@ -70,8 +71,8 @@ class UsageMeter:
             oom_kills=cell.troubles().oom_kills,
             io_read=counted.io_read,
             io_written=counted.io_written,
-            link_in=sum(one.bytes_in for one in subject.interfaces.values()),
-            link_out=sum(one.bytes_out for one in subject.interfaces.values()),
+            link_in=subject.counters.traffic[0],
+            link_out=subject.counters.traffic[1],
             processes=len(own),
         )
 

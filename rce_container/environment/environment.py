@@ -328,7 +328,8 @@ class Environment:
             case m.Shelved():
                 self._take_bundles()
             case m.Poll():
-                channel.send(m.encode(m.Counters(interfaces=self._endpoint.usage())))
+                counters = m.Counters(interfaces=self._endpoint.usage(), traffic=self._endpoint.traffic)
+                channel.send(m.encode(counters))
             case m.Dialed(request=request, error=error):
                 self._operator.answered(request, error or socket.socket(fileno=channel.take_fd()))
             case m.Cause(request=request, text=text):

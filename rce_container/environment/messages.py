@@ -109,6 +109,8 @@ class Counters(_Message):
     """Answer to :class:`Poll`."""
 
     interfaces: dict[str, InterfaceUsage] = {}
+    traffic: tuple[int, int] = (0, 0)
+    """Bytes that came in and went out on all links, frame headers included."""
 
 
 class Dial(_Message):
