@@ -70,6 +70,7 @@ class Connection(asyncio.BufferedProtocol):
         self._siblings = siblings
         self._transport: asyncio.Transport | None = None
         self._closing = False
+        self._large: bytes | None = None  # a frame that was set aside
         self._peer = "?"
 
     # ------------------------------------------------------------------ for the owner
@@ -141,8 +142,7 @@ class Connection(asyncio.BufferedProtocol):
     def get_buffer(self, sizehint: int) -> memoryview:
         """Return where the next bytes go."""
         del sizehint  # the reader knows better
-        if self.reader.is_large_complete:
-            self._take_large()
+        self._set_large_aside()
         return self.reader.buffer()
 
     def buffer_updated(self, nbytes: int) -> None:
@@ -150,6 +150,7 @@ class Connection(asyncio.BufferedProtocol):
         reader = self.reader
         reader.received(nbytes)
         try:
+            self._hand_over_large()
             while not self._closing and (payload := reader.next_frame()) is not None:
                 self._hand_over(payload)
         except TcprosError as error:
@@ -169,15 +170,28 @@ class Connection(asyncio.BufferedProtocol):
 
     # ------------------------------------------------------------------ inside
 
+    def _set_large_aside(self) -> None:
+        """Take a complete frame out of memory of its own, to be handed over later.
+
+        Not now: the owner may close the connection or pause it, and while a buffer is asked for, uvloop's
+        transports do not survive that.
+        """
+        if self.reader.is_large_complete:
+            self._large = self.reader.take_large()
+            self._learn_size(len(self._large))
+
     def _take_large(self) -> None:
-        """Hand over a frame that was read into memory of its own, unless it was before the next read."""
-        if self.reader.is_large_complete and not self._closing:
-            payload = self.reader.take_large()
-            self._learn_size(len(payload))
-            try:
-                self._hand_over(payload)
-            except TcprosError as error:
-                self._fail(error)
+        """Hand over a frame that was read into memory of its own, unless more was read since."""
+        self._set_large_aside()
+        try:
+            self._hand_over_large()
+        except TcprosError as error:
+            self._fail(error)
+
+    def _hand_over_large(self) -> None:
+        payload, self._large = self._large, None
+        if payload is not None and not self._closing:
+            self._hand_over(payload)
 
     def _hand_over(self, payload: bytes) -> None:
         self.bytes_in += len(payload)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 
 from rce.ros.core import Core
 from rce.ros.errors import ServiceFault, ServiceLost, ServiceNotFound, ServiceTimeout, TypeMismatch
 from rce.ros.node import Node
+from rce.ros.tcpros.header import decode_header, encode_header
 from rce.ros.types import SerializationError
 
 MakeNode = Callable[..., Node]
@@ -167,3 +169,25 @@ async def test_a_closed_service_is_gone(make_node: MakeNode) -> None:
         await asyncio.wait_for(kept.gone.wait(), 10)
         with pytest.raises(ServiceNotFound):
             await client(data=True)
+
+
+@pytest.mark.parametrize("wrong", [{}, {"md5sum": "0" * 32}, {"service": "/other"}])
+async def test_a_header_that_comes_in_pieces_is_answered(
+    core: Core, make_node: MakeNode, wrong: dict[str, str]
+) -> None:
+    """Its end fills the buffer, so more is read at once, while the answer closes the connection."""
+    probe = {"callerid": "/raw", "service": "/switch", "md5sum": "*", "probe": "1"} | wrong
+    header = encode_header(probe)
+    async with make_node("server") as server:
+        await server.advertise_service("/switch", "std_srvs/SetBool", lambda _: {})
+        where = urlsplit(core.graph.service("/switch") or "")
+        for cut in (4, 5, len(header) // 2, len(header) - 1):
+            reader, writer = await asyncio.open_connection(where.hostname, where.port)
+            writer.write(header[:cut])
+            await asyncio.sleep(0.01)  # or the system may join the pieces
+            writer.write(header[cut:])
+            async with asyncio.timeout(10):
+                answer = await reader.read()
+            assert ("error" in decode_header(answer[4:])) is bool(wrong)
+            writer.close()
+            await writer.wait_closed()

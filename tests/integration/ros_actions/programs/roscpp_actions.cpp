@@ -84,7 +84,7 @@ static void fail(const std::string& what) {
 
 static std::string run(ros::ServiceClient& go, int number, bool cancel) {
   static actionlib::SimpleActionClient<TestAction> client("simple", true);
-  if (!client.waitForServer(ros::Duration(20))) fail("no simple server");
+  if (!client.waitForServer(ros::Duration(200))) fail("no simple server");
   std::mutex lock;
   std::vector<int> heard;
   client.sendGoal(goal(number), {}, {}, [&](const actionlib::TestFeedbackConstPtr& feedback) {
@@ -98,7 +98,7 @@ static std::string run(ros::ServiceClient& go, int number, bool cancel) {
     waits = heard.empty();
   }
   if (cancel) client.cancelGoal();
-  if (!client.waitForResult(ros::Duration(20))) fail("no result");
+  if (!client.waitForResult(ros::Duration(200))) fail("no result");
   std::ostringstream text;
   std::lock_guard<std::mutex> held(lock);
   text << "[[";
@@ -117,7 +117,7 @@ static void until(const std::string& what, const std::function<bool()>& conditio
 
 static std::string runMany() {
   Client client("full");
-  if (!client.waitForActionServerToStart(ros::Duration(20))) fail("no full server");
+  if (!client.waitForActionServerToStart(ros::Duration(200))) fail("no full server");
   std::mutex lock;
   std::map<int, std::vector<std::string>> changes;
   std::map<int, Client::GoalHandle> goals;
@@ -166,7 +166,7 @@ int main(int argc, char** argv) {
   spinner.start();
   ros::NodeHandle node;
   ros::ServiceClient go = node.serviceClient<roscpp::Empty>("go");
-  if (!go.waitForExistence(ros::Duration(20))) fail("no service go");
+  if (!go.waitForExistence(ros::Duration(200))) fail("no service go");
   std::string succeeded = run(go, 3, false), aborted = run(go, -1, false), preempted = run(go, 0, true);
   std::cout << "{\"succeeded\":" << succeeded << ",\"aborted\":" << aborted << ",\"preempted\":" << preempted << ","
             << runMany() << "}" << std::endl;
