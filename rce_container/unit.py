@@ -16,7 +16,7 @@ from rce.control.model import EndpointSpec, EndpointStatus, LinkAddress, NodeSta
 from rce.link.handover import Doorman, HandoverSender
 from rce.link.tasks import TaskScope
 from rce.protocol.names import EndpointId
-from rce_container import events
+from rce_container import events, intake
 from rce_container.archive import LogArchive
 from rce_container.bundles.shelf import Shelf
 from rce_container.bundles.supply import Library, Supply
@@ -234,31 +234,37 @@ class Unit:
             sender.close()
 
     async def _converse(self, channel: Channel) -> None:
+        pace = intake.Pace()
         while (line := await channel.receive()) is not None:
-            match m.decode_to_manager(line):
+            pace.pay(intake.PER_LINE + len(line))
+            match intake.read(line):
                 case m.Report(status=status):
-                    self._report(status)
+                    self._report(intake.sound_status(self.id, status), pace)
                 case m.Fault(text=text):
-                    self._office.feed(events.Faulted(self.id, self.mark, text))
+                    pace.pay(intake.PER_FAULT)
+                    self._office.feed(events.Faulted(self.id, self.mark, intake.sound_text(text)))
                 case m.Counters() as counters:
-                    self.counters = counters
+                    self.counters = intake.sound_counters(counters)
                 case m.Killed(request=number):
                     channel.send(m.encode(m.Cause(request=number, text=self.warden.claim())))
                 case m.Dial() as request:
                     self._errands.spawn(self._dial(channel, request), f"dial for {self.id}")
+            if pause := pace.pause:
+                await asyncio.sleep(pause)
 
-    def _report(self, status: EndpointStatus) -> None:
+    def _report(self, status: EndpointStatus, pace: intake.Pace) -> None:
         if not self._stopping:
             self._limit(None)
         if self._isolated:
-            status = msgspec.structs.replace(status, nodes=self._with_outer_pids(status))
+            status = msgspec.structs.replace(status, nodes=self._with_outer_pids(status, pace))
         self.status = status
         self.reported.set()
         self._office.feed(events.Reported(self.id, self.mark, status))
 
-    def _with_outer_pids(self, status: EndpointStatus) -> tuple[NodeStatus, ...]:
+    def _with_outer_pids(self, status: EndpointStatus, pace: intake.Pace) -> tuple[NodeStatus, ...]:
         """Replace the nodes' pids inside the container by those outside."""
         if any(node.pid and node.pid not in self._pids for node in status.nodes):
+            pace.pay(intake.PER_LOOK)
             pids = self.warden.cell.pids() or [one.pid for one in self.handle.members(proc.table())]
             self._pids = {proc.inner_pid(pid): pid for pid in pids}
         return tuple(

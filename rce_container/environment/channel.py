@@ -24,10 +24,15 @@ class Channel:
 
     A descriptor arrives no later than the line it was sent with.
     One task receives; anybody sends. The channel owns the socket and the descriptors that nobody took.
+
+    Args:
+        sock: The socket.
+        takes_fds: Whether the peer may send descriptors; else the kernel drops them.
     """
 
-    def __init__(self, sock: socket.socket) -> None:
+    def __init__(self, sock: socket.socket, *, takes_fds: bool = True) -> None:
         sock.setblocking(False)
+        self._takes_fds = takes_fds
         self._sock = sock
         self._loop = asyncio.get_running_loop()
         self._received = bytearray()
@@ -122,18 +127,25 @@ class Channel:
     async def _fill(self) -> bool:
         while not self._closed:
             try:
-                data, fds, _, _ = socket.recv_fds(self._sock, _CHUNK, _MAX_FDS)
+                data = self._read()
             except (BlockingIOError, InterruptedError):
                 await self._readable()
                 continue
             except OSError:
                 return False
-            for fd in fds:  # recv_fds of Python 3.11 does not pass MSG_CMSG_CLOEXEC on
-                os.set_inheritable(fd, False)
-            self._fds.extend(fds)
             self._received += data
+            await asyncio.sleep(0)  # a peer that never pauses must not keep all others waiting
             return bool(data)
         return False
+
+    def _read(self) -> bytes:
+        if not self._takes_fds:
+            return self._sock.recv(_CHUNK)
+        data, fds, _, _ = socket.recv_fds(self._sock, _CHUNK, _MAX_FDS)
+        for fd in fds:  # recv_fds of Python 3.11 does not pass MSG_CMSG_CLOEXEC on
+            os.set_inheritable(fd, False)
+        self._fds.extend(fds)
+        return data
 
     async def _readable(self) -> None:
         waiting = self._waiting = self._loop.create_future()
@@ -166,7 +178,7 @@ async def accept(listener: socket.socket, take: Callable[[socket.socket], None])
 
 
 async def connect(path: str) -> Channel:
-    """Connect to a unix socket.
+    """Connect to a unix socket, as a manager does: what listens there may send no descriptors.
 
     Raises:
         OSError: Nobody listens there.
@@ -178,4 +190,4 @@ async def connect(path: str) -> Channel:
     except BaseException:
         sock.close()
         raise
-    return Channel(sock)
+    return Channel(sock, takes_fds=False)

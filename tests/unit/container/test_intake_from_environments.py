@@ -1,0 +1,90 @@
+"""What managers take from environments, which may be in the hands of their nodes."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from rce.control.model import (
+    EndpointState,
+    EndpointStatus,
+    InterfaceUsage,
+    LinkAddress,
+    NodeState,
+    NodeStatus,
+)
+from rce_container import intake
+from rce_container.environment import messages as m
+
+
+def status(**fields: object) -> EndpointStatus:
+    told = {"id": "anna/c", "revision": 3, "state": EndpointState.RUNNING, **fields}
+    return intake.sound_status("anna/c", msgspec.convert(told, EndpointStatus))
+
+
+def test_a_sound_report_stays_as_it_is() -> None:
+    said = EndpointStatus(
+        id="anna/c",
+        revision=3,
+        state=EndpointState.DEGRADED,
+        nodes=(NodeStatus(tag="n", state=NodeState.FAILED, pid=7, exit_code=-9, restarts=2, detail="why"),),
+        interfaces={"i": True},
+        connections=(4, 5),
+    )
+    assert intake.sound_status("anna/c", said) == said
+
+
+def test_a_container_speaks_of_itself_only() -> None:
+    found = status(id="bob/c", incarnation="x", detail="y", address=LinkAddress(host="evil", port=1))
+    assert found == EndpointStatus(id="anna/c", revision=3, state=EndpointState.RUNNING)
+    assert status(state=EndpointState.ABSENT).state is EndpointState.RUNNING
+
+
+def test_sizes_are_those_of_containers() -> None:
+    node = NodeStatus(tag="n", state=NodeState.FAILED, pid=10**30, exit_code=-(10**30), detail="x" * 10**6)
+    found = status(
+        nodes=(node, *(NodeStatus(tag=f"n{i}", state=NodeState.RUNNING) for i in range(10_000))),
+        interfaces={"no name": True, **{f"i{i}": True for i in range(10_000)}},
+        connections=tuple(range(100_000)),
+    )
+    assert len(found.nodes) == intake.MAX_ITEMS
+    assert len(found.interfaces) < intake.MAX_ITEMS
+    assert "no name" not in found.interfaces
+    assert len(found.connections) == intake.MAX_CONNECTIONS
+    first = found.nodes[0]
+    assert (first.pid, first.exit_code) == (2**53, -255)
+    assert len(first.detail) < 2100
+    assert len({one.tag for one in status(nodes=(node, node)).nodes}) == len(status(nodes=(node, node)).nodes)
+
+
+def test_counters_can_be_told_on() -> None:
+    said = m.Counters(
+        interfaces={"i": InterfaceUsage(bytes_in=10**400, dropped=-5), "../i": InterfaceUsage()},
+        traffic=(10**400, 7),
+    )
+    found = intake.sound_counters(said)
+    assert found.interfaces == {"i": InterfaceUsage(bytes_in=2**53)}
+    assert found.traffic == (2**53, 7)
+
+
+@pytest.mark.parametrize("line", [b'{"t":"Report","x":' + b"[" * 100_000, b"\xff", b"", b'{"t":"Boo"}'])
+def test_what_is_no_message_is_one_kind_of_error(line: bytes) -> None:
+    with pytest.raises(msgspec.DecodeError):
+        intake.read(line)
+
+
+def test_who_says_too_much_has_to_wait() -> None:
+    now = 0.0
+    pace = intake.Pace(lambda: now)
+    for _ in range(100):
+        pace.pay(intake.PER_FAULT)
+    assert pace.pause == 0.0, "a burst is heard at once"
+    for _ in range(200):
+        pace.pay(intake.PER_FAULT)
+    assert pace.pause == pytest.approx(5.0)
+    now = 5.0
+    pace.pay(0)
+    assert pace.pause == 0.0
+    now = 1000.0
+    pace.pay(intake.BURST + intake.BYTES_PER_S)
+    assert pace.pause == pytest.approx(1.0), "no more than a burst is saved up"
