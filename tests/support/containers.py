@@ -436,7 +436,11 @@ class Peer:
         return end
 
     async def wire(
-        self, address: LinkAddress, interfaces: tuple[InterfaceSpec, ...], revision: int = 1
+        self,
+        address: LinkAddress,
+        interfaces: tuple[InterfaceSpec, ...],
+        revision: int = 1,
+        id_: str = "user/box",
     ) -> None:
         """Connect to a container's interfaces."""
         own = tuple(InterfaceSpec(tag=i.tag, type=COMPLEMENT[i.type], cls=i.cls) for i in interfaces)
@@ -446,7 +450,7 @@ class Peer:
                 kind=EndpointKind.ROBOT,
                 revision=revision,
                 interfaces=own,
-                **wiring("user/box", address, [i.tag for i in interfaces]),
+                **wiring(id_, address, [i.tag for i in interfaces]),
             )
         )
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
 import json
+import mmap
 import os
-import re
-import resource
 import shutil
 import socket
+import struct
 import subprocess
 import sys
 import time
@@ -21,7 +22,11 @@ from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
-from rce.control.model import LinkSpec, NodeSpec, Resources
+import msgspec
+
+from rce.control.messages import Put
+from rce.control.model import EndpointState, InterfaceSpec, LinkSpec, NodeSpec, NodeState, Resources
+from rce.link import LinkError
 from rce_container.environment import proc
 from support.containers import ECHO, ECHO_INTERFACES, MACHINE, Machine, Peer, container, until
 from support.persons import SECRET
@@ -39,7 +44,12 @@ KEEPER = (
     "print('kept', flush=True)\n"
     "time.sleep(600)\n"
 )
+_NS_GET_OWNER_UID = 0xB704
 MB = 1 << 20
+MEMORY_MB = 96
+PROCESSES = 60
+OUTSIDE = ("anonymous", "memfd", "unix", "tcp", "tables", "zombies", "threads")
+"""What may be taken without a container, for a moment, and without harm."""
 
 
 def link(token: str) -> tuple[LinkSpec, ...]:
@@ -79,9 +89,7 @@ class World:
         return json.loads(next(line for line in text.splitlines() if line.startswith("{")))
 
 
-def _put_neighbour() -> Any:
-    from rce.control.messages import Put
-
+def _put_neighbour() -> Put:
     spec = container(
         NEIGHBOUR,
         1,
@@ -89,13 +97,7 @@ def _put_neighbour() -> Any:
         interfaces=ECHO_INTERFACES,
         peer="user/robot",
     )
-    return Put(endpoint=_with(spec, links=(*spec.links, *link(OTHER_TOKEN))))
-
-
-def _with(spec: Any, **parts: Any) -> Any:
-    import msgspec
-
-    return msgspec.structs.replace(spec, **parts)
+    return Put(endpoint=msgspec.structs.replace(spec, links=(*spec.links, *link(OTHER_TOKEN))))
 
 
 # Leaving and spying
@@ -109,7 +111,7 @@ async def attack(folder: Path, runtime: str) -> dict[str, Any]:
     try:
         with Bait(folder) as bait:
             async with world.running():
-                _write_facts(world, bait)
+                found["neighbour's words"] = _write_facts(world, bait)
                 before = world.environment(NEIGHBOUR)
                 nodes = machine.packages / "hostile" / "nodes"
                 executed = nodes / "executed"
@@ -121,10 +123,12 @@ async def attack(folder: Path, runtime: str) -> dict[str, Any]:
                     await machine.put(ATTACKER, nodes=(node,), links=link(TOKEN))
                     found[tag] = await world.say(ATTACKER, tag)
                     found["memory"] = search_from_outside(world)
+                    found["owner"] = owner_of_namespace(world.environment(ATTACKER).pid)
                     await machine.drop(ATTACKER)
                 found["outside"] = _try_outside(world)
                 found["neighbour lives"] = world.environment(NEIGHBOUR) == before
-                found["folder"] = str(folder)
+                paths = json.loads(world.facts.read_text())["paths"]
+                found["there"] = [name for name, path in paths.items() if os.path.lexists(path)]
     finally:
         machine.tidy()
     return found
@@ -151,7 +155,8 @@ class Bait:
             sock.close()
 
 
-def _write_facts(world: World, bait: Bait) -> None:
+def _write_facts(world: World, bait: Bait) -> list[str]:
+    """Tell the attacker where to look; returns words that would give the neighbour away."""
     (unit,) = world.machine.manager._units.values()
     environment = world.environment(NEIGHBOUR)
     shim = unit.handle.process.pid
@@ -171,8 +176,8 @@ def _write_facts(world: World, bait: Bait) -> None:
         "pids": {"manager": os.getpid(), "shim": shim, "neighbour": environment.pid},
         "paths": {
             "shadow": "/etc/shadow",
-            "root's home": "/root/.",
-            "homes": "/home/..data" if Path("/home/..data").exists() else str(Path.home() / ".profile"),
+            "root's home": "/root/.bashrc",
+            "configuration": "/etc/fstab",
             "state": str(world.folder / "state"),
             "logs": str(world.folder / "state" / "logs"),
             "neighbour's folder": str(unit.folder.path),
@@ -180,7 +185,7 @@ def _write_facts(world: World, bait: Bait) -> None:
             "neighbour's process": f"/proc/{environment.pid}/status",
             "treasure": "/home/rce/treasure",
             "shared treasure": "/dev/shm/treasure",
-            "machine's packages": "/var/lib/dpkg/status",
+            "machine's packages": "/var/lib/dpkg",
         },
         "backwards": {
             name: text[::-1]
@@ -194,6 +199,7 @@ def _write_facts(world: World, bait: Bait) -> None:
         },
     }
     world.facts.write_text(json.dumps(facts))
+    return [*NEIGHBOUR.split("/"), unit.mark]
 
 
 def _try_outside(world: World) -> dict[str, str]:
@@ -219,6 +225,21 @@ def _sleeper() -> Iterator[int]:
     process.stdout.readline()
     yield process.pid
     process.communicate()
+
+
+def owner_of_namespace(pid: int) -> list[int]:
+    """Who owns the user namespace of a process, and as whom the process runs; empty if that is not told."""
+    try:
+        with open(f"/proc/{pid}/ns/user") as file:
+            answer = fcntl.ioctl(file, _NS_GET_OWNER_UID, struct.pack("I", 0))
+    except PermissionError:
+        return []
+    return [struct.unpack("I", answer)[0], _uid(pid)]
+
+
+def _uid(pid: int) -> int:
+    text = Path(f"/proc/{pid}/status").read_text()
+    return int(text.partition("Uid:")[2].split()[0])
 
 
 def search_from_outside(world: World) -> dict[str, list[str]]:
@@ -253,10 +274,173 @@ def _holds(pid: int, texts: dict[str, str]) -> set[str]:
     return found | {f"{name} in variables" for name, text in texts.items() if text.encode() in variables}
 
 
+# Starving
+
+
+def starve_outside(things: list[str]) -> dict[str, str]:
+    """What stops them where no container does."""
+    return {thing: _starve_outside(thing) for thing in things}
+
+
+def _starve_outside(thing: str) -> str:
+    argv = [sys.executable, str(HOSTILE / "nodes" / "starve.py"), thing]
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            last = next(line for line in process.stdout if line.startswith("{"))
+        finally:
+            process.kill()
+    return str(json.loads(last)["ended"])
+
+
+async def starve(folder: Path, runtime: str, things: list[str]) -> dict[str, Any]:
+    """Let nodes take all they can get of one thing after the other, and ask the neighbour meanwhile."""
+    world = World(folder, runtime)
+    machine = world.machine
+    found: dict[str, Any] = {}
+    try:
+        async with world.running(slot_processes=PROCESSES, interrupt_timeout=0.2, cleanup_timeout=0.5):
+            status = machine.status(NEIGHBOUR)
+            assert status is not None
+            before = world.environment(NEIGHBOUR)
+            peer = Peer(MACHINE)
+            await peer.wire(status.address, ECHO_INTERFACES, id_=NEIGHBOUR)
+            await peer.active()
+            try:
+                for thing in things:
+                    found[thing] = await Hunger(world, thing).suffer(peer)
+            finally:
+                await peer.close()
+            found["neighbour lives"] = world.environment(NEIGHBOUR) == before
+            found["outside"] = starve_outside([thing for thing in things if thing in OUTSIDE])
+    finally:
+        machine.tidy()
+    return found
+
+
+class Hunger:
+    """What a container does that takes all of one thing, and what that does to others."""
+
+    def __init__(self, world: World, thing: str) -> None:
+        self._world = world
+        self._machine = world.machine
+        self._thing = thing
+        self._id = f"mallory/{thing}"
+
+    async def suffer(self, peer: Peer) -> dict[str, Any]:
+        """Make the container, wait for the worst, and remove it."""
+        machine, thing = self._machine, self._thing
+        told, tcp, disk = len(machine.told), tcp_pages(), _disk(self._world.folder)
+        node = NodeSpec(tag="hog", pkg="hostile", exe="starve.py", args=thing)
+        limits = Resources(memory=MEMORY_MB * MB, cpu=0.8)
+        interfaces = (
+            InterfaceSpec(tag="flap", type="PublisherInterface", cls="std_msgs/String", addr="/flap"),
+        )
+        parts: dict[str, Any] = {"resources": limits, "interfaces": interfaces, "peer": "user/robot"}
+        await machine.put(self._id, **parts)
+        async with self._robot(interfaces):
+            await machine.put(self._id, 2, nodes=(node,), **parts)
+            text = await self._outcome()
+            if thing == "stop":
+                await until(lambda: _is_stopped(self._world.environment(self._id).pid))
+            answers = await ask(peer)
+        found = {
+            "has": max(
+                (int(line.split()[1]) for line in text.splitlines() if line.startswith("has ")), default=0
+            ),
+            "ended": self._end(text),
+            "answers": answers,
+            "tcp": (tcp_pages() - tcp) * mmap.PAGESIZE // MB,
+            "disk": (_disk(self._world.folder) - disk) // MB,
+            "reports": sum(
+                getattr(getattr(one, "status", None), "id", "") == self._id for one in machine.told[told:]
+            ),
+            "processes": len(self._members()),
+        }
+        begin = time.monotonic()
+        await machine.drop(self._id)
+        found["took to drop"] = round(time.monotonic() - begin, 1)
+        return found
+
+    @contextlib.asynccontextmanager
+    async def _robot(self, interfaces: tuple[InterfaceSpec, ...]) -> AsyncIterator[None]:
+        """A robot of the attacker's, wired to its container."""
+        status = await until(
+            lambda: (one := self._machine.status(self._id)) and one.state is EndpointState.RUNNING and one
+        )
+        robot = Peer(MACHINE)
+        await robot.wire(status.address, interfaces, id_=self._id)
+        try:
+            yield
+        finally:
+            await robot.close()
+
+    async def _outcome(self) -> str:
+        """Wait for the last word of the node, or for its end, or for its container's."""
+        seen = ""
+        deadline = time.monotonic() + 20
+        while True:
+            assert time.monotonic() < deadline, (
+                f"{self._thing}: no end ({seen[-300:]!r} {self._machine.faults})"
+            )
+            with contextlib.suppress(AssertionError):  # there is no log yet
+                seen = await self._machine.log(self._id, "hog", -8192) or seen
+            node = self._machine.node(self._id, "hog")
+            is_over = node is not None and node.state is NodeState.FAILED
+            if '{"ended"' in seen or is_over or self._failures():
+                return seen
+            await asyncio.sleep(0.05)
+
+    def _failures(self) -> int:
+        return self._machine.manager._core.containers[self._id].failures
+
+    def _end(self, text: str) -> str:
+        for line in text.splitlines():
+            if line.startswith('{"ended"'):
+                return str(json.JSONDecoder().raw_decode(line)[0]["ended"])
+        return "the container died" if self._failures() else "killed"
+
+    def _members(self) -> list[Any]:
+        units = self._machine.manager._units.values()
+        return [one for unit in units if unit.id == self._id for one in unit.handle.members(proc.table())]
+
+
+async def ask(peer: Peer) -> int:
+    """How many of three requests the neighbour's node answers."""
+    request = bytes([5, 0, 0, 0]) + b"hello"
+    answers = 0
+    for _ in range(3):
+        with contextlib.suppress(TimeoutError, LinkError):
+            async with asyncio.timeout(10):
+                answers += await peer.ends["srv"].port.call(request) == request
+    return answers
+
+
+def tcp_pages() -> int:
+    """Pages of memory in all TCP sockets of the machine."""
+    for line in Path("/proc/net/sockstat").read_text().splitlines():
+        if line.startswith("TCP:"):
+            return int(line.split()[-1])
+    return 0
+
+
+def _is_stopped(pid: int) -> bool:
+    return "(stopped)" in Path(f"/proc/{pid}/status").read_text()
+
+
+def _disk(folder: Path) -> int:
+    total = 0
+    for parent, _, names in os.walk(folder):
+        for name in names:
+            with contextlib.suppress(FileNotFoundError):
+                total += Path(parent, name).lstat().st_blocks * 512
+    return total
+
+
 async def main() -> None:
     folder, runtime, what = Path(sys.argv[1]), sys.argv[2], sys.argv[3]
     folder.mkdir()
-    found = await {"attack": attack}[what](folder, runtime)
+    found = await (attack(folder, runtime) if what == "attack" else starve(folder, runtime, sys.argv[4:]))
     print(json.dumps(found))  # noqa: T201 - for the test that started it
 
 

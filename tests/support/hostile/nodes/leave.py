@@ -74,7 +74,10 @@ CALLS: dict[str, tuple[object, ...]] = {
 }
 """Each would work for root, or fail for another reason than a lack of rights."""
 NEVER_OUTSIDE = ("vhangup", "acct", "setdomainname")
-SHELL_CODE = {"32-bit call": b"\xb8\x14\x00\x00\x00\xcd\x80\xc3", "x32 call": b"\xb8\x27\x00\x00\x40\x0f\x05\xc3"}
+SHELL_CODE = {
+    "32-bit call": b"\xb8\x14\x00\x00\x00\xcd\x80\xc3",
+    "x32 call": b"\xb8\x27\x00\x00\x40\x0f\x05\xc3",
+}
 """``getpid`` by ``int 0x80``, and by its number in the x32 convention."""
 CLONE3_ARGS = struct.pack("<11Q", NAMESPACES["user"], 0, 0, 0, signal.SIGCHLD, *[0] * 6)
 HELPERS = (
@@ -104,7 +107,7 @@ def main() -> None:
     }
     attacks = {**processes(targets), **calls(outside), **limits(), **addresses(facts)}
     if not outside:
-        attacks |= {**files(), **rights(), **signals(facts, targets), **games()}
+        attacks |= {**files(), **rights(), **signals(facts), **games()}
     print(json.dumps({"targets": targets, "results": attempt_all(attacks)}), flush=True)
 
 
@@ -115,10 +118,10 @@ def processes(targets: dict[str, int]) -> dict[str, Attack]:
         for name in INSIDES:
             found[f"{name} of {who}"] = partial(_read, f"/proc/{pid}/{name}")
         for name in LINKS:
-            found[f"{name} of {who}"] = partial(os.stat, f"/proc/{pid}/{name}")
+            found[f"{name} of {who}"] = partial(_stat, f"/proc/{pid}/{name}")
         found |= {
-            f"fds of {who}": partial(os.listdir, f"/proc/{pid}/fd"),
-            f"files mapped by {who}": partial(os.listdir, f"/proc/{pid}/map_files"),
+            f"descriptor of {who}": partial(_open_any, f"/proc/{pid}/fd"),
+            f"file mapped by {who}": partial(_open_any, f"/proc/{pid}/map_files"),
             f"ptrace of {who}": partial(system, "ptrace", 0x4206, pid, 0, 0),
             f"process_vm_readv of {who}": partial(_read_memory, pid),
             f"process_vm_writev of {who}": partial(system, "process_vm_writev", pid, 0, 0, 0, 0, 0),
@@ -145,7 +148,12 @@ def calls(outside: bool) -> dict[str, Attack]:
             found[name] = partial(system, name, *arguments)
     for name, code in SHELL_CODE.items():
         found[name] = partial(_execute, code)
-    for family, words in {"packet": (17, 3, 0), "raw": (2, 3, 1), "alg": (38, 5, 0), "vsock": (40, 1, 0)}.items():
+    for family, words in {
+        "packet": (17, 3, 0),
+        "raw": (2, 3, 1),
+        "alg": (38, 5, 0),
+        "vsock": (40, 1, 0),
+    }.items():
         found[f"{family} socket"] = partial(_socket, *words)
     for number, name in {2: "unused", 9: "audit", 15: "uevent", 16: "generic"}.items():
         found[f"netlink {name}"] = partial(_socket, 16, 3, number)
@@ -213,7 +221,9 @@ def rights() -> dict[str, Attack]:
         "setgid": partial(os.setgid, 0),
         "setgroups": partial(os.setgroups, [0]),
         "user map": partial(_write, "/proc/self/uid_map", "0 0 1"),
-        "capset": partial(system, "capset", (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)(*[0xFFFFFFFF] * 6)),
+        "capset": partial(
+            system, "capset", (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)(*[0xFFFFFFFF] * 6)
+        ),
         "ambient": partial(system, "prctl", 47, 2, 21, 0, 0),
         "secure bits": partial(system, "prctl", 28, 0, 0, 0, 0),
         "no_new_privs": lambda: f"stays {libc.prctl(39, 0, 0, 0, 0)}",
@@ -225,11 +235,11 @@ def rights() -> dict[str, Attack]:
     }
 
 
-def signals(facts: dict[str, Any], targets: dict[str, int]) -> dict[str, Attack]:
+def signals(facts: dict[str, Any]) -> dict[str, Attack]:
     """Reach processes outside."""
     outside = {f"signal {who}": partial(os.kill, pid, 0) for who, pid in facts["pids"].items()}
     limits_of = {f"rlimit of {who}": partial(_set_limit, pid) for who, pid in facts["pids"].items()}
-    return {**outside, **limits_of, "signal group 0 of holder": partial(os.killpg, 1, 0)}
+    return {**outside, **limits_of}
 
 
 def games() -> dict[str, Attack]:
@@ -239,7 +249,7 @@ def games() -> dict[str, Attack]:
         "link to the machine": partial(os.symlink, "/etc/shadow", "/home/rce/shadow"),
         "fifo": partial(os.mkfifo, "/home/rce/pipe"),
         "closed folder": partial(_closed_folder),
-        "logs": partial(os.listdir, "/var/log/rce"),
+        "logs": lambda: " ".join(os.listdir("/var/log/rce")) or "nothing",
     }
 
 
@@ -249,6 +259,14 @@ def _read(path: str) -> None:
             file.seek(_some_address(path.replace("/mem", "/maps")))
         if not file.read(16):
             raise PermissionError(1, "nothing is said")
+
+
+def _stat(path: str) -> None:
+    os.stat(path)
+
+
+def _open_any(folder: str) -> None:
+    os.close(os.open(f"{folder}/{os.listdir(folder)[0]}", os.O_RDONLY | os.O_NONBLOCK))
 
 
 def _some_address(maps: str) -> int:

@@ -49,6 +49,7 @@ def main() -> None:
         "machine's variables": lambda: _variables(needles["secret"]),
         "machine's words": lambda: _search_files(needles),
         "own memory": lambda: _search_memory(needles),
+        "own memory with something in it": lambda: _plant(facts["backwards"]["treasure"], needles),
         "mount sources": lambda: "\n".join(_sources()),
         "host name": socket.gethostname,
         "cgroup": lambda: Path("/proc/self/cgroup").read_text().strip(),
@@ -146,6 +147,12 @@ def _search_memory(needles: dict[str, Needle]) -> str:
                 data = memory.read(end - begin)
                 found |= {name for name, needle in needles.items() if needle.search(data)}
     return " ".join(sorted(found)) or "none"
+
+
+def _plant(backwards: str, needles: dict[str, Needle]) -> str:
+    """Know the treasure, and search for it."""
+    treasure = backwards[::-1].encode()
+    return _search_memory(needles) if treasure else ""
 
 
 def _sources() -> set[str]:

@@ -1,0 +1,23 @@
+"""What hostile nodes found out and got, as root's guests and as a normal user's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from support.persons import Person
+
+MODULE = "support.hostile_world"
+
+
+@pytest.fixture(scope="session", params=["root", "normal"])
+def person(request: pytest.FixtureRequest) -> Person:
+    found = request.getfixturevalue(f"{request.param}_person")
+    assert isinstance(found, Person)
+    return found
+
+
+@pytest.fixture(scope="session")
+def attacked(person: Person) -> dict[str, Any]:
+    """How attempts to leave and to spy ended."""
+    return person.run("attack", module=MODULE)
