@@ -278,7 +278,7 @@ async def ticking(core: Core, speed: float) -> AsyncIterator[None]:
         clock = await world.advertise("/clock", "rosgraph_msgs/Clock")
 
         async def tick() -> None:
-            seconds = 1000.0
+            seconds = 1.0  # real clients that begin before the first tick count from zero
             while True:
                 clock.publish(clock=Time.from_sec(seconds))
                 await asyncio.sleep(0.01)
