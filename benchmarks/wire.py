@@ -75,6 +75,14 @@ class Robot:
                 if isinstance(frame, str):
                     self._note(_read(frame))
 
+    async def wait_inactive(self, *tags: str, timeout: float = 60) -> None:
+        """Wait until no one of these interfaces is active."""
+        async with asyncio.timeout(timeout):
+            while any(self.status.get(tag) for tag in tags):
+                frame = await self.socket.recv()
+                if isinstance(frame, str):
+                    self._note(_read(frame))
+
     async def send_forwarded(
         self, tag: str, payload: bytes, *, number: str = "nil", cls: str = STRING
     ) -> None:
