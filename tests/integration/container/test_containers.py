@@ -64,6 +64,8 @@ async def test_a_peer_talks_to_a_node(machine: Machine, way: str) -> None:
             assert usage.memory > 5_000_000
             assert usage.cpu_s > 0
             assert usage.processes >= 3
+            payload = usage.interfaces["req"].bytes_in
+            assert usage.link_in > payload > 0, "headers count too"
         await until(lambda: not any(machine.status(BOX).interfaces.values()), what="inactive interfaces")
         assert machine.faults == []
         await machine.drop(BOX)
