@@ -182,6 +182,14 @@ def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.Tes
     return report
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _no_cgroups_of_the_dead() -> None:
+    """Remove the cgroups of test runs that were killed."""
+    from support.leaks import sweep_dead_cgroups
+
+    sweep_dead_cgroups()
+
+
 @pytest.fixture(scope="session")
 def rce_data() -> Path:
     """The folder of public maps and lidar logs, for tests that are marked with ``needs("data")``."""

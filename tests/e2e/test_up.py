@@ -15,6 +15,7 @@ from pathlib import Path
 import psutil
 import pytest
 from support.engine import Program, engine_processes, free_ports, until
+from support.leaks import sweep_cgroups
 from support.stranger import check_echo, stranger, wire_echo
 
 pytestmark = [pytest.mark.e2e, pytest.mark.timeout(120)]
@@ -29,8 +30,10 @@ def folder() -> Iterator[Path]:
     left = engine_processes(path)
     for process in left:
         process.kill()
+    cgroups = sweep_cgroups(path)
     shutil.rmtree(path)
     assert not left, f"left behind: {left}"
+    assert not cgroups, f"left behind: {cgroups}"
 
 
 @contextlib.asynccontextmanager

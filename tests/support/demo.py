@@ -17,6 +17,7 @@ from typing import Any
 
 from rce_client.demo.ports import ANY, Ports, option_of
 from support.engine import engine_processes, until
+from support.leaks import sweep_cgroups
 
 STOP_TIMEOUT_S = 30.0
 
@@ -41,6 +42,7 @@ def clean_folder() -> Any:
         files = [path for path in folder.iterdir() if path.name != "rce"]
         assert not files, f"files left behind: {files}"
     finally:
+        sweep_cgroups(folder)
         shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -19,6 +19,8 @@ from typing import Any
 
 import psutil
 
+from support.leaks import sweep_cgroups
+
 READY_TIMEOUT_S = 30.0
 STOP_TIMEOUT_S = 30.0
 
@@ -278,6 +280,8 @@ async def running_engine(**options: Any) -> AsyncIterator[Engine]:
             with contextlib.suppress(psutil.NoSuchProcess):
                 process.kill()
         mounts = [line for line in Path("/proc/mounts").read_text().splitlines() if str(folder) in line]
+        cgroups = sweep_cgroups(folder)
         shutil.rmtree(folder, ignore_errors=True)
     assert not left, f"processes left behind: {left}"
+    assert not cgroups, f"cgroups left behind: {cgroups}"
     assert not mounts, f"mounts left behind: {mounts}"

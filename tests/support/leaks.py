@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import time
 from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -18,6 +19,8 @@ from rce_container.limits import files
 
 CGROUPS = Path("/sys/fs/cgroup")
 INTERFACES = Path("/sys/class/net")
+DEAD_AFTER_S = 600.0
+"""An empty cell of this age is nobody's."""
 
 
 class Footprint(NamedTuple):
@@ -129,27 +132,45 @@ def task_set_cgroups() -> Iterator[Path]:
         folders[:] = [name for name in folders if name not in ours]
 
 
-def sweep_cgroups(folder: Path) -> None:
-    """Kill what is left in the cgroups of an engine that a test has ended, and remove them."""
+def sweep_cgroups(folder: Path) -> list[Path]:
+    """Kill what is left in the cgroups of an engine that a test has ended, and remove them.
+
+    Args:
+        folder: Holds all of the engine's files.
+
+    Returns:
+        The cgroups that were left.
+    """
     traces = Traces(folder)
     traces.look()
-    for cgroup in traces.cgroups():
-        for pid in files.pids(cgroup):
-            process = proc.read(pid)
+    found = traces.cgroups()
+    for cgroup in found:
+        for process in map(proc.read, files.pids(cgroup)):
             if process is not None:
                 proc.kill(process)
         with contextlib.suppress(OSError):
             files.drop(cgroup)
+    return found
 
 
-def sweep_empty_cgroups() -> None:
-    """Remove what killed test runs left: cgroups of task sets without any container.
+def sweep_dead_cgroups() -> None:
+    """Remove what killed test runs left: cgroups of task sets with nothing in them for long.
 
-    Those of task sets that run are not harmed: they make it again with their next container.
+    Those of task sets that run are not harmed: they make theirs again with their next container.
     """
     for cgroup in task_set_cgroups():
-        with contextlib.suppress(OSError):
-            cgroup.rmdir()
+        cells = files.children(cgroup)
+        for one in (*filter(_is_old, cells), cgroup):
+            with contextlib.suppress(OSError):
+                one.rmdir()
+
+
+def _is_old(cell: Path) -> bool:
+    """Whether a cell is there for longer than any container takes to start."""
+    try:
+        return time.time() - cell.stat().st_ctime > DEAD_AFTER_S
+    except OSError:
+        return False
 
 
 def _walk(folder: Path) -> Iterator[Path]:
