@@ -1,4 +1,4 @@
-"""``python -m support.hostile_world FOLDER RUNTIME attack|starve NAME...``: gives a machine to somebody hostile.
+"""``python -m support.hostile_world FOLDER RUNTIME attack|starve NAME...``: a machine with somebody hostile.
 
 Runs as whatever user it is started by, with a manager of its own, a neighbour of another user beside the
 attacker, and sockets of the machine that nobody inside should reach. Prints, as JSON, what became of it all.
@@ -20,11 +20,11 @@ import sys
 import time
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import msgspec
 
-from rce.control.messages import Put
+from rce.control.messages import Fault, Put
 from rce.control.model import EndpointState, InterfaceSpec, LinkSpec, NodeSpec, NodeState, Resources
 from rce.link import LinkError
 from rce_container.environment import proc
@@ -48,6 +48,8 @@ _NS_GET_OWNER_UID = 0xB704
 MB = 1 << 20
 MEMORY_MB = 96
 PROCESSES = 60
+STARTED_BESIDE = ("passing", "processors")
+"""What might keep other containers from starting."""
 OUTSIDE = ("anonymous", "memfd", "unix", "tcp", "tables", "zombies", "threads")
 """What may be taken without a container, for a moment, and without harm."""
 
@@ -143,8 +145,9 @@ class Bait:
         self._sockets = [socket.socket(family) for family in (socket.AF_UNIX, socket.AF_UNIX, socket.AF_INET)]
         self.port = 0
 
-    def __enter__(self) -> Bait:
-        for sock, address in zip(self._sockets, (self.abstract, self.path, ("127.0.0.1", 0)), strict=True):
+    def __enter__(self) -> Self:
+        addresses: tuple[Any, ...] = (self.abstract, self.path, ("127.0.0.1", 0))
+        for sock, address in zip(self._sockets, addresses, strict=True):
             sock.bind(address)
             sock.listen()
         self.port = self._sockets[2].getsockname()[1]
@@ -230,7 +233,7 @@ def _sleeper() -> Iterator[int]:
 def owner_of_namespace(pid: int) -> list[int]:
     """Who owns the user namespace of a process, and as whom the process runs; empty if that is not told."""
     try:
-        with open(f"/proc/{pid}/ns/user") as file:
+        with Path(f"/proc/{pid}/ns/user").open() as file:
             answer = fcntl.ioctl(file, _NS_GET_OWNER_UID, struct.pack("I", 0))
     except PermissionError:
         return []
@@ -262,7 +265,7 @@ def search_from_outside(world: World) -> dict[str, list[str]]:
 
 def _holds(pid: int, texts: dict[str, str]) -> set[str]:
     found = set()
-    with open(f"/proc/{pid}/mem", "rb", buffering=0) as memory:
+    with Path(f"/proc/{pid}/mem").open("rb", buffering=0) as memory:
         for line in Path(f"/proc/{pid}/maps").read_text().splitlines():
             fields = line.split()
             begin, end = (int(text, 16) for text in fields[0].split("-"))
@@ -332,7 +335,7 @@ class Hunger:
         machine, thing = self._machine, self._thing
         told, tcp, disk = len(machine.told), tcp_pages(), _disk(self._world.folder)
         node = NodeSpec(tag="hog", pkg="hostile", exe="starve.py", args=thing)
-        limits = Resources(memory=MEMORY_MB * MB, cpu=0.8)
+        limits = Resources(memory=MEMORY_MB * MB, cpu=0 if thing == "processors" else 0.8)
         interfaces = (
             InterfaceSpec(tag="flap", type="PublisherInterface", cls="std_msgs/String", addr="/flap"),
         )
@@ -344,6 +347,8 @@ class Hunger:
             if thing == "stop":
                 await until(lambda: _is_stopped(self._world.environment(self._id).pid))
             answers = await ask(peer)
+            if thing in STARTED_BESIDE:
+                await self._start_another()
         found = {
             "has": max(
                 (int(line.split()[1]) for line in text.splitlines() if line.startswith("has ")), default=0
@@ -355,7 +360,7 @@ class Hunger:
             "reports": sum(
                 getattr(getattr(one, "status", None), "id", "") == self._id for one in machine.told[told:]
             ),
-            "processes": len(self._members()),
+            "faults": [one.text for one in machine.told[told:] if isinstance(one, Fault)],
         }
         begin = time.monotonic()
         await machine.drop(self._id)
@@ -374,6 +379,13 @@ class Hunger:
             yield
         finally:
             await robot.close()
+
+    async def _start_another(self) -> None:
+        """Make a container of somebody else meanwhile."""
+        id_ = f"calm/beside_{self._thing}"
+        await self._machine.put(id_, nodes=(NodeSpec(tag="talk", pkg="own", exe="talk.py"),))
+        await self._machine.log_holds(id_, "talk", "hello")
+        await self._machine.drop(id_)
 
     async def _outcome(self) -> str:
         """Wait for the last word of the node, or for its end, or for its container's."""
@@ -399,10 +411,6 @@ class Hunger:
             if line.startswith('{"ended"'):
                 return str(json.JSONDecoder().raw_decode(line)[0]["ended"])
         return "the container died" if self._failures() else "killed"
-
-    def _members(self) -> list[Any]:
-        units = self._machine.manager._units.values()
-        return [one for unit in units if unit.id == self._id for one in unit.handle.members(proc.table())]
 
 
 async def ask(peer: Peer) -> int:

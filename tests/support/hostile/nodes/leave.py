@@ -52,7 +52,7 @@ PROTECTED_SETTINGS = (
 CALLS: dict[str, tuple[object, ...]] = {
     "acct": (0,),
     "add_key": (b"user", b"k", b"v", 1, -3),
-    "bpf": (0, (ctypes.c_char * 128)(2, 0, 0, 0, 4, 0, 0, 0, 4, 0, 0, 0, 1), 128),
+    "bpf": (0, struct.pack("<4I", 2, 4, 4, 1).ljust(128, b"\0"), 128),
     "delete_module": (b"no_such_module", 0),
     "fanotify_init": (0, 0),
     "fsopen": (b"tmpfs", 0),
@@ -62,7 +62,7 @@ CALLS: dict[str, tuple[object, ...]] = {
     "lookup_dcookie": (0, 0, 0),
     "memfd_secret": (0,),
     "open_tree": (-100, b"/", 1),
-    "perf_event_open": ((ctypes.c_char * 128)(1, 0, 0, 0, 128), 0, -1, -1, 0),
+    "perf_event_open": (struct.pack("<2I", 1, 128).ljust(128, b"\0"), 0, -1, -1, 0),
     "quotactl": (0x80000100, 0, 0, 0),
     "request_key": (b"user", b"k", 0, -3),
     "setdomainname": (b"(none)", 6),

@@ -15,15 +15,35 @@ import socket
 import struct
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from attempts import attempt_all, system
 
 SYSTEM_FILES = (
-    "acpi cmdline config.gz diskstats driver interrupts kallsyms kcore key-users keys kmsg kpagecount mdstat "
-    "modules partitions sched_debug schedstat softirqs swaps timer_list vmallocinfo"
-).split()
+    "acpi",
+    "cmdline",
+    "config.gz",
+    "diskstats",
+    "driver",
+    "interrupts",
+    "kallsyms",
+    "kcore",
+    "key-users",
+    "keys",
+    "kmsg",
+    "kpagecount",
+    "mdstat",
+    "modules",
+    "partitions",
+    "sched_debug",
+    "schedstat",
+    "softirqs",
+    "swaps",
+    "timer_list",
+    "vmallocinfo",
+)
 """What the kernel tells in ``/proc`` of the machine and nobody in a container needs."""
 Needle = re.Pattern[bytes]
 POINTER = re.compile(rb"\bffff[0-9a-f]{12}\b")
@@ -33,10 +53,9 @@ def main() -> None:
     """Look at everything."""
     facts: dict[str, Any] = json.loads(Path(sys.argv[1]).read_text())
     needles = {name: _pattern(text) for name, text in facts["backwards"].items()}
-    paths = {name: lambda path=path: os.stat(path) and None for name, path in facts["paths"].items()}
     attacks: dict[str, Callable[[], object]] = {
-        **{f"file {name}": act for name, act in paths.items()},
-        **{f"/proc/{name}": lambda name=name: _content(f"/proc/{name}") for name in SYSTEM_FILES},
+        **{f"file {name}": partial(_find, path) for name, path in facts["paths"].items()},
+        **{f"/proc/{name}": partial(_content, f"/proc/{name}") for name in SYSTEM_FILES},
         "kernel log": lambda: system("syslog", 3, ctypes.create_string_buffer(64), 64),
         "kernel pointers": _pointers,
         "processes": _processes,
@@ -53,7 +72,7 @@ def main() -> None:
         "mount sources": lambda: "\n".join(_sources()),
         "host name": socket.gethostname,
         "cgroup": lambda: Path("/proc/self/cgroup").read_text().strip(),
-        "sysfs": lambda: os.listdir("/sys") and None,
+        "sysfs": partial(_find, "/sys/kernel"),
     }
     print(json.dumps(attempt_all(attacks)), flush=True)
 
@@ -61,6 +80,10 @@ def main() -> None:
 def _pattern(backwards: str) -> Needle:
     """What finds a text, without holding it anywhere in one piece."""
     return re.compile("".join(f"[{letter}]" for letter in reversed(backwards)).encode())
+
+
+def _find(path: str) -> None:
+    os.stat(path)
 
 
 def _content(path: str) -> str:

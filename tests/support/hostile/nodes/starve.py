@@ -6,6 +6,7 @@ Prints ``has N`` as it goes: megabytes of memory, else pieces. ``{"ended": ...}`
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import ctypes
 import errno
 import json
@@ -19,7 +20,8 @@ import threading
 import time
 import xmlrpc.client
 from collections.abc import Callable, Iterator
-from itertools import count
+from functools import partial
+from itertools import count, islice
 
 from attempts import find_process, libc, system
 
@@ -84,7 +86,7 @@ def pipes() -> Iterator[int]:
     for _ in count():
         ours, theirs = os.pipe()
         os.set_blocking(theirs, False)
-        held += _fill(lambda fd=theirs: os.write(fd, PIECE[:65536]))
+        held += _fill(partial(os.write, theirs, PIECE[:65536]))
         _kept.append(ours)
         yield held // MB
 
@@ -96,7 +98,7 @@ def unix_sockets() -> Iterator[int]:
         pair = socket.socketpair()
         pair[0].setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 8 * MB)
         pair[0].setblocking(False)
-        held += _fill(lambda sock=pair[0]: sock.send(PIECE[:65536]))
+        held += _fill(partial(pair[0].send, PIECE[:65536]))
         _kept.append(pair)
         yield held // MB
 
@@ -108,7 +110,7 @@ def tcp_sockets() -> Iterator[int]:
         for _ in range(100):
             sender = socket.create_connection(server.getsockname())
             sender.setblocking(False)
-            held += _fill(lambda sock=sender: sock.send(PIECE))
+            held += _fill(partial(sender.send, PIECE))
             _kept.append((sender, server.accept()))
             yield held // MB
 
@@ -172,9 +174,22 @@ def threads() -> Iterator[int]:
 def descriptors() -> Iterator[int]:
     """Open files."""
     for number in count(1):
-        _kept.append(open("/dev/null", "rb", buffering=0))
+        _kept.append(os.open("/dev/null", os.O_RDONLY))
         if number % 1000 == 0:
             yield number
+
+
+def passing() -> Iterator[int]:
+    """Descriptors that are on their way for ever, in sockets."""
+    pieces = [os.open("/dev/null", os.O_RDONLY)] * 250
+    for number in count(1):
+        pair = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        pair[0].setblocking(False)
+        _kept.append(pair)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                socket.send_fds(pair[0], [b"x"], pieces)
+        yield number
 
 
 def processors() -> Iterator[int]:
@@ -183,14 +198,14 @@ def processors() -> Iterator[int]:
         if os.fork() == 0:
             while True:
                 pass
-    for number in range(1, 30):
+    for number in range(1, 15):
         time.sleep(0.1)
         yield number
 
 
 def output() -> Iterator[int]:
     """A log without an end."""
-    end = time.monotonic() + 3
+    end = time.monotonic() + 2
     line = b"x" * 120 + b"\n"
     while time.monotonic() < end:
         os.write(1, line * 500)
@@ -208,10 +223,10 @@ async def _log() -> None:
 
     async with Node("flood") as node:
         rosout = await node.advertise("/rosout", "rosgraph_msgs/Log", queue_size=100)
-        end = time.monotonic() + 3
-        number = 0
+        end = time.monotonic() + 2
+        numbers = count()
         while time.monotonic() < end:
-            for number in range(number, number + 20):
+            for number in islice(numbers, 20):
                 rosout.publish(name=f"/nobody{number}", level=4, msg="y" * 20000)
             await asyncio.sleep(0.01)
 
@@ -220,7 +235,7 @@ def graph() -> Iterator[int]:
     """Topics, services and parameters without number, at the container's ROS core."""
     core = xmlrpc.client.ServerProxy(os.environ["ROS_MASTER_URI"])
     uri = "http://127.0.0.1:9/"
-    end = time.monotonic() + 4
+    end = time.monotonic() + 2
     for number in count(1):
         if time.monotonic() > end:
             break
@@ -239,7 +254,7 @@ def flapping() -> Iterator[int]:
 async def _flap() -> int:
     from rce.ros.node import Node
 
-    end = time.monotonic() + 3
+    end = time.monotonic() + 2
     async with Node("flap") as node:
         for number in count(1):
             subscriber = await node.subscribe("/flap", "std_msgs/String", print)
@@ -288,6 +303,7 @@ OTHER: dict[str, Callable[[], Iterator[int]]] = {
     "vforks": waiting_parents,
     "threads": threads,
     "files": descriptors,
+    "passing": passing,
     "processors": processors,
     "output": output,
     "rosout": log_records,
