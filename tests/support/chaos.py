@@ -28,6 +28,8 @@ MASTER_AND_MANAGER = 0.25
 """How often the victim is one of the two programs, and not a process below them."""
 DESTROYED = 0.5
 """How often a container that is there is destroyed, and not resized."""
+MAKERS = ("bwrap", "unshare", "podman", "conmon")
+"""The programs that make namespaces."""
 TWICE = 0.25
 """How often another one is killed right after."""
 FD_SLACK = 3
@@ -156,8 +158,8 @@ def _part(pid: int) -> str:
         "stringEcho.py": "node",
         "read -r word": "holder",
     }
-    if Path(words[0]).name == "bwrap":
-        return "bwrap"
+    if (program := Path(words[0]).name) in MAKERS:
+        return program
     return next((name for needle, name in names.items() if needle in line), "")
 
 
@@ -221,7 +223,7 @@ async def run(runtime: str, seed: int, rounds: int, *, groups: bool) -> list[str
 
 def main() -> None:
     runtime, seed, rounds = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
-    for line in asyncio.run(run(runtime, seed, rounds, groups=runtime == "namespace")):
+    for line in asyncio.run(run(runtime, seed, rounds, groups=runtime != "process")):
         print(line)  # noqa: T201 - for whom it was started by
 
 
