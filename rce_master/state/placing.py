@@ -23,6 +23,7 @@ from rce_master.state.placement import Room, choose, refusals
 from rce_master.state.records import Container, ContainerLive
 
 if TYPE_CHECKING:
+    from rce.control.model import Resources
     from rce_master.state.changes import Transaction
 
 
@@ -37,7 +38,7 @@ def admit(tx: Transaction, container: Container, *, wait: bool) -> None:
         return
     if any(room.fits(container.resources) for room in _with_group(tx, container, known)):
         return
-    why = _why_nowhere(tx, container)
+    why = _why_nowhere(tx, container, capacity.rooms(tx.tables))
     if not wait:
         raise NoRoom(
             f"no machine takes container {container.tag!r} now: {why}; to wait for room, ask with wait"
@@ -51,7 +52,14 @@ def place_waiting(tx: Transaction) -> None:
     if not waiting:
         return
     rooms = capacity.rooms(tx.tables)
+    too_much: set[Resources] = set()  # rooms only fill up here: what found none finds none later
     for container in sorted(waiting, key=lambda c: c.number):
+        wish = container.resources
+        if wish in too_much:
+            continue
+        if not any(room.fits(wish) for room in rooms.values()):
+            too_much.add(wish)
+            continue
         room = best(tx, container, rooms)
         if room is not None:
             told = tx.tables.container_live(container.id).told
@@ -88,12 +96,14 @@ def happened(tx: Transaction, id_: str, event: ContainerEvent) -> None:
 
 def tell_waiting(tx: Transaction) -> None:
     """Tell users once of containers that have been waiting for a machine for long."""
+    rooms: dict[str, Room] | None = None
     for endpoint in tx.tables.endpoints.by("task_set", ""):
         live = tx.tables.live[endpoint.id]
         if not isinstance(endpoint, Container) or not isinstance(live, ContainerLive) or live.told:
             continue
         if tx.now - live.since >= tx.settings.placement_patience:
-            _tell(tx, endpoint, _why_nowhere(tx, endpoint))
+            rooms = capacity.rooms(tx.tables) if rooms is None else rooms
+            _tell(tx, endpoint, _why_nowhere(tx, endpoint, rooms))
 
 
 def _tell(tx: Transaction, container: Container, why: str) -> None:
@@ -103,8 +113,7 @@ def _tell(tx: Transaction, container: Container, why: str) -> None:
     tx.happen("container_waiting", container.id, text)
 
 
-def _why_nowhere(tx: Transaction, container: Container) -> str:
-    rooms = capacity.rooms(tx.tables)
+def _why_nowhere(tx: Transaction, container: Container, rooms: dict[str, Room]) -> str:
     if not rooms:
         return "no container task set is connected"
     open_ = capacity.open_to(tx.tables, container, rooms)

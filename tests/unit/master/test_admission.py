@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from support.master_world import World
 
 from rce.control.model import EndpointState, EndpointStatus, Network, NodeSpec
 from rce_master.exceptions import Conflict, Forbidden, Invalid, LimitReached, NoRoom
-from rce_master.state import commands
+from rce_master.state import commands, placing
 from rce_master.state.records import UserRole
 from rce_master.state.settings import StateSettings
 
@@ -273,3 +275,24 @@ def test_nodes_may_not_wait_for_one_another_in_a_circle(world: World) -> None:
     with pytest.raises(Invalid, match="node 'c': after goes round in a circle: c after"):
         add("c", "a")
     add("c")
+
+
+def test_many_that_wait_cost_little(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World()
+    world.container_set("c1", name="m1", slots=2)
+    world.container("first")
+    looked: list[str] = []
+
+    def choose(tx: Any, container: Any, rooms: Any) -> Any:
+        looked.append(container.tag)
+        return best(tx, container, rooms)
+
+    best = placing.best
+    monkeypatch.setattr(placing, "best", choose)
+    for number in range(5):
+        world.container(f"c{number}", wait=True, size=2)
+    assert looked == [], "that none of them fits is seen once, and without looking at each"
+    world.container("small", wait=True)
+    assert looked == ["small"], "who fits passes those that do not"
+    world.tick(1)
+    assert looked == ["small"]
