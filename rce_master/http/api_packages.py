@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from functools import cache
 from typing import TYPE_CHECKING
 
 from aiohttp import web
@@ -16,7 +17,7 @@ from rce_master.exceptions import Invalid, NotFound
 from rce_master.http import package_models as models
 from rce_master.http.routes import OF_USER, Call, RouteTable
 from rce_master.state import commands
-from rce_master.state.packages import find
+from rce_master.state.packages import find, uses
 from rce_master.state.records import Bundle, PackageKey, bundle_key
 
 if TYPE_CHECKING:
@@ -36,8 +37,16 @@ async def list_packages(call: Call) -> models.PackagesOut:
     tables = call.services.realm.tables
     scope = call.scope
     found = tables.bundles if scope is None else tables.bundles.by("user", scope)
+    users = {bundle.user for bundle in found}
+    used = {id_: nodes for user in users for id_, nodes in uses(tables, user).items()}
+    newest = cache(lambda user, name: find(tables, user, name))
     return models.PackagesOut(
-        packages=[_package_out(tables, bundle) for bundle in sorted(found, key=lambda bundle: bundle.id)]
+        packages=[
+            _package_out(
+                bundle, is_newest=newest(bundle.user, bundle.name) == bundle, nodes=used.get(bundle.id)
+            )
+            for bundle in sorted(found, key=lambda bundle: bundle.id)
+        ]
     )
 
 
@@ -49,7 +58,7 @@ async def show_package(call: Call) -> models.PackageOut:
     found = tables.bundles.get(bundle_key(call.owner, name, version))
     if found is None:
         raise NotFound(f"there is no package {name!r} of version {version!r}")
-    return _package_out(tables, found)
+    return _shown(tables, found)
 
 
 @routes.route(
@@ -75,7 +84,7 @@ async def push_package(call: Call) -> models.PackageOut:
     )
     size = call.request.content_length or 0
     bundle, warnings = await call.services.packages.push(wish, size, _body(call.request))
-    return _package_out(call.services.realm.tables, bundle, warnings)
+    return _shown(call.services.realm.tables, bundle, warnings)
 
 
 @routes.route(
@@ -135,12 +144,20 @@ async def _body(request: web.Request) -> AsyncIterator[bytes]:
         yield chunk
 
 
-def _package_out(tables: Tables, bundle: Bundle, warnings: tuple[str, ...] = ()) -> models.PackageOut:
+def _shown(tables: Tables, bundle: Bundle, warnings: tuple[str, ...] = ()) -> models.PackageOut:
+    is_newest = find(tables, bundle.user, bundle.name) == bundle
+    nodes = uses(tables, bundle.user).get(bundle.id)
+    return _package_out(bundle, is_newest=is_newest, nodes=nodes, warnings=warnings)
+
+
+def _package_out(
+    bundle: Bundle, *, is_newest: bool, nodes: list[str] | None, warnings: tuple[str, ...] = ()
+) -> models.PackageOut:
     return models.PackageOut(
         user=bundle.user,
         name=bundle.name,
         version=bundle.version,
-        newest=find(tables, bundle.user, bundle.name) == bundle,
+        newest=is_newest,
         description=bundle.description,
         executables=list(bundle.executables),
         requirements=bundle.requirements,
@@ -151,12 +168,7 @@ def _package_out(tables: Tables, bundle: Bundle, warnings: tuple[str, ...] = ())
         digest=bundle.digest,
         key=key_id(bundle.key),
         created=bundle.created,
-        nodes=[
-            f"{container.tag}/{node.tag}"
-            for container in tables.containers(bundle.user)
-            for node in container.nodes.values()
-            if find(tables, bundle.user, node.pkg) == bundle
-        ],
+        nodes=nodes or [],
         warnings=list(warnings),
     )
 

@@ -5,6 +5,7 @@ What a version holds is kept elsewhere, under its hash; here is what is known of
 
 from __future__ import annotations
 
+from functools import cache
 from typing import TYPE_CHECKING
 
 from rce.bundles.signing import key_id
@@ -15,7 +16,7 @@ from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
 from rce_master.state.records import Bundle, Container, bundle_key, package_key_key
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     from rce.control.model import NodeSpec
     from rce_master.state.changes import Transaction
@@ -115,12 +116,7 @@ def remove_bundle(tx: Transaction, command: RemoveBundle) -> None:
     found = tx.tables.bundles.get(bundle_key(command.user, command.name, command.version))
     if found is None:
         raise NotFound(f"there is no package {command.name!r} of version {command.version!r}")
-    users = [
-        f"{container.tag}/{node.tag}"
-        for container in tx.tables.containers(found.user)
-        for node in container.nodes.values()
-        if find(tx.tables, found.user, node.pkg) == found
-    ]
+    users = uses(tx.tables, found.user).get(found.id)
     if users:
         raise Conflict(
             f"{found.name} {found.version} is used by {', '.join(users)}; remove the nodes first, or let them"
@@ -146,6 +142,23 @@ def find(tables: Tables, user: str, pkg: str) -> Bundle | None:
     return newest(tables.bundles.by("package", f"{user}/{name}"), lambda bundle: bundle.version)
 
 
+def _finder(tables: Tables, user: str) -> Callable[[str], Bundle | None]:
+    """Make a :func:`find` that looks once for each text: many nodes name the same, and versions are many."""
+    return cache(lambda pkg: find(tables, user, pkg))
+
+
+def uses(tables: Tables, user: str) -> dict[str, list[str]]:
+    """Tell which nodes of a user need which version: ``CONTAINER/NODE`` by the versions' ids."""
+    found: dict[str, list[str]] = {}
+    lookup = _finder(tables, user)
+    for container in tables.containers(user):
+        for node in container.nodes.values():
+            bundle = lookup(node.pkg)
+            if bundle is not None:
+                found.setdefault(bundle.id, []).append(f"{container.tag}/{node.tag}")
+    return found
+
+
 def check_node(tables: Tables, user: str, node: NodeSpec) -> None:
     """Check that there is the version which a node names.
 
@@ -161,7 +174,7 @@ def check_node(tables: Tables, user: str, node: NodeSpec) -> None:
 
 def bundle_specs(tables: Tables, container: Container) -> tuple[BundleSpec, ...]:
     """Tell what the nodes of a container need, in the order of names and versions."""
-    found = (find(tables, container.user, node.pkg) for node in container.nodes.values())
+    found = map(_finder(tables, container.user), [node.pkg for node in container.nodes.values()])
     needed = {bundle.id: bundle for bundle in found if bundle is not None}
     return tuple(_spec(needed[id_]) for id_ in sorted(needed))
 
