@@ -42,16 +42,21 @@ def _find(archive: LogArchive, message: ReadLog, living: str) -> Kept:
     tag = EndpointId.parse(message.id).tag
     if message.wish.life:
         ended = [kept for kept in archive.ended(message.id) if kept.life.mark == message.wish.life]
-        found = current if current and living == message.wish.life else next(iter(ended), None)
+        found = current if living == message.wish.life else next(iter(ended), None)
         missing = f"the logs of that life of container {tag} are not kept any more"
-    elif current is not None and not message.wish.previous:
+    elif current is not None and not message.wish.previous and _is_owners(current, message):
         return current
     else:
         found = next((kept for kept in archive.ended(message.id) if kept.life.mark != living), None)
         missing = f"no logs of an earlier life of container {tag} are kept here"
-    if found is None or 0 < found.life.ended < message.wish.since:
+    if found is None or not _is_owners(found, message):
         raise FileNotFoundError(missing)
     return found
+
+
+def _is_owners(kept: Kept, message: ReadLog) -> bool:
+    """Whether a life is of the user who is meant, and not of one of the same name before."""
+    return kept.life.began >= message.wish.since
 
 
 def _read(kept: Kept, message: ReadLog) -> Chunk:

@@ -55,9 +55,11 @@ async def read_log(tables: Tables, peers: Mapping[str, LogReader], request: LogR
         NotFound: There is no such container, node or log.
         TaskSetAway: Its task set is not connected or does not answer.
     """
-    wish = msgspec.structs.replace(request.wish, since=_owner_since(tables, request.id))
-    request = request._replace(wish=wish)
     container = tables.container(request.id)
+    if container is None or not _is_present(tables, request):
+        wish = msgspec.structs.replace(request.wish, since=_owner_since(tables, request.id))
+        request = request._replace(wish=wish)
+    wish = request.wish
     if container is None:
         return await _read_anywhere(tables, peers, request)
     if wish.previous or wish.life:
@@ -119,6 +121,13 @@ async def _ask(peer: LogReader | None, request: LogRequest) -> LogChunk:
         )
     except ControlError as error:
         raise TaskSetAway(f"container {tag!r} cannot be reached: {error}") from error
+
+
+def _is_present(tables: Tables, request: LogRequest) -> bool:
+    """Whether the present life is meant, which is its owner's whatever its machine's clock says."""
+    status = tables.container_live(request.id).status
+    wish = request.wish
+    return not wish.previous and wish.life in ("", status.incarnation if status is not None else "")
 
 
 def _owner_since(tables: Tables, id_: str) -> float:

@@ -40,4 +40,4 @@ class LogWish(Struct, frozen=True, kw_only=True, omit_defaults=True):
     previous: bool = False
     """Of the last life that ended, though the container may live another one; goes without ``life``."""
     since: float = 0.0
-    """Not of lives that ended before this time (seconds since the epoch): they were another user's."""
+    """Not of lives that began before this time (seconds since the epoch): they were another user's."""

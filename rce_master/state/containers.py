@@ -63,7 +63,12 @@ def create_container(tx: Transaction, command: CreateContainer) -> None:
     if len(tx.tables.containers(command.user)) >= tx.settings.max_containers:
         raise LimitReached(f"you have {tx.settings.max_containers} containers already; destroy one first")
     capacity.check_wish(tx, command.user, id_, command.resources)
-    made = Container(id=id_, resources=command.resources, number=tx.next_number("container"))
+    made = Container(
+        id=id_,
+        resources=command.resources,
+        number=tx.next_number("container"),
+        born=tx.next_number("revision"),
+    )
     tx.put(replace(made, size=endpoints.grown(tx, made, command.resources)))
     tx.put(ContainerLive(id=id_, phase=ContainerPhase.REQUESTED, since=tx.now))
     tx.touch(id_)

@@ -154,6 +154,8 @@ class Container(_Endpoint, frozen=True, kw_only=True, tag=True):
     """What it was asked for with at first, if it was resized since."""
     number: int = 0
     """Grows from container to container: the order in which they were asked for."""
+    born: int = 0
+    """The newest revision when it was asked for: what was told of less is a former one of the same name."""
     nodes: dict[str, NodeSpec] = {}
     """By tag."""
     parameters: dict[str, ParameterValue] = {}

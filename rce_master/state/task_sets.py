@@ -17,6 +17,7 @@ from rce_master.state.records import (
     Robot,
     RobotLive,
     TaskSet,
+    Tombstone,
     tombstone_key,
 )
 
@@ -87,23 +88,26 @@ def _register(tx: Transaction, hello: Hello) -> None:
 
 def _adopt(tx: Transaction, process: str, status: EndpointStatus) -> None:
     endpoint = tx.tables.endpoints.get(status.id)
-    if (
-        isinstance(endpoint, Container)
-        and not endpoint.task_set
-        and _may_adopt(tx, process, endpoint, status)
-    ):
-        placing.bind(tx, endpoint, process)
+    if isinstance(endpoint, Container) and not endpoint.task_set:
+        _find_again(tx, process, endpoint, status)
         endpoint = tx.tables.endpoints[status.id]
     if endpoint is not None and endpoint.task_set == process:
         _note(tx, endpoint, status)
 
 
-def _may_adopt(tx: Transaction, process: str, container: Container, status: EndpointStatus) -> bool:
-    """Whether a container that is placed nowhere may go on where it is: not if it grew too much meanwhile."""
+def _find_again(tx: Transaction, process: str, container: Container, status: EndpointStatus) -> None:
+    """Let a container that is placed nowhere go on where it is, unless it grew too much meanwhile.
+
+    One of the same name that was there before it is none of its lives: ``Sync`` has it dropped, and the
+    container may be placed there when it is gone.
+    """
     task_set = tx.tables.task_sets[process]
     if task_set.kind is not TaskSetKind.CONTAINER or status.state is EndpointState.STOPPING:
-        return False
-    return not capacity.room_at(tx.tables, task_set).shortages(container.resources)
+        return
+    if status.revision < container.born:
+        tx.put(Tombstone(process=process, id=container.id))
+    elif not capacity.room_at(tx.tables, task_set).shortages(container.resources):
+        placing.bind(tx, container, process)
 
 
 def _miss(tx: Transaction, endpoint: Container | Robot) -> None:

@@ -81,8 +81,16 @@ def test_nobody_reads_what_is_another_ones(archive: LogArchive) -> None:
         with pytest.raises(FileNotFoundError):
             read(archive, node)
     with pytest.raises(FileNotFoundError):
-        read(archive, id_="bob/box", since=10.5)
-    assert read(archive, id_="bob/box", since=9.5)
+        read(archive, id_="bob/box", since=9.5)
+    assert read(archive, id_="bob/box", since=1.0)
+
+
+def test_what_still_ends_of_a_user_who_was_removed_is_not_another_ones(archive: LogArchive) -> None:
+    live(archive, "one")
+    assert read(archive, living="one", since=1.0)
+    for wish in ({}, {"life": "one"}):
+        with pytest.raises(FileNotFoundError):
+            read(archive, living="one", since=1.5, **wish)
 
 
 def test_the_last_life_that_ended_counts(archive: LogArchive) -> None:

@@ -7,9 +7,11 @@ import pytest
 from rce.control.exceptions import PeerTimeoutError
 from rce.control.logs import LogWish
 from rce.control.messages import LogChunk, MachineInfo, TaskSetKind
+from rce.control.model import EndpointState, EndpointStatus
 from rce_master.exceptions import NotFound, TaskSetAway
 from rce_master.logs import LogRequest, read_log
-from rce_master.state.records import Container, TaskSet, User, UserRole
+from rce_master.state.lifecycle import ContainerPhase
+from rce_master.state.records import Container, ContainerLive, TaskSet, User, UserRole
 from rce_master.state.tables import Tables
 
 BOX = "anna/box"
@@ -52,6 +54,9 @@ class Cloud:
             self.tables.task_sets.assign(process, task_set)
         if at is not None:
             self.tables.endpoints.assign(BOX, Container(id=BOX, task_set=at))
+            status = EndpointStatus(id=BOX, revision=1, state=EndpointState.RUNNING, incarnation="now")
+            live = ContainerLive(id=BOX, phase=ContainerPhase.RUNNING, since=0.0, status=status)
+            self.tables.live.assign(BOX, live)
         self.robots = Machine("robots have no logs")
 
     async def read(self, node: str = "", wish: LogWish = LogWish()) -> str:  # noqa: B008
@@ -63,7 +68,13 @@ async def test_a_container_is_read_where_it_is() -> None:
     cloud = Cloud(at="a", a=Machine("here"), b=Machine("there"))
     assert await cloud.read() == "here"
     assert not cloud.machines["b"].wishes
-    assert cloud.machines["a"].wishes == [LogWish(since=17.0)], "not what was there before its user"
+    await cloud.read(wish=LogWish(life="now"))
+    await cloud.read(wish=LogWish(life="former"))
+    assert cloud.machines["a"].wishes == [
+        LogWish(),
+        LogWish(life="now"),
+        LogWish(life="former", since=17.0),
+    ], "not what was there before its user"
     with pytest.raises(NotFound, match="has no node 'x'"):
         await cloud.read("x")
     cloud.machines["a"].silent = True
@@ -75,6 +86,7 @@ async def test_of_a_container_that_is_gone_the_last_life_counts() -> None:
     older, newer = Machine("older", ended=5.0), Machine("newer", ended=6.0)
     cloud = Cloud(a=older, b=newer, c=Machine(), d=Machine("?", silent=True))
     assert await cloud.read("any") == "newer"
+    assert older.wishes == [LogWish(since=17.0)], "not what was there before its user"
     assert not cloud.robots.wishes
     with pytest.raises(NotFound, match="there is no container 'box'"):
         await Cloud(a=Machine()).read()

@@ -403,3 +403,20 @@ def test_a_container_that_its_machine_ended_is_stopped_until_there_is_another(wo
     assert world.phase() == "stopped"
     world.container_set("c2")
     assert world.phase() == "placed"
+
+
+def test_a_container_of_the_same_name_that_ran_before_is_not_taken_for_this_one() -> None:
+    world = World()
+    world.container_set("c1")
+    world.container("c")
+    former = EndpointStatus(
+        id="anna/c", revision=world.spec("c").revision, state=EndpointState.RUNNING, incarnation="former"
+    )
+    world.report("c1", former)
+    world.do(commands.TaskSetLeft(process="c1"))
+    world.do(commands.DestroyContainer(user="anna", tag="c"))
+    world.container("c")
+    world.container_set("c1", endpoints=(former,))
+    assert world.state.tables.endpoints["anna/c"].task_set == "", "the former one has to end first"
+    world.do(commands.EndpointGone(process="c1", id="anna/c"))
+    assert world.state.tables.endpoints["anna/c"].task_set == "c1"
