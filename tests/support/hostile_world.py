@@ -1,4 +1,4 @@
-"""``python -m support.hostile_world FOLDER RUNTIME attack|starve NAME...``: a machine with somebody hostile.
+"""``python -m support.hostile_world FOLDER RUNTIME WHAT``: a machine with somebody hostile on it.
 
 Runs as whatever user it is started by, with a manager of its own, a neighbour of another user beside the
 attacker, and sockets of the machine that nobody inside should reach. Prints, as JSON, what became of it all.
@@ -18,7 +18,7 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -28,10 +28,13 @@ from rce.control.messages import Fault, Put
 from rce.control.model import EndpointState, InterfaceSpec, LinkSpec, NodeSpec, NodeState, Resources
 from rce.link import LinkError
 from rce_container.environment import proc
+from rce_container.runtimes import namespace
+from rce_container.seccomp.library import FilterUnavailableError
 from support.containers import ECHO, ECHO_INTERFACES, MACHINE, Machine, Peer, container, until
 from support.persons import SECRET
 
 HOSTILE = Path(__file__).parent / "hostile"
+MODULE = "support.hostile_world"
 NEIGHBOUR = "calmneighbour/quietbox"
 ATTACKER = "mallory/box"
 TOKEN = "thetokenofthislink"
@@ -105,7 +108,9 @@ def _put_neighbour() -> Put:
 # Leaving and spying
 
 
-async def attack(folder: Path, runtime: str) -> dict[str, Any]:
+async def attack(
+    folder: Path, runtime: str, programs: Sequence[str] = ("leave.py", "executed", "spy.py")
+) -> dict[str, Any]:
     """Let nodes try to leave and to spy, by fork and by execution, and the same outside."""
     world = World(folder, runtime)
     machine = world.machine
@@ -119,7 +124,7 @@ async def attack(folder: Path, runtime: str) -> dict[str, Any]:
                 executed = nodes / "executed"
                 executed.write_text(f"#!{sys.executable}\n{(nodes / 'leave.py').read_text()}")
                 executed.chmod(0o755)
-                for exe in ("leave.py", "executed", "spy.py"):
+                for exe in programs:
                     tag = exe.partition(".")[0]
                     node = NodeSpec(tag=tag, pkg="hostile", exe=exe, args=str(world.facts))
                     await machine.put(ATTACKER, nodes=(node,), links=link(TOKEN))
@@ -445,10 +450,21 @@ def _disk(folder: Path) -> int:
     return total
 
 
+def _no_filter() -> bytes:
+    raise FilterUnavailableError("it is not wanted")
+
+
 async def main() -> None:
     folder, runtime, what = Path(sys.argv[1]), sys.argv[2], sys.argv[3]
     folder.mkdir()
-    found = await (attack(folder, runtime) if what == "attack" else starve(folder, runtime, sys.argv[4:]))
+    match what:
+        case "attack":
+            found = await attack(folder, runtime)
+        case "unfiltered":
+            namespace.make_filter = _no_filter
+            found = await attack(folder, runtime, ("executed",))
+        case _:
+            found = await starve(folder, runtime, sys.argv[4:])
     print(json.dumps(found))  # noqa: T201 - for the test that started it
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from support.hostile_world import MODULE
 from support.persons import Person
-
-MODULE = "support.hostile_world"
 
 
 @pytest.fixture(scope="session", params=["root", "normal"])

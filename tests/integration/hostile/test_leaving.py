@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from support.hostile_world import MODULE
 from support.persons import Person
 
 pytestmark = [pytest.mark.needs("bwrap"), pytest.mark.timeout(120)]
@@ -143,6 +144,32 @@ SAME_OUTSIDE = {
     "message queues",
 }
 """What ends in the same way, or may, without a container: there is none of it, or everybody may do it."""
+
+
+WALLS = {
+    **{name: results for name, results in {**PROCESSES, **ADDRESSES, **FILES, **PROGRAMS, **RIGHTS}.items()},
+    **{f"{call} {kind}": NO_RIGHT for call in ("unshare", "clone") for kind in NAMESPACES},
+    **{f"{call} user": {"ENOSPC"} for call in ("unshare", "clone")},
+    **{name: CALLS[name] for name in CALLS if name.startswith("setns")},
+    **{name: LIMITS[name] for name in ("real time", "nice", "terminals", "inotify", "waiting signals")},
+    **dict.fromkeys(("clone time", "setns user"), {"done", "EINVAL"}),  # of no use: it is their own
+    **dict.fromkeys(("chroot", "bpf", "fsopen", "open_tree", "syslog", "swapoff", "vhangup"), NO_RIGHT),
+    **dict.fromkeys(("packet socket", "raw socket"), NO_RIGHT),
+}
+"""What must hold on a machine on which no filter of system calls can be made."""
+
+
+@pytest.fixture(scope="module")
+def unfiltered(root_person: Person) -> dict[str, Any]:
+    found: dict[str, Any] = root_person.run("unfiltered", module=MODULE)["executed"]["results"]
+    return found
+
+
+def test_the_walls_stand_without_a_filter(unfiltered: dict[str, Any]) -> None:
+    assert {
+        name: result for name, result in unfiltered.items() if result not in WALLS.get(name, {result})
+    } == {}
+    assert unfiltered["userfaultfd"] == "done", "there is no filter"
 
 
 @pytest.mark.parametrize("attempt", EXPECTED)

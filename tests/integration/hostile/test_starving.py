@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from support.hostile_world import MEMORY_MB, OUTSIDE, PROCESSES
+from support.hostile_world import MEMORY_MB, MODULE, OUTSIDE, PROCESSES
 from support.persons import Person
 
 pytestmark = [pytest.mark.needs("bwrap"), pytest.mark.timeout(120)]
@@ -37,13 +37,13 @@ REPORTS = 60
 
 @pytest.fixture(scope="module")
 def starved(root_person: Person) -> dict[str, Any]:
-    return root_person.run("starve", *THINGS, module="support.hostile_world")
+    return root_person.run("starve", *THINGS, module=MODULE)
 
 
 @pytest.fixture(scope="module")
 def weakly(normal_person: Person) -> dict[str, Any]:
     """The same where limits are weak: the user may make no cgroups."""
-    return normal_person.run("starve", *WITHOUT_CGROUPS, module="support.hostile_world")
+    return normal_person.run("starve", *WITHOUT_CGROUPS, module=MODULE)
 
 
 @pytest.mark.needs("cgroups")

@@ -123,8 +123,8 @@ def processes(targets: dict[str, int]) -> dict[str, Attack]:
             f"descriptor of {who}": partial(_open_any, f"/proc/{pid}/fd"),
             f"file mapped by {who}": partial(_open_any, f"/proc/{pid}/map_files"),
             f"ptrace of {who}": partial(system, "ptrace", 0x4206, pid, 0, 0),
-            f"process_vm_readv of {who}": partial(_read_memory, pid),
-            f"process_vm_writev of {who}": partial(system, "process_vm_writev", pid, 0, 0, 0, 0, 0),
+            f"process_vm_readv of {who}": partial(_touch_memory, "process_vm_readv", pid),
+            f"process_vm_writev of {who}": partial(_touch_memory, "process_vm_writev", pid),
             f"process_madvise of {who}": partial(_advise, pid),
             f"pidfd_getfd of {who}": partial(_take_fd, pid),
             f"kcmp of {who}": partial(system, "kcmp", os.getpid(), pid, 1, 0, 0),
@@ -273,7 +273,7 @@ def _some_address(maps: str) -> int:
     return int(Path(maps).read_text().partition("-")[0], 16)
 
 
-def _read_memory(pid: int) -> int:
+def _touch_memory(call: str, pid: int) -> int:
     class Piece(ctypes.Structure):
         _fields_ = (("base", ctypes.c_void_p), ("length", ctypes.c_size_t))
 
@@ -283,7 +283,7 @@ def _read_memory(pid: int) -> int:
     except OSError:
         address = 0x400000
     here, there = Piece(ctypes.addressof(buffer), 16), Piece(address, 16)
-    return system("process_vm_readv", pid, ctypes.byref(here), 1, ctypes.byref(there), 1, 0)
+    return system(call, pid, ctypes.byref(here), 1, ctypes.byref(there), 1, 0)
 
 
 def _advise(pid: int) -> int:
