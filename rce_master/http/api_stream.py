@@ -111,6 +111,8 @@ def _one_of(words: type[E], name: str, word: str) -> E:
 async def stream_events(call: Call) -> web.StreamResponse:
     """Stream events until the client or the server ends it, or the token is worth nothing any more."""
     scope, last = call.scope, _start(call)
+    owner = call.services.realm.tables.users.get(scope or "")
+    born = owner.created if owner is not None else 0.0  # what happened before was another one's of that name
     response = web.StreamResponse(
         headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     )
@@ -123,7 +125,8 @@ async def stream_events(call: Call) -> web.StreamResponse:
             if not call.is_still_valid:
                 return response
             # A comment now and then keeps proxies from giving up, and finds out that a client is gone.
-            frames = [_frame(event) for event in news if scope is None or event.user == scope]
+            mine = [event for event in news if scope in (None, event.user) and event.time >= born]
+            frames = [_frame(event) for event in mine]
             await response.write(b"".join(frames) or b":\n\n")
             last = news[-1].id if news else last
     except ConnectionResetError:

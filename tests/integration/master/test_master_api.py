@@ -222,6 +222,19 @@ async def test_events_are_followed_and_resumed(site: Site) -> None:
     assert [e["kind"] for e in await waiting] == ["container_destroyed"]
 
 
+async def test_a_user_does_not_see_what_one_of_the_same_name_did_before(site: Site) -> None:
+    anna = {"name": "anna", "password": "one"}
+    await site.api("POST", "/users", anna, status=201)
+    await site.api(
+        "POST", "/containers", {"tag": "former"}, token=await site.login("anna", "one"), status=204
+    )
+    await site.api("DELETE", "/users/anna", status=204)
+    await site.api("POST", "/users", anna, status=201)
+    token = await site.login("anna", "one")
+    await site.api("POST", "/containers", {"tag": "mine"}, token=token, status=204)
+    assert [e["subject"] for e in await read_events(site, 1, token, since=0)] == ["anna/mine"]
+
+
 async def test_a_stream_ends_with_the_token(site: Site) -> None:
     await site.api("POST", "/users", {"name": "anna", "password": "one"}, status=201)
     anna = await site.login("anna", "one")
