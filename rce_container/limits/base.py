@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
 from typing import ClassVar, NamedTuple, Protocol
 
-from rce.control.limits import MEGABYTE
+from rce.control.limits import MEGABYTE, MIN_MEMORY
 from rce.control.model import Resources
 
 
@@ -42,11 +42,14 @@ WEIGHT_PER_SLOT = 100
 
 
 def limits_of(resources: Resources, settings: SlotSettings) -> Limits:
-    """The limits of a container: what it asks for itself, else as many slots' as its size says."""
+    """The limits of a container: what it asks for itself, else as many slots' as its size says.
+
+    Stores of earlier releases may hold wishes for less memory than a container can live with.
+    """
     size = max(1, resources.size)
     return Limits(
         cpu=max(0.0, resources.cpu),
-        memory=resources.memory if resources.memory > 0 else size * settings.slot_memory,
+        memory=max(resources.memory, MIN_MEMORY) if resources.memory > 0 else size * settings.slot_memory,
         processes=size * settings.slot_processes,
         weight=size * WEIGHT_PER_SLOT,
     )
