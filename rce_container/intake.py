@@ -16,6 +16,7 @@ from msgspec.structs import asdict, replace
 
 from rce.control.model import EndpointState, EndpointStatus, InterfaceUsage, LinkAddress, NodeStatus
 from rce.protocol.names import is_name
+from rce.protocol.printable import one_line
 from rce_container.environment import messages as m
 
 T = TypeVar("T")
@@ -56,22 +57,24 @@ def read(line: bytes) -> m.ToManager:
 
 
 def sound_text(text: str) -> str:
-    """Cut a text that is too long for people."""
+    """Cut a text that is too long for people, and take out what their terminals would obey."""
+    text = one_line(text)
     return text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]} ..."
 
 
-def sound_status(id_: str, status: EndpointStatus) -> EndpointStatus:
+def sound_status(id_: str, status: EndpointStatus, newest: int = _MAX_NUMBER) -> EndpointStatus:
     """Take of a report what can be true of a container.
 
     Args:
         id_: The container, whatever it calls itself.
         status: What its environment says.
+        newest: The newest revision that it was told of, if that is known.
     """
     nodes = {node.tag: node for node in islice(status.nodes, MAX_ITEMS) if is_name(node.tag)}
     return replace(
         status,
         id=id_,
-        revision=_whole(status.revision, least=-1),
+        revision=min(_whole(status.revision, least=-1), newest),
         state=status.state if status.state in _STATES else EndpointState.RUNNING,
         incarnation="",
         detail="",

@@ -239,7 +239,7 @@ class Unit:
             pace.pay(intake.PER_LINE + len(line))
             match intake.read(line):
                 case m.Report(status=status):
-                    self._report(intake.sound_status(self.id, status), pace)
+                    self._report(self._sound(status), pace)
                 case m.Fault(text=text):
                     pace.pay(intake.PER_FAULT)
                     self._office.feed(events.Faulted(self.id, self.mark, intake.sound_text(text)))
@@ -251,6 +251,11 @@ class Unit:
                     self._errands.spawn(self._dial(channel, request), f"dial for {self.id}")
             if pause := pace.pause:
                 await asyncio.sleep(pause)
+
+    def _sound(self, status: EndpointStatus) -> EndpointStatus:
+        if self._spec is None:
+            return intake.sound_status(self.id, status)
+        return intake.sound_status(self.id, status, self._spec.revision)
 
     def _report(self, status: EndpointStatus, pace: intake.Pace) -> None:
         if not self._stopping:

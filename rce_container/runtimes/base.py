@@ -118,8 +118,8 @@ class Handle:
         loop = asyncio.get_running_loop()
         deadline = loop.time() + _KILL_TIMEOUT_S
         while True:
-            processes = proc.table()
-            seen.update((found.pid, found) for found in self.members(processes))
+            if self._mark or seen or self._has_roots:  # else there is nothing that a look could find
+                seen.update((found.pid, found) for found in self.members(proc.table()))
             if self._mark:
                 seen.update((found.pid, found) for found in proc.marked(self._mark))
             left = [one for one in seen.values() if proc.alive(one.pid, one.start)]
@@ -131,6 +131,12 @@ class Handle:
                 proc.kill(one)
             await asyncio.sleep(_KILL_PAUSE_S)
         self._collect()
+
+    @property
+    def _has_roots(self) -> bool:
+        """Whether something lives from which other processes may descend; cheap, unlike a look at all."""
+        environment = self.environment
+        return self.alive or (environment is not None and proc.alive(environment.pid, environment.start))
 
     def _collect(self) -> None:
         """Take the exit code, so that no zombie is left."""

@@ -38,6 +38,7 @@ def test_a_container_speaks_of_itself_only() -> None:
     found = status(id="bob/c", incarnation="x", detail="y", address=LinkAddress(host="evil", port=1))
     assert found == EndpointStatus(id="anna/c", revision=3, state=EndpointState.RUNNING)
     assert status(state=EndpointState.ABSENT).state is EndpointState.RUNNING
+    assert intake.sound_status("anna/c", status(revision=10), 4).revision == 4, "it was told of no more"
 
 
 def test_sizes_are_those_of_containers() -> None:
