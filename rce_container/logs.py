@@ -8,6 +8,7 @@ import stat
 from pathlib import Path
 from typing import NamedTuple
 
+from rce.protocol.printable import one_line
 from rce_container.environment.logs.files import ENVIRONMENT_LOG, ROSOUT_LOG, segments
 from rce_container.environment.logs.streams import FRAGMENT_BYTES, text_of
 
@@ -81,7 +82,7 @@ def last_line(folder: Path, name: str = ENVIRONMENT_LOG, *, within: int = 4096) 
     except OSError:
         return ""
     lines = text.strip().splitlines()
-    return lines[-1].strip() if lines else ""
+    return one_line(lines[-1].strip()) if lines else ""
 
 
 def _raw(folder: Path, name: str, offset: int, limit: int, *, before: int = 0) -> _Raw:

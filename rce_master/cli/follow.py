@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 import time
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from rce.control.logs import LogLevel
+from rce.protocol.printable import for_terminal, one_line
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
 from rce_master.cli.exceptions import ApiError
@@ -69,7 +71,7 @@ async def _logs(path: str, follow: bool, offset: int, query: dict[str, str]) -> 
                 if chunk["ended"] and told != chunk["life"]:
                     told = chunk["life"]
                     typer.echo(_obituary(chunk), err=True)
-                typer.echo(chunk["text"], nl=False)
+                typer.echo(_shown(chunk["text"]), nl=False)
                 life, before, offset = chunk["life"], offset, chunk["offset"]
                 if offset != before:
                     continue
@@ -93,9 +95,15 @@ async def _lives_again(client: ApiClient, url: str, query: dict[str, str], life:
     return chunk is not None and chunk["life"] != life
 
 
+def _shown(text: str) -> str:
+    """A log as it is; on a terminal without what that would obey."""
+    return for_terminal(text) if sys.stdout.isatty() else text
+
+
 def _obituary(chunk: dict[str, Any]) -> str:
     when = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(chunk["ended"]))
-    return f"-- the container's life {chunk['life']} ended {when}: {chunk['reason'] or 'unknown reason'} --"
+    reason = one_line(chunk["reason"]) or "unknown reason"
+    return f"-- the container's life {chunk['life']} ended {when}: {reason} --"
 
 
 async def _read(
@@ -129,4 +137,4 @@ async def _events(since: int | None, as_json: bool) -> None:
 
 def _line(event: Event) -> str:
     when = time.strftime("%H:%M:%S", time.localtime(event.time))
-    return f"{when} {event.kind:<24} {event.subject} {event.text}".rstrip()
+    return one_line(f"{when} {event.kind:<24} {event.subject} {event.text}".rstrip())

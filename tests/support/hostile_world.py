@@ -21,6 +21,7 @@ import time
 from collections.abc import AsyncIterator, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
+from unittest import mock
 
 import msgspec
 
@@ -28,7 +29,6 @@ from rce.control.messages import Fault, Put
 from rce.control.model import EndpointState, InterfaceSpec, LinkSpec, NodeSpec, NodeState, Resources
 from rce.link import LinkError
 from rce_container.environment import proc
-from rce_container.runtimes import namespace
 from rce_container.seccomp.library import FilterUnavailableError
 from support.containers import ECHO, ECHO_INTERFACES, MACHINE, Machine, Peer, container, until
 from support.persons import SECRET
@@ -461,8 +461,8 @@ async def main() -> None:
         case "attack":
             found = await attack(folder, runtime)
         case "unfiltered":
-            namespace.make_filter = _no_filter
-            found = await attack(folder, runtime, ("executed",))
+            with mock.patch("rce_container.runtimes.namespace.make_filter", _no_filter):
+                found = await attack(folder, runtime, ("executed",))
         case _:
             found = await starve(folder, runtime, sys.argv[4:])
     print(json.dumps(found))  # noqa: T201 - for the test that started it
