@@ -99,13 +99,21 @@ class LogArchive:
             log.warning("how container %s ended cannot be noted: %s", id_, error)
 
     def find(self, mark: str) -> Kept | None:
-        """The life of a mark, whosever it is."""
-        return next((kept for kept in self._all(f"*/*/{mark}.json")), None)
+        """The life of a mark, whosever it is. Looks at every container; see :meth:`get`."""
+        found = (_kept(folder / mark) for folder in self._tags())
+        return next((kept for kept in found if kept is not None), None)
+
+    def get(self, id_: str, mark: str) -> Kept | None:
+        """The life of a mark, of a container."""
+        return _kept(self._folder(id_) / mark)
+
+    def folders(self) -> dict[str, Path]:
+        """Where the logs of all lives are, by mark."""
+        return {kept.life.mark: kept.folder for kept in self._all()}
 
     def ended(self, id_: str) -> list[Kept]:
         """The ended lives of a container, the newest first."""
-        user_and_tag = EndpointId.parse(id_)
-        found = [kept for kept in self._all(f"{user_and_tag}/*.json") if kept.life.ended]
+        found = [kept for kept in self._lives(self._folder(id_)) if kept.life.ended]
         return sorted(found, key=_age)
 
     def settle(self, living: Collection[str], now: float) -> None:
@@ -115,7 +123,7 @@ class LogArchive:
             living: The marks of lives of which something may be there.
             now: The time.
         """
-        for kept in list(self._all("*/*/*.json")):
+        for kept in list(self._all()):
             if not kept.life.ended and kept.life.mark not in living:
                 self._settle(kept, now)
 
@@ -132,7 +140,7 @@ class LogArchive:
 
     def prune(self, now: float) -> None:
         """Remove what is too old or too much, the oldest first."""
-        ended = sorted((kept for kept in self._all("*/*/*.json") if kept.life.ended), key=_age)
+        ended = sorted((kept for kept in self._all() if kept.life.ended), key=_age)
         space = self._space
         lives: dict[str, int] = {}
         for kept in ended:
@@ -153,12 +161,33 @@ class LogArchive:
         endpoint = EndpointId.parse(id_)
         return self._root / endpoint.user / endpoint.tag
 
-    def _all(self, pattern: str) -> Iterator[Kept]:
-        for path in self._root.glob(pattern):
-            folder = path.with_suffix("")
-            life = _read(folder)
-            if life is not None and life.mark == folder.name:
-                yield Kept(life, folder)
+    def _all(self) -> Iterator[Kept]:
+        for folder in self._tags():
+            yield from self._lives(folder)
+
+    def _tags(self) -> Iterator[Path]:
+        """The folders of all containers."""
+        for user in _children(self._root):
+            yield from _children(user)
+
+    def _lives(self, folder: Path) -> Iterator[Kept]:
+        """The lives of one container."""
+        for path in _children(folder):
+            if path.suffix == ".json" and (kept := _kept(path.with_suffix(""))) is not None:
+                yield kept
+
+
+def _children(folder: Path) -> list[Path]:
+    """What is in a folder; nothing if it is gone: lives are pruned meanwhile."""
+    try:
+        return list(folder.iterdir())
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+
+
+def _kept(folder: Path) -> Kept | None:
+    life = _read(folder)
+    return Kept(life, folder) if life is not None and life.mark == folder.name else None
 
 
 def _age(kept: Kept) -> float:

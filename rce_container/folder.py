@@ -16,7 +16,6 @@ import secrets
 import shutil
 import socket
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Self
 
@@ -250,15 +249,15 @@ class StateFolder:
             raise
         return folder
 
-    def open(self, mark: str) -> ContainerFolder:
-        """The folder of one life of a container, whether it is there or not."""
-        kept = self.archive.find(mark)
-        return ContainerFolder(self._containers, self._run, mark, kept.folder if kept else None)
-
-    def existing(self) -> Iterator[ContainerFolder]:
-        """All folders that are there, in no order."""
+    def existing(self) -> list[ContainerFolder]:
+        """All folders of lives of containers that are there, by mark."""
         marks = {path.name for parent in (self._containers, self._run) for path in parent.iterdir()}
-        return (self.open(mark) for mark in sorted(marks) if _MARK.fullmatch(mark))
+        logs = self.archive.folders()
+        return [
+            ContainerFolder(self._containers, self._run, mark, logs.get(mark))
+            for mark in sorted(marks)
+            if _MARK.fullmatch(mark)
+        ]
 
     def _word(self, file: str, default: str) -> str:
         path = self._state / file

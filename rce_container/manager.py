@@ -186,7 +186,7 @@ class Manager:
             unit.kill()
 
     async def _deal_with_the_past(self) -> None:
-        folders = list(self._state.existing())
+        folders = await asyncio.to_thread(self._state.existing)
         await self._sweep_cells({folder.mark for folder in folders})
         marks = {folder.mark for folder in folders}
         await asyncio.to_thread(self._state.archive.settle, marks, time.time())

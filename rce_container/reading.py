@@ -38,7 +38,7 @@ def read_for(archive: LogArchive, message: ReadLog, living: str) -> LogChunk:
 
 
 def _find(archive: LogArchive, message: ReadLog, living: str) -> Kept:
-    current = archive.find(living) if living else None
+    current = archive.get(message.id, living) if living else None
     tag = EndpointId.parse(message.id).tag
     if message.wish.life:
         ended = [kept for kept in archive.ended(message.id) if kept.life.mark == message.wish.life]

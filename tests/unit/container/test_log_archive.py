@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -160,11 +161,32 @@ def test_a_records_text_is_not_believed(archive: LogArchive, tmp_path: Path) -> 
         assert marks(archive) == []
 
 
+def test_what_vanishes_while_it_is_looked_at_is_passed_over(
+    archive: LogArchive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for user in ("anna", "bob"):
+        live(archive, f"of_{user}", id_=f"{user}/box")
+    list_folder = Path.iterdir
+
+    def iterdir(path: Path) -> Iterator[Path]:
+        if path.name == "logs":
+            return iter([*list_folder(path), path / "gone"])
+        return list_folder(path)
+
+    monkeypatch.setattr(Path, "iterdir", iterdir)
+    assert set(archive.folders()) == {"of_anna", "of_bob"}
+    archive.settle((), 10.0)
+    archive.prune(20.0)
+    assert archive.get("anna/box", "of_anna") is not None
+    assert archive.get("bob/box", "of_anna") is None
+    assert archive.find("of_bob") is not None
+
+
 def test_the_logs_of_a_state_folder_outlive_the_container(tmp_path: Path) -> None:
     with StateFolder(tmp_path / "state", tmp_path / "run") as state:
         folder = state.create(BOX)
         (folder.logs / "node.000000000000.log").write_bytes(b"ohello\n")
-        assert state.open(folder.mark).logs == folder.logs
+        assert [one.logs for one in state.existing()] == [folder.logs]
         folder.remove()
         state.archive.end(BOX, folder.mark, "destroyed", 10.0)
     with StateFolder(tmp_path / "state", tmp_path / "run") as state:
