@@ -55,8 +55,19 @@ def _pick(settings: EngineSettings) -> dict[str, Any]:
             "grace": "grace",
             "labels": "label",
             "package_path": "package_path_",
+            "images": "image",
+            "slots": "slots",
+            "slot_processes": "slot_processes",
+            "first_uid": "first_uid",
+            "uids": "uids",
+            "log_days": "log_days",
+            "allow_requirements": "allow_requirements",
+            "pip_args": "pip_args",
         },
     )
+    amounts = ("slot_memory", "home_size", "log_space", "bundle_space")
+    in_bytes = chosen(settings.container, {name: name for name in amounts})
+    picked |= {name: amount // MEGABYTE for name, amount in in_bytes.items()}
     if "runtime" in settings.container.model_fields_set:
         picked["runtime"] = settings.container.runtime.value
     if "state_dir" in settings.model_fields_set:

@@ -15,7 +15,7 @@ import typer
 import uvloop
 
 from rce.config.exceptions import ConfigError
-from rce.config.settings import EngineSettings, Runtime, load_settings
+from rce.config.settings import ContainerSettings, EngineSettings, Runtime, load_settings
 from rce.supervision.supervisor import Program, StartError, Supervisor
 
 
@@ -140,10 +140,21 @@ def programs(settings: EngineSettings) -> Iterable[Program]:
         *_options({"state-dir": state / "container", "runtime": settings.container.runtime.value}),
         *_options({"grace": settings.container.grace}),
         *_repeat("label", settings.container.labels),
+        *_repeat("image", settings.container.images),
+        *_options(_sizes(settings.container)),
         *(("--allow-requirements",) if settings.container.allow_requirements else ()),
         *_joined({"pip-args": settings.container.pip_args}),
         *(packages + control + common),
     )
+
+
+def _sizes(container: ContainerSettings) -> dict[str, Any]:
+    """What containers and their machine have: options of ``rce-container``, memory and disk in MB."""
+    plain = ("slots", "slot_processes", "first_uid", "uids", "log_days")
+    amounts = ("slot_memory", "home_size", "log_space", "bundle_space")
+    values = {name: getattr(container, name) for name in plain}
+    values |= {name: getattr(container, name) >> 20 for name in amounts}
+    return {name.replace("_", "-"): value for name, value in values.items()}
 
 
 def _next(port: int, offset: int) -> int:

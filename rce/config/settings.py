@@ -29,6 +29,8 @@ class Runtime(Enum):
     AUTO = "auto"
     """The strongest that this machine can do."""
     NAMESPACE = "namespace"
+    PODMAN = "podman"
+    """All containers are of images."""
     PROCESS = "process"
 
 
@@ -130,6 +132,26 @@ class ContainerSettings(Strict):
     """How long containers wait for a manager that was killed until they end themselves."""
     labels: tuple[str, ...] = Field(default=(), strict=False)
     """What this machine has; containers ask for it as special features."""
+    images: tuple[str, ...] = Field(default=(), strict=False)
+    """Folders with root file systems that containers may have; the first is that of ``runtime: podman``."""
+    slots: int = Field(default=0, ge=0)
+    """What this machine offers in all; 0: one for each 64 MB of its memory."""
+    slot_memory: Annotated[int, BeforeValidator(_as_bytes), Field(ge=32 << 20)] = 512 << 20
+    """Bytes of a container for each of its slots; written as other memory."""
+    slot_processes: int = Field(default=256, ge=16)
+    """Processes and threads of a container for each of its slots."""
+    home_size: Annotated[int, BeforeValidator(_as_bytes), Field(ge=1 << 20)] = 256 << 20
+    """Bytes of a container's home, which is in memory."""
+    first_uid: int = Field(default=700_000, ge=1)
+    """As root: the first of the users that containers run as; they must belong to nobody else."""
+    uids: int = Field(default=10_000, ge=1)
+    """How many such users there are."""
+    log_days: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 3.0
+    """How long the logs of containers that ended are kept."""
+    log_space: Annotated[int, BeforeValidator(_as_bytes)] = 1 << 30
+    """Bytes that they may take in all."""
+    bundle_space: Annotated[int, BeforeValidator(_as_bytes)] = 4 << 30
+    """Bytes that packages of users may take on the machine."""
     allow_requirements: bool = False
     """Whether what users' packages ask for in a ``requirements.txt`` is installed."""
     pip_args: str = ""

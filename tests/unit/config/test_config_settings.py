@@ -82,7 +82,7 @@ def test_every_fault_is_listed(tmp_path: Path) -> None:
         "state",
     ]
     assert "did you mean 'http_port'?" in str(caught.value)
-    assert "must be one of auto, namespace, process" in str(caught.value)
+    assert "must be one of auto, namespace, podman, process" in str(caught.value)
 
 
 def test_secret_does_not_show() -> None:

@@ -27,6 +27,10 @@ container:
   runtime: process
   labels: [gpu]
   package_path: [/srv/packages]
+  images: [/srv/rootfs]
+  slots: 12
+  slot_memory: 1G
+  allow_requirements: true
 state_dir: /var/lib/rce
 """
 
@@ -59,6 +63,9 @@ def test_container_takes_its_settings_from_the_file(file: str) -> None:
     assert list(found["label"]) == ["gpu"]
     assert [str(path) for path in found["package_path_"]] == ["/srv/packages"]
     assert str(found["state_dir"]) == "/var/lib/rce/container"
+    assert list(found["image"]) == ["/srv/rootfs"]
+    assert (found["slots"], found["slot_memory"], found["home_size"]) == (12, 1024, 256)
+    assert found["allow_requirements"]
 
 
 def test_the_command_line_wins(file: str) -> None:

@@ -40,6 +40,11 @@ SETTINGS = EngineSettings(
         runtime=Runtime.PROCESS,
         labels=("gpu", "lidar"),
         package_path=(Path("/p"),),
+        images=("debian:12", "/srv/rootfs"),
+        slots=12,
+        slot_memory=128,
+        home_size="1G",
+        log_days=0.5,
         allow_requirements=True,
         pip_args="--no-index --pre",
     ),
@@ -66,6 +71,10 @@ def test_what_is_set_arrives() -> None:
     assert contexts["master"].params["max_slots"] == 4
     assert contexts["container"].params["allow_requirements"]
     assert contexts["container"].params["pip_args"] == "--no-index --pre"
+    params = contexts["container"].params
+    assert list(params["image"]) == ["debian:12", "/srv/rootfs"]
+    sizes = ("slots", "slot_memory", "slot_processes", "home_size", "log_days", "log_space", "bundle_space")
+    assert [params[name] for name in sizes] == [12, 128, 256, 1024, 0.5, 1024, 4096]
     assert contexts["master"].params["max_cpu"] == 1.5
     assert contexts["master"].params["max_memory"] == f"{8 << 30}B"
     assert contexts["robot2"].params["public_host"] == "robots.example.org"
