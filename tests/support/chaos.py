@@ -123,6 +123,16 @@ class Chaos:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(victim, signal.SIGKILL)
 
+    async def kill_all(self) -> None:
+        """Kill the manager and all that it has made, at once."""
+        self.story.append("kill all")
+        victims = [pid for pids in parts(self.traces).values() for pid in pids]
+        for pid in (self.engine.container.pid, *victims):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        await self.engine.container.kill()
+        await self.engine.container.start()
+
     async def settle(self) -> None:
         """Ask for what is wanted, as clients do, until it is there."""
         for one in self.customers:
@@ -203,6 +213,7 @@ async def run(runtime: str, seed: int, rounds: int, *, groups: bool) -> list[str
         chaos = Chaos(engine, crowd, random.Random(seed), traces)
         try:
             await chaos.run(rounds)
+            await chaos.kill_all()
             await chaos.settle()
             for one in crowd:
                 await one.destroy()
