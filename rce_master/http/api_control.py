@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from rce.web.openapi import Query
@@ -13,6 +14,16 @@ from rce_master.http.routes import OF_USER, Call, RouteTable
 routes = RouteTable("control")
 
 _QUERY = (OF_USER,)
+_FAULT = re.compile(r"^([A-Z]{2}): data\.(?:\w+\[\d+\]\.|containerData\.)?(\w+)")
+"""A fault in a client's message, up to the key that is wrong."""
+_NAMES = {
+    "nodeTag": "tag",
+    "interfaceTag": "tag",
+    "endpointTag": "endpoint",
+    "interfaceType": "type",
+    "className": "cls",
+}
+"""What keys of the messages are called here, if it is not only written another way."""
 
 
 async def _request(call: Call, kind: str, data: dict[str, Any]) -> None:
@@ -24,7 +35,7 @@ async def _request(call: Call, kind: str, data: dict[str, Any]) -> None:
     """
     wanted, faults = requests.read(call.owner, kind, data)
     if faults:
-        raise Invalid("; ".join(faults))
+        raise Invalid("; ".join(_FAULT.sub(_place, fault) for fault in faults))
     for outcome in await call.services.realm.submit_all(wanted):
         if outcome is not None:
             raise outcome
@@ -162,6 +173,14 @@ async def disconnect(call: Call) -> None:
     """Part two interfaces."""
     pair = {"tagA": call.query("tag_a"), "tagB": call.query("tag_b")}
     await _request(call, "CX", {"disconnect": [pair]})
+
+
+def _place(fault: re.Match[str]) -> str:
+    """Say where a fault is in words of this API."""
+    kind, key = fault.groups()
+    if key == "containerTag":
+        return "tag" if kind == "CC" else "container"
+    return _NAMES.get(key) or re.sub(r"(?=[A-Z])", "_", key).lower()
 
 
 def _camel(key: str) -> str:

@@ -49,7 +49,7 @@ async def test_bad_requests_say_what_is_wrong(site: Site) -> None:
     assert "cpus" in reply["error"]
     assert "size" in reply["error"]
     reply = await site.api("POST", "/containers", {"tag": "9c"}, status=422)
-    assert "containerTag" in reply["error"]
+    assert "tag: must be a name" in reply["error"]
     assert "error" in await site.api("GET", "/nothing", status=404)
     assert "error" in await site.api("PATCH", "/containers", status=405)
     async with site.session.post(

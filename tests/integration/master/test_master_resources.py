@@ -82,13 +82,32 @@ async def test_amounts_are_read_and_out_of_capacity_is_a_conflict(site: Site) ->
         reply = await site.api("POST", "/containers", {"tag": "d", "cpu": 4}, status=409)
         assert "m1 has 1.5 of 2 cores free, 4 needed" in reply["error"]
         reply = await site.api("POST", "/containers", {"tag": "d", "memory": "lots"}, status=422)
-        assert "data.containerData.memory: must be a number of MB such as 256" in reply["error"]
+        assert reply["error"].startswith("memory: must be a number of MB such as 256")
         await site.api("POST", "/containers", {"tag": "d", "cpu": 4, "wait": True}, status=204)
         shown = await container(site, "d")
         assert shown["state"] == "requested"
         assert shown["detail"] == "m1 has 1.5 of 2 cores free, 4 needed"
         (machine,) = (await site.api("GET", "/machines"))["machines"]
         assert (machine["promised_cores"], machine["promised_slots"], machine["slots"]) == (0.5, 2, 8)
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "place"),
+    [
+        ("/containers", {"tag": "a b"}, "tag: must be a name"),
+        ("/containers", {"tag": "c", "network": "group"}, "group: is missing"),
+        ("/containers", {"tag": "c", "group": "g", "group_ip": "300.1.1.1"}, "group_ip: must be an IPv4"),
+        ("/containers/c/nodes", {"tag": "", "pkg": "p", "exe": "x"}, "tag: "),
+        ("/containers/1/nodes", {"tag": "n", "pkg": "p", "exe": "x"}, "container: "),
+        ("/containers/c/nodes", {"tag": "n", "pkg": "p", "exe": "x", "max_restarts": -1}, "max_restarts: "),
+        ("/endpoints/c/interfaces", {"tag": "i", "type": "x", "cls": "p/T"}, "type: "),
+        ("/endpoints/c/interfaces", {"tag": "i", "type": "PublisherInterface", "cls": "T"}, "cls: "),
+        ("/connections", {"tag_a": "x", "tag_b": "a/b"}, "tag_a: "),
+    ],
+)
+async def test_faults_name_the_keys_of_this_api(site: Site, path: str, body: Any, place: str) -> None:
+    reply = await site.api("POST", path, body, status=422)
+    assert reply["error"].startswith(place)
 
 
 async def test_how_a_node_lives_reaches_its_machine(site: Site) -> None:
