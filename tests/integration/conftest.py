@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import copy
 
 import pytest
 from support import persons
@@ -19,3 +20,11 @@ def root_person() -> Iterator[Person]:
 def normal_person() -> Iterator[Person]:
     with persons.normal() as person:
         yield person
+
+
+@pytest.fixture(scope="session")
+def podman_person(root_person: Person) -> Person:
+    """Root with podman, which has the machine's programs where no image is named."""
+    person = copy(root_person)
+    person.runtime = "podman"
+    return person

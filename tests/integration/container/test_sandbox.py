@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-from copy import copy
 from typing import Any
 
 import pytest
@@ -18,14 +17,6 @@ NO_CAPABILITIES = "0" * 16
 REFUSED = (errno.EPERM, errno.ENOSYS, errno.EACCES)
 
 pytestmark = [pytest.mark.needs("bwrap"), pytest.mark.timeout(120)]
-
-
-@pytest.fixture(scope="session")
-def podman_person(root_person: Person) -> Person:
-    """The same with podman, which has the machine's programs where no image is named."""
-    person = copy(root_person)
-    person.runtime = "podman"
-    return person
 
 
 @pytest.fixture(

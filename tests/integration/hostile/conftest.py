@@ -9,7 +9,9 @@ from support.hostile_world import MODULE
 from support.persons import Person
 
 
-@pytest.fixture(scope="session", params=["root", "normal"])
+@pytest.fixture(
+    scope="session", params=["root", "normal", pytest.param("podman", marks=pytest.mark.needs("podman"))]
+)
 def person(request: pytest.FixtureRequest) -> Person:
     found = request.getfixturevalue(f"{request.param}_person")
     assert isinstance(found, Person)

@@ -205,7 +205,7 @@ def processors() -> Iterator[int]:
 
 def output() -> Iterator[int]:
     """A log without an end."""
-    end = time.monotonic() + 2
+    end = time.monotonic() + 1.2
     line = b"x" * 120 + b"\n"
     while time.monotonic() < end:
         os.write(1, line * 500)
@@ -223,7 +223,7 @@ async def _log() -> None:
 
     async with Node("flood") as node:
         rosout = await node.advertise("/rosout", "rosgraph_msgs/Log", queue_size=100)
-        end = time.monotonic() + 2
+        end = time.monotonic() + 1.2
         numbers = count()
         while time.monotonic() < end:
             for number in islice(numbers, 20):
@@ -235,7 +235,7 @@ def graph() -> Iterator[int]:
     """Topics, services and parameters without number, at the container's ROS core."""
     core = xmlrpc.client.ServerProxy(os.environ["ROS_MASTER_URI"])
     uri = "http://127.0.0.1:9/"
-    end = time.monotonic() + 2
+    end = time.monotonic() + 1.2
     for number in count(1):
         if time.monotonic() > end:
             break
@@ -254,7 +254,7 @@ def flapping() -> Iterator[int]:
 async def _flap() -> int:
     from rce.ros.node import Node
 
-    end = time.monotonic() + 2
+    end = time.monotonic() + 1.2
     async with Node("flap") as node:
         for number in count(1):
             subscriber = await node.subscribe("/flap", "std_msgs/String", print)
