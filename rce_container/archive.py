@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
-import shutil
 import threading
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -22,6 +20,7 @@ from msgspec import Struct
 from rce.protocol.names import EndpointId
 from rce_container.exceptions import StateError
 from rce_container.logs import last_line
+from rce_container.trees import remove, size_of
 from rce_container.writing import write_whole
 
 log = logging.getLogger(__name__)
@@ -144,14 +143,14 @@ class LogArchive:
         space = self._space
         lives: dict[str, int] = {}
         for kept in ended:
-            space -= _size(kept.folder)
+            space -= size_of(kept.folder)
             lives[kept.life.id] = lives.get(kept.life.id, 0) + 1
             is_old = now - kept.life.ended > self._days * _DAY_S
             if is_old or space < 0 or lives[kept.life.id] > MAX_LIVES:
                 self._remove(kept.folder)
 
     def _remove(self, folder: Path) -> None:
-        shutil.rmtree(folder, ignore_errors=True)
+        remove(folder)
         with self._lock, contextlib.suppress(OSError):
             _record(folder).unlink()
             folder.parent.rmdir()
@@ -208,13 +207,3 @@ def _read(folder: Path) -> Life | None:
 def _write(folder: Path, life: Life) -> None:
     """Write a life's record, atomically."""
     write_whole(_record(folder), msgspec.json.encode(life))
-
-
-def _size(folder: Path) -> int:
-    """Bytes that a folder's files take; follows no links."""
-    total = 0
-    for parent, _, files in os.walk(folder):
-        for name in files:
-            with contextlib.suppress(OSError):
-                total += Path(parent, name).lstat().st_size
-    return total

@@ -13,7 +13,6 @@ import fcntl
 import os
 import re
 import secrets
-import shutil
 import socket
 import time
 from pathlib import Path
@@ -24,6 +23,7 @@ from msgspec import Struct
 
 from rce_container.archive import LOG_DAYS, LOG_SPACE, LogArchive
 from rce_container.exceptions import StateError
+from rce_container.trees import remove
 from rce_container.writing import write_whole
 
 _MARK = re.compile(r"[0-9a-f]{12}")
@@ -125,22 +125,21 @@ class ContainerFolder:
     def remove(self) -> None:
         """Remove everything, also what a node made unreadable. Blocks; may be repeated."""
         for path in (self.run, self.path):
-            shutil.rmtree(path, ignore_errors=True)
+            remove(path)
             if path.exists():
                 _make_accessible(path)
-                shutil.rmtree(path, ignore_errors=True)
+                remove(path)
 
 
 def _make_accessible(root: Path) -> None:
     """Undo what a node did to the permissions of its folders. Follows no links."""
-    with contextlib.suppress(OSError):
-        root.chmod(0o700)
-    for parent, folders, _ in os.walk(root):
-        for folder in folders:
-            path = Path(parent, folder)
-            if not path.is_symlink():
-                with contextlib.suppress(OSError):
-                    path.chmod(0o700)
+    waiting = [str(root)]
+    while waiting:
+        folder = waiting.pop()
+        with contextlib.suppress(OSError):
+            os.chmod(folder, 0o700)  # noqa: PTH101 - there may be very many
+            with os.scandir(folder) as entries:
+                waiting += [entry.path for entry in entries if entry.is_dir(follow_symlinks=False)]
 
 
 class StateFolder:

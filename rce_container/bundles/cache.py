@@ -22,8 +22,9 @@ from rce.bundles.unpacking import unpack
 from rce.control.contents import Piece
 from rce.control.exceptions import ContentError
 from rce.control.model import BundleSpec
-from rce_container.bundles.disk import forget_before_boot, in_thread, remove, scratch_aside, size_of
+from rce_container.bundles.disk import forget_before_boot, in_thread, scratch_aside
 from rce_container.bundles.exceptions import BundleTrouble, NoSpace, Unfetched, Unverified
+from rce_container.trees import remove, size_of
 
 Fetch = Callable[[str, int], Awaitable[Piece]]
 """Fetches the piece of a content, by its hash, that begins at an offset; raises :class:`ContentError`."""

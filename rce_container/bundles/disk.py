@@ -1,4 +1,4 @@
-"""Folders that only ever appear whole, and how large they are. What is not asynchronous blocks."""
+"""Folders that only ever appear whole. What is not asynchronous blocks."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import tempfile
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import ParamSpec, TypeVar
+
+from rce_container.trees import remove
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -54,21 +56,6 @@ async def scratch_aside(parent: Path) -> AsyncIterator[Path]:
         yield folder
     finally:
         await in_thread(remove, folder)
-
-
-def remove(folder: Path) -> None:
-    """Remove a folder with all that is in it, if it is there."""
-    shutil.rmtree(folder, ignore_errors=True)
-
-
-def size_of(folder: Path) -> int:
-    """Tell how many bytes the files in a folder take."""
-    total = 0
-    for parent, _, files in os.walk(folder):
-        for name in files:
-            with contextlib.suppress(OSError):
-                total += os.lstat(os.path.join(parent, name)).st_size  # noqa: PTH118 - many files
-    return total
 
 
 def forget_before_boot(folder: Path) -> None:

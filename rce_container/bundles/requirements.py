@@ -19,10 +19,11 @@ from pathlib import Path
 
 from rce.bundles.requirements import FILE_NAME, read_requirements
 from rce.ros.packages import MANIFESTS, BadPackage, parse_manifest
-from rce_container.bundles.disk import forget_before_boot, in_thread, remove, scratch_aside, size_of
+from rce_container.bundles.disk import forget_before_boot, in_thread, scratch_aside
 from rce_container.bundles.exceptions import RequirementsTrouble
 from rce_container.exceptions import RuntimeUnavailableError
 from rce_container.runtimes.namespace import interpreter_paths, read_only_mounts, system_mounts
+from rce_container.trees import remove, size_of
 
 BUILD = "/build"
 SITE = "site"

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection
 from pathlib import Path
 
-from rce_container.bundles.disk import remove, replicate, scratch
+from rce_container.bundles.disk import replicate, scratch
 from rce_container.environment.bundles import REQUIREMENTS
+from rce_container.trees import remove
 
 KEPT = 8
 """Bundles that no node names any more stay, the newest so many: a node that still runs may read from them."""

@@ -32,7 +32,7 @@ def segments(folder: Path, name: str) -> list[tuple[int, Path]]:
     found = []
     for path in folder.glob(f"{name}.*.log"):
         start = path.name[len(name) + 1 : -len(".log")]
-        if start.isdigit():
+        if start.isascii() and start.isdigit():
             found.append((int(start), path))
     return sorted(found)
 
