@@ -13,7 +13,7 @@ from rich.table import Table
 
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
-from rce_master.cli.exceptions import ApiError
+from rce_master.cli.exceptions import ApiError, CliError
 
 _FORBIDDEN = 403
 _COLOURS = {
@@ -61,9 +61,19 @@ async def _ps(as_json: bool) -> None:
 
 
 async def fetch(client: ApiClient, *names: str) -> Everything:
-    """Get several lists at once; one that this user may not see is empty."""
-    async with asyncio.TaskGroup() as group:
-        tasks = {name: group.create_task(_fetch(client, name)) for name in names}
+    """Get several lists at once; one that this user may not see is empty.
+
+    Raises:
+        CliError: One cannot be had.
+    """
+    failure: Exception | None = None
+    try:
+        async with asyncio.TaskGroup() as group:
+            tasks = {name: group.create_task(_fetch(client, name)) for name in names}
+    except* CliError as failures:
+        failure = failures.exceptions[0]
+    if failure is not None:
+        raise failure
     return {name: task.result() for name, task in tasks.items()}
 
 

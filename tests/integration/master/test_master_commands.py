@@ -48,6 +48,12 @@ async def test_events_go_on_where_they_were(site: Site) -> None:
     assert kinds == ["user_added", "container_requested", "container_destroyed"]
 
 
+async def test_a_master_that_is_away_is_one_plain_error() -> None:
+    async with ApiClient("http://127.0.0.1:1/", "x") as client:
+        with pytest.raises(CliError, match="cannot use the master at"):
+            await show.fetch(client, "robots", "containers")
+
+
 async def test_ps_shows_what_there_is(site: Site) -> None:
     async with site.containers() as containers, ApiClient(site.url, site.token) as client:
         await client.call("POST", "/containers", {"tag": "c"})
