@@ -111,8 +111,8 @@ async def test_a_process_of_a_node_that_ran_out_of_memory_is_told_of(packages: M
 
 
 async def test_a_container_that_cannot_live_at_all_says_why(packages: Machine) -> None:
-    async with packages.engine():
-        await packages.put(BOX, resources=Resources(memory=2 * MB))
+    async with packages.engine(slot_memory=2 * MB):
+        await packages.put(BOX)
         await until(
             lambda: any("out of memory: the container's limit of 2 MB" in f for f in packages.faults),
             what=lambda: packages.faults,
