@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import resource
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -27,7 +26,7 @@ from rce.control.messages import (
     ToTaskSet,
     Usage,
 )
-from rce.control.model import EndpointStatus, LinkAddress, Network
+from rce.control.model import EndpointStatus, LinkAddress
 from rce.protocol.names import EndpointId
 from rce_container import core, events
 from rce_container.bundles.supply import Library
@@ -36,14 +35,15 @@ from rce_container.environment import proc
 from rce_container.environment.channel import connect
 from rce_container.environment.exceptions import ChannelError
 from rce_container.environment.process import strike_all
-from rce_container.exceptions import ContainerError, NetworkError, StartError, StateError
-from rce_container.folder import ContainerFolder, Record
+from rce_container.exceptions import ContainerError, NetworkError, StateError
+from rce_container.folder import ContainerFolder
+from rce_container.launcher import Launcher
 from rce_container.life import Phase
-from rce_container.limits import Cell, limits_of
+from rce_container.limits import Cell
 from rce_container.limits.warden import Warden
 from rce_container.network import Networks
 from rce_container.reading import read_for
-from rce_container.runtimes.base import Handle, Order
+from rce_container.runtimes.base import Handle
 from rce_container.unit import Office, Unit
 from rce_container.usage import Subject, UsageMeter
 
@@ -55,11 +55,6 @@ if TYPE_CHECKING:
     from rce_container.settings import ContainerSettings
 
 log = logging.getLogger(__name__)
-
-ROS_PORT = 11311
-LOOPBACK = "127.0.0.1"
-PODMAN = "podman"
-"""The runtime of containers that have an image."""
 
 
 class Manager:
@@ -106,6 +101,14 @@ class Manager:
         self.send: Callable[[ToMaster], None] = lambda _: None
         self._core = core.ManagerCore()
         self._networks = Networks()
+        self._launcher = Launcher(
+            settings=settings,
+            runtimes=runtimes,
+            runtime=runtime,
+            offered=info.runtimes,
+            limiter=limiter,
+            networks=self._networks,
+        )
         self._office = Office(
             settings=settings,
             doorman=doorman,
@@ -232,7 +235,7 @@ class Manager:
             finally:
                 channel.close()
         await strike_all(folder.mark)
-        await self._remove_cell(folder.mark)
+        await self._launcher.undo(folder.mark)
         await asyncio.to_thread(folder.remove)
         await asyncio.to_thread(self._state.archive.settle_one, folder.mark, time.time())
 
@@ -248,15 +251,6 @@ class Manager:
             await asyncio.to_thread(self._limiter.sweep, keep)
         except (ContainerError, OSError) as error:
             log.error("what earlier containers left cannot be removed: %s", error)  # noqa: TRY400
-
-    async def _remove_cell(self, mark: str) -> None:
-        """Remove a cell with all that is in it."""
-        cell = self._limiter.adopt(mark)
-        try:
-            await asyncio.to_thread(cell.kill)
-            await asyncio.to_thread(cell.remove)
-        except ContainerError as error:
-            log.error("a container that did not start: %s", error)  # noqa: TRY400 - its text says it all
 
     # What the core decides
 
@@ -297,18 +291,14 @@ class Manager:
             self._feed(events.Lost(id_, "", str(error)))
             return
         try:
-            runtime = self._runtime_for(id_)
-            limits = limits_of(self._core.resources(id_), self._settings)
-            cell = self._limiter.create(folder.mark, limits)
-            handle = self._launch(id_, folder, runtime, cell)
+            handle, cell, isolated = self._launcher.launch(id_, folder, self._core.resources(id_))
         except (ContainerError, OSError) as error:  # disk, descriptors or memory of this machine ran out
-            self._tasks.create_task(self._remove_cell(folder.mark), name=f"cell of {id_}")
-            self._tasks.create_task(self._networks.detach(folder.mark), name=f"network of {id_}")
+            self._tasks.create_task(self._launcher.undo(folder.mark), name=f"what was made of {id_}")
             folder.remove()
             self._state.archive.end(id_, folder.mark, f"cannot be started: {error}", time.time())
             self._feed(events.Lost(id_, "", str(error)))
             return
-        unit = self._own(id_, folder, handle, cell, isolated=runtime.isolated)
+        unit = self._own(id_, folder, handle, cell, isolated=isolated)
         self._starting.add(unit)
         self._tasks.create_task(self._await_start(unit), name=f"start of {id_}")
         self._feed(events.Made(id_, folder.mark, self._address(folder)))
@@ -317,79 +307,6 @@ class Manager:
         await unit.reported.wait()
         self._starting.discard(unit)
         self._start_waiting()
-
-    def _runtime_for(self, id_: str) -> Runtime:
-        """The runtime that makes a container: an image needs one that can run images.
-
-        Raises:
-            StartError: None here can.
-        """
-        resources = self._core.resources(id_)
-        runtime = self._runtime
-        if resources.image and runtime.name != PODMAN:
-            if PODMAN not in self._info.runtimes:
-                raise StartError(f"its image needs the runtime {PODMAN}, which does not work on this machine")
-            runtime = self._runtimes[PODMAN]
-        if resources.network is Network.GROUP and not runtime.isolated:
-            raise StartError(f"the runtime {runtime.name} has no networks of groups")
-        return runtime
-
-    def _launch(self, id_: str, folder: ContainerFolder, runtime: Runtime, cell: Cell) -> Handle:
-        settings = self._settings
-        resources = self._core.resources(id_)
-        container = EndpointId.parse(id_)
-        seat = None
-        if resources.network is Network.GROUP:
-            seat = self._networks.enroll(
-                container, resources.group, resources.group_ip, folder.mark, folder.hosts
-            )
-        host_network = resources.network is Network.HOST
-        boot = m.Boot(
-            id=id_,
-            mark=folder.mark,
-            machine=settings.machine,
-            home="",
-            logs="",
-            ros_port=ROS_PORT if runtime.isolated and not host_network else 0,
-            isolated=runtime.isolated,
-            address=str(seat.address.ip) if seat else LOOPBACK,
-            rlimits=_rlimits(cell, isolated=runtime.isolated),
-            packages=tuple(map(str, settings.packages)),
-            bundles=runtime.bundles(folder),
-            grace=settings.grace,
-            interrupt_timeout=settings.interrupt_timeout,
-            terminate_timeout=settings.terminate_timeout,
-        )
-        with folder.listen(folder.control_socket) as control, folder.listen(folder.link_socket) as links:
-            order = Order(
-                container.tag,
-                boot,
-                folder,
-                settings.packages,
-                control.fileno(),
-                links.fileno(),
-                join=cell.join,
-                host_network=host_network,
-                switch=seat.path if seat else "",
-                image=resources.image or runtime.image,
-            )
-            handle = runtime.start(order)
-        process = handle.process
-        record = Record(
-            id=id_,
-            mark=folder.mark,
-            runtime=runtime.name,
-            pid=process.pid,
-            start=process.start,
-            group=resources.group if seat else "",
-            address=str(seat.address) if seat else "",
-        )
-        try:
-            folder.write_record(record)
-        except StateError:
-            proc.kill(process)  # all of the container ends with it
-            raise
-        return handle
 
     def _own(self, id_: str, folder: ContainerFolder, handle: Handle, cell: Cell, *, isolated: bool) -> Unit:
         warden = Warden(EndpointId.parse(id_).tag, cell, self._settings)
@@ -432,11 +349,3 @@ class Manager:
             times = self._process.cpu_times()
             memory = self._process.memory_info().rss
             self.send(Usage(cpu_s=times.user + times.system, memory=memory, endpoints=usage))
-
-
-def _rlimits(cell: Cell, *, isolated: bool) -> dict[int, int]:
-    """What the container's processes limit themselves."""
-    rlimits = dict(cell.rlimits)
-    if not isolated:
-        rlimits.pop(resource.RLIMIT_NPROC, None)  # would count all processes of this user
-    return rlimits

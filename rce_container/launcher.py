@@ -1,0 +1,181 @@
+"""Starting the processes of a container: its limits, its place in a network, its runtime."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import resource
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+from rce.control.model import Network, Resources
+from rce.protocol.names import EndpointId
+from rce_container.environment import messages as m
+from rce_container.environment import proc
+from rce_container.exceptions import ContainerError, StartError, StateError
+from rce_container.folder import ContainerFolder, Record
+from rce_container.limits import Cell, limits_of
+from rce_container.runtimes.base import Handle, Order
+
+if TYPE_CHECKING:
+    from rce_container.limits import Limiter
+    from rce_container.network import Networks
+    from rce_container.network.networks import Seat
+    from rce_container.runtimes.base import Runtime
+    from rce_container.settings import ContainerSettings
+
+log = logging.getLogger(__name__)
+
+ROS_PORT = 11311
+LOOPBACK = "127.0.0.1"
+PODMAN = "podman"
+"""The runtime of containers that have an image."""
+
+
+class Launched(NamedTuple):
+    """What there is of a container whose processes were started."""
+
+    handle: Handle
+    cell: Cell
+    isolated: bool
+    """See :attr:`rce_container.runtimes.base.Runtime.isolated`."""
+
+
+class Launcher:
+    """Starts containers.
+
+    Args:
+        settings: How containers are run.
+        runtimes: All runtimes by name.
+        runtime: The one for containers that need no other.
+        offered: Names of the runtimes that work on this machine.
+        limiter: Enforces the containers' limits.
+        networks: The networks of groups.
+    """
+
+    def __init__(
+        self,
+        *,
+        settings: ContainerSettings,
+        runtimes: Mapping[str, Runtime],
+        runtime: Runtime,
+        offered: Collection[str],
+        limiter: Limiter,
+        networks: Networks,
+    ) -> None:
+        self._settings = settings
+        self._runtimes = runtimes
+        self._runtime = runtime
+        self._offered = offered
+        self._limiter = limiter
+        self._networks = networks
+
+    def launch(self, id_: str, folder: ContainerFolder, resources: Resources) -> Launched:
+        """Start a container's first process, and note in its folder who it is.
+
+        Raises:
+            ContainerError: It cannot be started. What was made of it is removed by :meth:`undo`.
+            OSError: The machine has no more of something.
+        """
+        runtime = self._runtime_for(resources)
+        cell = self._limiter.create(folder.mark, limits_of(resources, self._settings))
+        seat = self._enroll(id_, folder, resources)
+        boot = self._boot(id_, folder, resources, runtime, cell, seat)
+        with folder.listen(folder.control_socket) as control, folder.listen(folder.link_socket) as links:
+            order = Order(
+                EndpointId.parse(id_).tag,
+                boot,
+                folder,
+                self._settings.packages,
+                control.fileno(),
+                links.fileno(),
+                join=cell.join,
+                host_network=resources.network is Network.HOST,
+                switch=seat.path if seat else "",
+                image=resources.image or runtime.image,
+            )
+            handle = runtime.start(order)
+        process = handle.process
+        record = Record(
+            id=id_,
+            mark=folder.mark,
+            runtime=runtime.name,
+            pid=process.pid,
+            start=process.start,
+            group=resources.group if seat else "",
+            address=str(seat.address) if seat else "",
+        )
+        try:
+            folder.write_record(record)
+        except StateError:
+            proc.kill(process)  # all of the container ends with it
+            raise
+        return Launched(handle, cell, runtime.isolated)
+
+    async def undo(self, mark: str) -> None:
+        """Remove a container's cell, with all that is in it, and its place in a network."""
+        cell = self._limiter.adopt(mark)
+        try:
+            await asyncio.to_thread(cell.kill)
+            await asyncio.to_thread(cell.remove)
+        except ContainerError as error:
+            log.error("a container that did not start: %s", error)  # noqa: TRY400 - its text says it all
+        await self._networks.detach(mark)
+
+    def _runtime_for(self, resources: Resources) -> Runtime:
+        """The runtime that makes a container: an image needs one that can run images.
+
+        Raises:
+            StartError: None here can.
+        """
+        runtime = self._runtime
+        if resources.image and runtime.name != PODMAN:
+            if PODMAN not in self._offered:
+                raise StartError(f"its image needs the runtime {PODMAN}, which does not work on this machine")
+            runtime = self._runtimes[PODMAN]
+        if resources.network is Network.GROUP and not runtime.isolated:
+            raise StartError(f"the runtime {runtime.name} has no networks of groups")
+        return runtime
+
+    def _enroll(self, id_: str, folder: ContainerFolder, resources: Resources) -> Seat | None:
+        if resources.network is not Network.GROUP:
+            return None
+        return self._networks.enroll(
+            EndpointId.parse(id_), resources.group, resources.group_ip, folder.mark, folder.hosts
+        )
+
+    def _boot(
+        self,
+        id_: str,
+        folder: ContainerFolder,
+        resources: Resources,
+        runtime: Runtime,
+        cell: Cell,
+        seat: Seat | None,
+    ) -> m.Boot:
+        settings = self._settings
+        own_network = runtime.isolated and resources.network is not Network.HOST
+        return m.Boot(
+            id=id_,
+            mark=folder.mark,
+            machine=settings.machine,
+            home="",
+            logs="",
+            ros_port=ROS_PORT if own_network else 0,
+            isolated=runtime.isolated,
+            address=str(seat.address.ip) if seat else LOOPBACK,
+            rlimits=_rlimits(cell, isolated=runtime.isolated),
+            packages=tuple(map(str, settings.packages)),
+            bundles=runtime.bundles(folder),
+            grace=settings.grace,
+            interrupt_timeout=settings.interrupt_timeout,
+            terminate_timeout=settings.terminate_timeout,
+        )
+
+
+def _rlimits(cell: Cell, *, isolated: bool) -> dict[int, int]:
+    """What the container's processes limit themselves."""
+    rlimits = dict(cell.rlimits)
+    if not isolated:
+        rlimits.pop(resource.RLIMIT_NPROC, None)  # would count all processes of this user
+    return rlimits
