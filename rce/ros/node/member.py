@@ -120,6 +120,12 @@ class GraphMember:
                 for subscriber in source.subscribers:
                     subscriber.sink.end()
 
+    def _stop_for_others(self, reason: str) -> None:
+        """Stop because another program says so, such as the core when a second node takes this one's name."""
+        if not self.is_shutdown:
+            _log.warning("%s has to stop: %s", self.name, reason)
+        self.shutdown(reason)
+
     async def spin(self) -> None:
         """Wait until the node is told to stop, by the master, another node or a signal."""
         if self._signals:
@@ -163,7 +169,7 @@ class GraphMember:
                 self._topics,
                 settings.master_uri,
                 lambda: (settings.host, self._listener.port),
-                self.shutdown,
+                self._stop_for_others,
                 self._parameter_changed,
             )
             dispatcher = Dispatcher(slave.methods(), NOTHING)
