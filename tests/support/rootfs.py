@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import secrets
 import shutil
 import subprocess
 from collections.abc import Iterable, Iterator
@@ -26,7 +27,7 @@ _STDLIB_LEFT_OUT = (
 @contextlib.contextmanager
 def image_of(rootfs: Path) -> Iterator[str]:
     """Have a root file system as an image in podman's store; gives its name."""
-    name = f"localhost/rce-test-{os.getpid()}-{rootfs.parent.name.lower()}:1"
+    name = f"localhost/rce-test-{os.getpid()}-{secrets.token_hex(4)}:1"
     tar = subprocess.run(["tar", "-C", str(rootfs), "-c", "."], capture_output=True, check=True).stdout
     subprocess.run(["podman", "import", "-q", "-", name], input=tar, capture_output=True, check=True)
     try:

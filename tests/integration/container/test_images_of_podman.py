@@ -170,7 +170,10 @@ async def test_an_image_that_cannot_be_had_is_told(machine: Machine, folder: Pat
         await until(lambda: len(faults()) == len(reasons), what="a fault of each")
         for number, reason in enumerate(reasons.values()):
             assert reason in faults()[f"user/box{number}"]
-            assert machine.status(f"user/box{number}").state is EndpointState.FAILED
+            box = f"user/box{number}"
+            await until(
+                lambda box=box: machine.status(box).state is EndpointState.FAILED, what=f"{box} failed"
+            )
 
 
 async def test_a_program_has_the_images_own_python(folder: Path) -> None:
