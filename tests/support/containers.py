@@ -472,3 +472,11 @@ async def joined(address: LinkAddress, machine: str = MACHINE) -> AsyncIterator[
         yield peer
     finally:
         await peer.close()
+
+
+def program_of(pid: int) -> str:
+    """The name of the program that a process runs; empty if it is gone."""
+    try:
+        return Path(f"/proc/{pid}/comm").read_text().strip()
+    except (FileNotFoundError, ProcessLookupError):
+        return ""

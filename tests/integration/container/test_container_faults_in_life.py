@@ -11,7 +11,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-from support.containers import Machine, until
+from support.containers import Machine, program_of, until
 
 from rce.control.messages import Drop
 from rce.control.model import EndpointState, NodeSpec, NodeState, Resources
@@ -75,7 +75,7 @@ class Stage:
         handle = self.unit.handle
         shim = handle.process.pid
         environment = handle.environment.pid if handle.environment is not None else 0
-        cradles = (pid for pid in self._children(environment) if _name(pid) == "rce-cradle")
+        cradles = (pid for pid in self._children(environment) if program_of(pid) == "rce-cradle")
         node = self.machine.node(BOX, "node")
         pids = {
             "shim": shim,
@@ -108,10 +108,6 @@ class Stage:
 
     def _children(self, pid: int) -> list[int]:
         return [one.pid for one in proc.table().values() if one.parent == pid]
-
-
-def _name(pid: int) -> str:
-    return Path(f"/proc/{pid}/comm").read_text().strip()
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.containers import ECHO, ECHO_INTERFACES, Machine, joined, until
+from support.containers import ECHO, ECHO_INTERFACES, Machine, joined, program_of, until
 from support.rootfs import image_of, make_rootfs
 
 from rce.control.messages import Fault
@@ -201,18 +201,16 @@ async def test_whoever_is_killed_nothing_is_left(machine: Machine, victim: str) 
         machine.note_processes()
         old = dict(machine.pids)
         shims = {one.pid for one in machine.shims()}
-        victims = [one for one in machine.processes() if one.pid not in shims and _comm(one) == victim]
-        assert victims, [_comm(one) for one in machine.processes()]
+        victims = [
+            one for one in machine.processes() if one.pid not in shims and program_of(one.pid) == victim
+        ]
+        assert victims, [program_of(one.pid) for one in machine.processes()]
         os.kill(victims[-1].pid, signal.SIGKILL)
         if victim == "conmon":  # only carries the end of the container to podman: the container lives on
             await machine.drop(BOX)
         else:
             await until(lambda: machine.status(BOX).incarnation not in ("", first), what="a new life")
         assert not [pid for pid, start in old.items() if proc.alive(pid, start)]
-
-
-def _comm(process: proc.Process) -> str:
-    return Path(f"/proc/{process.pid}/comm").read_text().strip()
 
 
 async def test_a_container_is_adopted_and_ends_by_itself(machine: Machine) -> None:

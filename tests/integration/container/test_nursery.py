@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-from support.containers import ECHO, Machine, until
+from support.containers import ECHO, Machine, program_of, until
 
 from rce.control.model import EndpointState, NodeSpec, NodeState
 from rce_container.environment import proc
@@ -117,17 +117,13 @@ async def test_a_node_starts_without_the_cradle(namespaces: Machine) -> None:
     machine = namespaces
     async with machine.engine():
         await running(machine)
-        (cradle,) = [one for one in machine.processes() if _name(one.pid) == "rce-cradle"]
+        (cradle,) = [one for one in machine.processes() if program_of(one.pid) == "rce-cradle"]
         os.kill(cradle.pid, signal.SIGKILL)
         await until(lambda: not proc.alive(cradle.pid, cradle.start))
         await machine.put(BOX, 2, nodes=(TALK, ECHO))
         assert "hello" in await machine.log_holds(BOX, "node", "hello")
         await machine.node_is(BOX, "echo", NodeState.RUNNING)
         assert machine.faults == []
-
-
-def _name(pid: int) -> str:
-    return Path(f"/proc/{pid}/comm").read_text().strip()
 
 
 async def test_the_nursery_ends_with_its_manager(namespaces: Machine) -> None:
