@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from abc import abstractmethod
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING
 
@@ -63,9 +64,9 @@ class RosInterface(Interface):
         except RosError as error:
             raise InterfaceError(f"{self.addr}: {error}") from error
 
+    @abstractmethod
     async def open(self) -> None:
         """Do the work of :meth:`start`; errors of ROS may go through."""
-        raise NotImplementedError
 
 
 class PublisherInterface(RosInterface):
