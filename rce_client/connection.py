@@ -288,7 +288,7 @@ class Connection(Requests, OwnInterfaces):
             case ErrorReport():
                 self._take_error(event.text)
             case Fault():
-                self._take_error(f"unreadable: {event.text}")
+                self._take_fault(event)
             case _:
                 self._take_error(f"unexpected message {type(event).__name__}")
 
@@ -330,6 +330,14 @@ class Connection(Requests, OwnInterfaces):
             self._early[message.i_tag] = message
             if len(self._early) > _MOST_EARLY:
                 del self._early[next(iter(self._early))]
+
+    def _take_fault(self, fault: Fault) -> None:
+        """Tell of what came and cannot be read; a service call that it was part of fails."""
+        end = None if fault.call is None else self._ends.get(fault.call.i_tag)
+        if fault.call is not None and end is not None:
+            end.on_fault(fault.call.msg_id, f"unreadable: {fault.text}")
+        if not isinstance(end, ServiceClient):
+            self._take_error(f"unreadable: {fault.text}")
 
     def _take_error(self, text: str) -> None:
         fault = read_call_fault(text)

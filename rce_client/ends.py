@@ -94,7 +94,7 @@ class End(ABC):
         """The connection ended."""
 
     def on_fault(self, msg_id: str, text: str) -> None:  # noqa: B027
-        """An ``ER`` names a message of this end."""
+        """An ``ER`` names a message of this end, or a message for it is lost."""
 
     def on_closed(self) -> None:  # noqa: B027
         """Nothing will come any more."""
@@ -284,6 +284,10 @@ class ServiceProvider(End, Generic[M]):
         self._calls.add(task)
         task.add_done_callback(self._calls.discard)
 
+    def on_fault(self, msg_id: str, text: str) -> None:
+        """Answer a request that cannot be read."""
+        self._answer(msg_id, f"the robot could not read the request: {text}")
+
     def on_lost(self) -> None:
         """Give up what nobody waits for any more."""
         for task in self._calls:
@@ -303,7 +307,12 @@ class ServiceProvider(End, Generic[M]):
         self._answer(message.msg_id, answer)
 
     def _answer(self, msg_id: str, answer: object) -> None:
-        if not self._way.post_control(encode_data(self.tag, self.cls, answer, msg_id)):
+        try:
+            frames = encode_data(self.tag, self.cls, answer, msg_id)
+        except TypeError as error:
+            _log.exception("answer of service %s", self.tag)
+            frames = encode_data(self.tag, self.cls, f"the answer cannot be sent: {error}", msg_id)
+        if not self._way.post_control(frames):
             _log.warning("%s: no connection to send an answer on", self.tag)
 
 

@@ -103,6 +103,9 @@ class RobotInterface(Interface):
             RobotError: It is refused.
         """
 
+    def refused(self, msg_id: str, problem: str) -> None:
+        """Take note that a message of the robot with this id was refused, which the robot knows."""
+
     def on_active(self, active: bool) -> None:
         """Tell the robot."""
         self.active = active

@@ -14,6 +14,7 @@ import msgspec
 
 from rce.control.model import EndpointState, EndpointStatus, EndpointUsage
 from rce.link import Endpoint, InterfaceError
+from rce.protocol.calls import call_at
 from rce.protocol.names import EndpointId, InterfaceType
 from rce_robot.exceptions import MisdirectedError
 from rce_robot.interfaces import make_interface
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from rce.control.model import EndpointSpec, InterfaceSpec, LinkAddress
     from rce.guard.budget import Ledger
     from rce.link import Interface, LinkHub, Port
+    from rce.protocol.calls import CallId
     from rce.protocol.messages import DataMessage, Request
     from rce_robot.forms import Form
     from rce_robot.interface import RobotInterface
@@ -166,10 +168,20 @@ class Namespace:
         """
         interface = self._interfaces.get(message.i_tag)
         if interface is None:
-            raise MisdirectedError(f"{message.i_tag}: robot {self.id.tag} has no such interface")
+            name = call_at(message.i_tag, message.msg_id) or message.i_tag
+            raise MisdirectedError(f"{name}: robot {self.id.tag} has no such interface")
         if message.type != interface.cls:
-            raise MisdirectedError(f"{message.i_tag}: carries {interface.cls}, not {message.type}")
+            name = call_at(message.i_tag, message.msg_id) or message.i_tag
+            problem = f"{name}: carries {interface.cls}, not {message.type}"
+            interface.refused(message.msg_id, problem)
+            raise MisdirectedError(problem)
         interface.take(message)
+
+    def refused(self, call: CallId, problem: str) -> None:
+        """End the service call of a message that was refused."""
+        interface = self._interfaces.get(call.i_tag)
+        if interface is not None:
+            interface.refused(call.msg_id, problem)
 
     async def ask_master(self, request: Request) -> tuple[str, ...]:
         """Have a request of the robot carried out."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from typing import TYPE_CHECKING
 
 from rce.link import CallError, CallTimeout, Overloaded, PeerFault, PeerLost
@@ -16,6 +17,9 @@ if TYPE_CHECKING:
     from rce_robot.forms import Form
     from rce_robot.interface import RobotSide
     from rce_robot.outbox import Buffer
+
+
+_log = logging.getLogger(__name__)
 
 
 class AskedByRobot(RobotInterface):
@@ -32,6 +36,10 @@ class AskedByRobot(RobotInterface):
             answer = await self.port.call(payload)
         except CallError as error:
             self.robot.report(f"{self._name(msg_id)}: {error}")
+            return
+        except Exception:  # noqa: BLE001 - logged; the caller must hear of the end of its call
+            _log.exception("service call at %s", self.tag)
+            self.robot.report(f"{self._name(msg_id)}: internal error; the engine's log tells more")
             return
         if not self._send_service(answer, msg_id):
             self.robot.report(f"{self._name(msg_id)}: the answer was dropped, too much waits to be sent")
@@ -81,6 +89,10 @@ class AnsweredByRobot(RobotInterface):
         except UnreadableError as error:
             answer.set_exception(PeerFault(f"the robot's answer cannot be read: {error}"))
             raise
+
+    def refused(self, msg_id: str, problem: str) -> None:
+        """Fail the call: its answer is lost."""
+        self.not_rendered(msg_id, f"the robot's answer was refused: {problem}")
 
     def robot_left(self) -> None:
         """Fail the calls that wait."""

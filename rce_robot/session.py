@@ -15,6 +15,7 @@ import msgspec
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 
+from rce.protocol.calls import call_at
 from rce.protocol.codec import encode
 from rce.protocol.limits import Limits
 from rce.protocol.messages import (
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from collections import Counter
     from collections.abc import Coroutine
 
+    from rce.protocol.calls import CallId
     from rce.protocol.messages import Request
     from rce.protocol.stream import Event
     from rce_robot.outbox import Queued
@@ -50,6 +52,9 @@ class Owner(Protocol):
 
     def take(self, message: DataMessage) -> None:
         """Handle a data message; raises :class:`RobotError` if it is refused."""
+
+    def refused(self, call: CallId, problem: str) -> None:
+        """A message of a service call was refused before it could be handled."""
 
     async def ask_master(self, request: Request) -> tuple[str, ...]:
         """Have a request carried out; return what went wrong, as texts."""
@@ -277,9 +282,12 @@ class Session:
                     self.report(str(error))
                 except Exception:  # noqa: BLE001 - logged; it must not end anything else
                     _log.exception("data message at %s", event.i_tag)
-                    self.report(f"{event.i_tag}: internal error; the engine's log tells more")
+                    name = call_at(event.i_tag, event.msg_id) or event.i_tag
+                    self.report(f"{name}: internal error; the engine's log tells more")
             case Fault():
                 self.report(event.text)
+                if event.call is not None:
+                    self._owner.refused(event.call, event.text)
             case ErrorReport() | InterfaceStatus():
                 self.report(f"type: {type_of(event)} is not for clients to send")
             case _:

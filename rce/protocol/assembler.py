@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from rce.protocol.exceptions import AssemblyError
 from rce.protocol.limits import DEFAULT_LIMITS, Limits
@@ -28,6 +28,15 @@ _ID = re.compile(r"[0-9A-Fa-f]{32}")
 _ID_BYTES = re.compile(rb"[0-9A-Fa-f]{32}")
 
 Binary: TypeAlias = bytes | bytearray | memoryview
+
+
+class Dropped(NamedTuple):
+    """Something that will not become a message."""
+
+    text: str
+    """Why."""
+    value: Any = None
+    """The incomplete message; ``None`` for a binary value that no message asked for."""
 
 
 @dataclass(eq=False, slots=True)
@@ -73,7 +82,7 @@ class Assembler:
         oldest = next(iter(self._entries.values()), None)
         return None if oldest is None else oldest.deadline
 
-    def add_message(self, value: Any, size: int, now: float) -> tuple[bool, list[str]]:
+    def add_message(self, value: Any, size: int, now: float) -> tuple[bool, list[Dropped]]:
         """Take a parsed text frame.
 
         Args:
@@ -82,7 +91,7 @@ class Assembler:
             now: Seconds on the caller's clock.
 
         Returns:
-            Whether ``value`` is complete, and a text for everything that had to be dropped.
+            Whether ``value`` is complete, and everything that had to be dropped.
 
         Raises:
             AssemblyError: A reference in it is wrong; the message is refused.
@@ -91,7 +100,7 @@ class Assembler:
 
     def add_single(
         self, value: Any, id_: str, holder: list[Any], size: int, now: float
-    ) -> tuple[bool, list[str]]:
+    ) -> tuple[bool, list[Dropped]]:
         """Take a message of which it is known already that it refers to one binary value only.
 
         Args:
@@ -113,7 +122,7 @@ class Assembler:
 
     def _await(
         self, value: Any, places: dict[str, tuple[Any, Any]], size: int, now: float
-    ) -> tuple[bool, list[str]]:
+    ) -> tuple[bool, list[Dropped]]:
         """Put in place what is there already, and wait for the rest."""
         found = [self._unclaimed[id_] for id_ in places if id_ in self._unclaimed]
         for unclaimed in found:
@@ -131,7 +140,7 @@ class Assembler:
         self._awaited.update(dict.fromkeys(partial.missing, partial))
         return False, self._keep(partial)
 
-    def add_binary(self, frame: Binary, now: float) -> tuple[Any, list[str]]:
+    def add_binary(self, frame: Binary, now: float) -> tuple[Any, list[Dropped]]:
         """Take a binary frame.
 
         Args:
@@ -139,8 +148,8 @@ class Assembler:
             now: Seconds on the caller's clock.
 
         Returns:
-            The message that this frame completed (``None`` if it completed none), and a text for everything
-            that had to be dropped.
+            The message that this frame completed (``None`` if it completed none), and everything that had to
+            be dropped.
 
         Raises:
             AssemblyError: The frame is wrong, or its id was there already.
@@ -165,25 +174,25 @@ class Assembler:
         self._forget(partial)
         return partial.value, []
 
-    def expire(self, now: float) -> list[str]:
-        """Drop what is older than the limit; return a text for each."""
-        dropped = []
+    def expire(self, now: float) -> list[Dropped]:
+        """Drop what is older than the limit; return each with why."""
+        dropped: list[Dropped] = []
         while self._entries:
             oldest = next(iter(self._entries.values()))
             if oldest.deadline > now:
                 break
             self._forget(oldest)
-            dropped.append(f"{_describe(oldest)} within {self._limits.expiry:g} s; dropped")
+            dropped.append(_dropped(oldest, f"within {self._limits.expiry:g} s; dropped"))
         return dropped
 
-    def drop_oldest(self, size: int) -> list[str]:
-        """Drop what is incomplete, oldest first, until ``size`` bytes are free; return a text for each."""
+    def drop_oldest(self, size: int) -> list[Dropped]:
+        """Drop what is incomplete, oldest first, until ``size`` bytes are free; return each with why."""
         goal = self.pending_bytes - size
-        dropped = []
+        dropped: list[Dropped] = []
         while self._entries and self.pending_bytes > goal:
             oldest = next(iter(self._entries.values()))
             self._forget(oldest)
-            dropped.append(f"{_describe(oldest)} and memory is short; dropped")
+            dropped.append(_dropped(oldest, "and memory is short; dropped"))
         return dropped
 
     def _claim_places(self, value: Any) -> dict[str, tuple[Any, Any]]:
@@ -216,19 +225,19 @@ class Assembler:
                 places.update((id_, (ids, index)) for index, id_ in enumerate(ids))
         return places
 
-    def _keep(self, entry: _Partial | _Unclaimed) -> list[str]:
+    def _keep(self, entry: _Partial | _Unclaimed) -> list[Dropped]:
         self._entries[id(entry)] = entry
         self.pending_bytes += entry.size
         return self._shrink()
 
-    def _shrink(self) -> list[str]:
+    def _shrink(self) -> list[Dropped]:
         """Drop the oldest until the rest is within the limits."""
-        dropped = []
+        dropped: list[Dropped] = []
         limits = self._limits
         while self.pending_bytes > limits.max_pending_bytes or len(self._entries) > limits.max_pending:
             oldest = next(iter(self._entries.values()))
             self._forget(oldest)
-            dropped.append(f"{_describe(oldest)} and too much is incomplete; the oldest was dropped")
+            dropped.append(_dropped(oldest, "and too much is incomplete; the oldest was dropped"))
         return dropped
 
     def _forget(self, entry: _Partial | _Unclaimed) -> None:
@@ -261,7 +270,9 @@ def _references(value: Any) -> Iterator[tuple[dict[str, Any], str]]:
             stack.extend(inner for inner in item if type(inner) is dict or type(inner) is list)
 
 
-def _describe(entry: _Partial | _Unclaimed) -> str:
+def _dropped(entry: _Partial | _Unclaimed, why: str) -> Dropped:
     if isinstance(entry, _Unclaimed):
-        return f"no message asked for binary value {entry.id} ({entry.size - ID_LENGTH} bytes)"
-    return f"{len(entry.missing)} of {len(entry.places)} binary values of a message did not come"
+        size = entry.size - ID_LENGTH
+        return Dropped(f"no message asked for binary value {entry.id} ({size} bytes) {why}")
+    missing = f"{len(entry.missing)} of {len(entry.places)} binary values of a message did not come"
+    return Dropped(f"{missing} {why}", entry.value)

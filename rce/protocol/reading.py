@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, AnyStr, Literal, TypeVar
 import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 
+from rce.protocol.calls import text_id
 from rce.protocol.exceptions import MessageError
 from rce.protocol.limits import DEFAULT_LIMITS
 from rce.protocol.messages import (
@@ -242,6 +243,8 @@ def message_from_json(value: Any, accept: Collection[str] = TYPES) -> ClientMess
         return read_request(kind, data)
     if kind == "ER":
         return ErrorReport(text=_convert(data, str, "data"))
+    if kind == "DM" and isinstance(data, dict) and "msgID" in data:
+        data = {**data, "msgID": text_id(data["msgID"])}
     return _convert(data, TYPES[kind], "data")
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from msgspec import Struct
 
 from rce.protocol.assembler import Assembler, Binary
+from rce.protocol.calls import CallId, call_at, call_of
 from rce.protocol.exceptions import ProtocolError
 from rce.protocol.limits import DEFAULT_LIMITS, Limits
 from rce.protocol.messages import (
@@ -35,12 +36,21 @@ if TYPE_CHECKING:
     from collections.abc import Collection
     from typing import Self
 
+    from rce.protocol.assembler import Dropped
+
 
 class Fault(Struct, frozen=True):
     """Something from the peer was refused or dropped; the stream goes on."""
 
     text: str
-    """Fit to be sent to the peer as ``ER``."""
+    """Fit to be sent to the peer as ``ER``; it starts with the call, if there is one."""
+    call: CallId | None = None
+    """The service call that ends with this, because its request or its answer is lost."""
+
+    @classmethod
+    def of(cls, problem: str, call: CallId | None) -> Self:
+        """Make the fault of a message, which is a service call's or not."""
+        return cls(problem if call is None else f"{call}: {problem}", call)
 
 
 Event: TypeAlias = ClientMessage | Fault
@@ -55,6 +65,11 @@ class _Serialized:
     def __init__(self, data: SerializedData) -> None:
         self._data = data
         self.holder: list[Any] = [None]
+
+    @property
+    def call(self) -> CallId | None:
+        """The service call that it belongs to."""
+        return call_at(self._data.i_tag, self._data.msg_id)
 
     def message(self) -> DataMessage:
         """Return the message with the bytes that were put into ``holder``."""
@@ -115,6 +130,7 @@ class ProtocolStream:
             return [Fault(f"a text frame of {len(text)} is longer than the limit of {limits.max_text}")]
         shallow = is_shallow(text, limits.max_depth)
         starred = _may_be_starred(text)
+        value: Any = None
         if shallow and not starred:
             message = decode_data(text)
             if message is not None:
@@ -135,7 +151,7 @@ class ProtocolStream:
                 return [message_from_json(value, self._accept)]
             complete, dropped = self._assembler.add_message(value, len(text), now)
         except ProtocolError as error:
-            return [Fault(str(error))]
+            return [Fault.of(str(error), call_of(value))]
         return self._events(value if complete else None, dropped)
 
     def feed_binary(self, frame: Binary, now: float) -> list[Event]:
@@ -156,15 +172,15 @@ class ProtocolStream:
 
     def expire(self, now: float) -> list[Event]:
         """Drop what has been incomplete for too long."""
-        return [Fault(reason) for reason in self._assembler.expire(now)]
+        return [_fault(dropped) for dropped in self._assembler.expire(now)]
 
     def drop_oldest(self, size: int) -> list[Event]:
         """Drop what is incomplete, oldest first, until ``size`` bytes are free."""
-        return [Fault(reason) for reason in self._assembler.drop_oldest(size)]
+        return [_fault(dropped) for dropped in self._assembler.drop_oldest(size)]
 
-    def _events(self, value: Any, dropped: list[str]) -> list[Event]:
+    def _events(self, value: Any, dropped: list[Dropped]) -> list[Event]:
         """Make the events of a complete message, if there is one, and of what had to be dropped for it."""
-        events: list[Event] = [Fault(reason) for reason in dropped] if dropped else []
+        events: list[Event] = [_fault(one) for one in dropped] if dropped else []
         if value is not None:
             events.append(self._message(value))
         return events
@@ -175,7 +191,13 @@ class ProtocolStream:
         try:
             return message_from_json(value, self._accept)
         except ProtocolError as error:
-            return Fault(str(error))
+            return Fault.of(str(error), call_of(value))
+
+
+def _fault(dropped: Dropped) -> Fault:
+    """Tell of what will not become a message."""
+    value = dropped.value
+    return Fault.of(dropped.text, value.call if type(value) is _Serialized else call_of(value))
 
 
 def _may_be_starred(text: str | bytes) -> bool:

@@ -14,7 +14,7 @@ from rce_robot.converters.stamps import (
     time_from_json,
     time_to_json,
 )
-from rce_robot.converters.values import number_packer, to_float, to_octets, unpack_list
+from rce_robot.converters.values import number_packer, to_float, to_integer, to_octets, unpack_list
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -135,7 +135,7 @@ def _check_number(code: Code, field: Field, value: str) -> None:
     elif NUMBERS[field.type].is_float:
         code.line(f"elif {value}.__class__ is not float: {value} = {code.bind(to_float)}({value})")
     else:
-        code.line(f"elif {value}.__class__ is not int: raise Refused")
+        code.line(f"elif {value}.__class__ is not int: {value} = {code.bind(to_integer)}({value})")
 
 
 def _json_default(field: Field) -> Any:

@@ -96,8 +96,11 @@ def _check_number(type_name: str, value: Any) -> None:
     if type_name == "bool":
         fits = isinstance(value, bool)
     else:
-        kinds = (int, float, type(None)) if number.is_float else (int,)
+        kinds = (int, float, type(None)) if number.is_float else (int, float)
         fits = isinstance(value, kinds) and not isinstance(value, bool)
+        if isinstance(value, float) and not number.is_float:
+            fits = value.is_integer()
+            value = int(value) if fits else value
     if not fits:
         raise ValueError(f"{describe(value)} is not a {type_name}")
     if value is None:

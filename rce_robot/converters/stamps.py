@@ -82,7 +82,7 @@ def duration_from_json(value: Any) -> tuple[int, int]:
 
 
 def _parts(value: dict[str, Any], kind: str, low: int, high: int) -> tuple[int, int]:
-    secs, nsecs = value.get("secs", 0), value.get("nsecs", 0)
+    secs, nsecs = _whole(value.get("secs", 0)), _whole(value.get("nsecs", 0))
     if len(value) != ("secs" in value) + ("nsecs" in value):
         raise ValueError(
             f"an object that is a {kind} has secs and nsecs, this one has {', '.join(value)[:80]}"
@@ -94,3 +94,8 @@ def _parts(value: dict[str, Any], kind: str, low: int, high: int) -> tuple[int, 
                 f"{name} of a {kind} is {describe(part)}, must be an integer from {low} to {high}"
             )
     return secs, nsecs
+
+
+def _whole(value: Any) -> Any:
+    """Make an integer of a number without fraction; anything else is left for the check."""
+    return int(value) if value.__class__ is float and value.is_integer() else value

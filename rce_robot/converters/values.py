@@ -35,14 +35,21 @@ def to_float(value: Any) -> float:
     raise RefusedValueError
 
 
+def to_integer(value: Any) -> int:
+    """Read a number that is not an integer already: ``3.0`` is 3, as languages without integers write it."""
+    if value.__class__ is float and value.is_integer():
+        return int(value)
+    raise RefusedValueError
+
+
 def to_octets(value: Any) -> bytes | bytearray | memoryview:
     """Read ``uint8[]`` or ``char[]``: a binary value, a base64 string, or a list of numbers."""
     if isinstance(value, BINARY):
         return value
     if value.__class__ is str:
         return base64.b64decode(value, validate=True)
-    if isinstance(value, (list, tuple)) and _INTEGERS.issuperset(map(type, value)):
-        return bytes(value)
+    if isinstance(value, (list, tuple)):
+        return bytes(_integers(value))
     raise RefusedValueError
 
 
@@ -51,18 +58,24 @@ def number_packer(number: Number) -> Callable[[Any], bytes]:
     if number.code == "?":
         return _pack_bools
     code = number.code
-    allowed = _FLOATS if number.is_float else _INTEGERS
 
     def pack(values: Any) -> bytes:
         if not isinstance(values, (list, tuple)):
             raise RefusedValueError
-        if not allowed.issuperset(map(type, values)):
-            if not number.is_float:
-                raise RefusedValueError
+        if not number.is_float:
+            values = _integers(values)
+        elif not _FLOATS.issuperset(map(type, values)):
             values = [value if value.__class__ is float else to_float(value) for value in values]
         return pack_numbers(code, array(code, values))
 
     return pack
+
+
+def _integers(values: list[Any] | tuple[Any, ...]) -> Any:
+    """Read numbers without fraction; what holds nothing but integers is returned as it is."""
+    if _INTEGERS.issuperset(map(type, values)):
+        return values
+    return [value if value.__class__ is int else to_integer(value) for value in values]
 
 
 def _pack_bools(values: Any) -> bytes:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from rce.link import PeerFault
 from rce_client.connection import Connection, State
 from rce_client.exceptions import (
     CallError,
@@ -130,6 +131,20 @@ async def test_service_provider(engine: Engine) -> None:
         assert await asyncio.gather(*calls) == [ros_string("A"), ros_string("B")]
         with pytest.raises(Exception, match="robot says no"):
             await port.call(ros_string("fail"))
+
+
+async def test_an_answer_that_cannot_be_sent_fails_its_caller(engine: Engine) -> None:
+    """The connection goes on, too: the next call is answered."""
+
+    def handler(request: dict[str, Any]) -> dict[str, Any]:
+        return {"data": object() if request["data"] == "bad" else "good"}
+
+    async with engine.connection() as conn:
+        provider = await conn.service_provider("serve", ECHO, handler)
+        await provider.wait_active(10)
+        with pytest.raises(PeerFault, match="the answer cannot be sent"):
+            await engine.end("serve").port.call(ros_string("bad"))
+        assert await engine.end("serve").port.call(ros_string("x")) == ros_string("good")
 
 
 async def test_an_interface_can_be_closed_and_made_again(engine: Engine) -> None:

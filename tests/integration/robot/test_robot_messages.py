@@ -174,3 +174,42 @@ async def test_fragments_make_a_message(cloud: Cloud, robot: Robot) -> None:
     text = '{"type":"DM","data":{"iTag":"say","type":"std_msgs/String","msgID":"nil","msg":{"data":"parts"}}}'
     await robot.socket.send([text[:10], text[10:50], text[50:]])
     assert await end.received.get() == ros_string("parts")
+
+
+@pytest.mark.parametrize("msg_id", [7, 7.0])
+async def test_an_integer_msg_id_is_answered_as_text(cloud: Cloud, robot: Robot, msg_id: float) -> None:
+    """Lua and MATLAB write 7.0 for 7."""
+    await cloud.joined("ask", "ServiceProviderConverter", ECHO)
+    data = {"iTag": "ask", "type": ECHO, "msgID": msg_id, "msg": {"data": "x"}}
+    await robot.send("DM", data)
+    assert (await robot.get("DM"))["msgID"] == "7"
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        {"iTag": "ask", "type": ECHO, "msg": {"data": 5}},
+        {"iTag": "ask", "type": "std_srvs/SetBool", "msg": {}},
+        {"iTag": "ask", "type": "none", "msg": {}},
+        {"iTag": "ask", "type": ECHO},
+        {"iTag": "ask", "type": ECHO, "msg*": "no id"},
+        {"iTag": "nobody", "type": ECHO, "msg": {}},
+    ],
+)
+async def test_a_refused_request_ends_at_its_caller(cloud: Cloud, robot: Robot, data: dict[str, str]) -> None:
+    await cloud.joined("ask", "ServiceProviderConverter", ECHO)
+    await robot.send("DM", {**data, "msgID": "id7"})
+    assert (await robot.get("ER")).startswith(f"{data['iTag']}, msgID id7: ")
+
+
+@pytest.mark.parametrize(
+    "answer", [{"type": "std_srvs/SetBool", "msg": {}}, {"type": "none", "msg": {}}, {"type": ECHO}]
+)
+async def test_a_refused_answer_fails_its_caller(cloud: Cloud, robot: Robot, answer: dict[str, str]) -> None:
+    end = await cloud.joined("serve", "ServiceClientConverter", ECHO)
+    call = asyncio.create_task(end.port.call(ros_string("x")))
+    request = await robot.get("DM")
+    await robot.send("DM", {"iTag": "serve", "msgID": request["msgID"], **answer})
+    async with asyncio.timeout(10):  # far less than a call may take
+        with pytest.raises(PeerFault, match="the robot's answer was refused: serve, msgID"):
+            await call

@@ -138,7 +138,7 @@ def test_garbage_bytes_are_read_or_refused(data: Any) -> None:
         ("std_msgs/Header", {"seq": "1"}, "seq: '1' is not a uint32"),
         ("std_msgs/Header", {"seq": -1}, "seq: -1 is out of the range of uint32"),
         ("std_msgs/Header", {"seq": 2**32}, "seq: 4294967296 is out of the range of uint32"),
-        ("std_msgs/Header", {"seq": 1.0}, "seq: 1.0 is not a uint32"),
+        ("std_msgs/Header", {"seq": 1.5}, "seq: 1.5 is not a uint32"),
         ("std_msgs/Header", {"seq": True}, "seq: true is not a uint32"),
         ("std_msgs/Header", {"seq": None}, "seq: null is not a uint32"),
         ("std_msgs/Header", {"frame_id": 1}, "frame_id: 1 is not a string"),
@@ -354,3 +354,37 @@ def test_base64_is_what_the_wire_has() -> None:
     codec = converter("std_msgs/UInt8MultiArray")
     payload = codec.decode({"data": base64.b64encode(octets).decode()})[0]
     assert codec.encode(payload)["data"] == octets
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "same"),
+    [
+        ("std_msgs/Int32", {"data": 3.0}, {"data": 3}),
+        ("std_msgs/Int64", {"data": -1e15}, {"data": -(10**15)}),
+        ("std_msgs/UInt8", {"data": -0.0}, {"data": 0}),
+        ("std_msgs/Int32MultiArray", {"data": [1, 2.0, -3e0]}, {"data": [1, 2, -3]}),
+        ("std_msgs/UInt8MultiArray", {"data": [1.0, 255.0]}, {"data": [1, 255]}),
+        ("std_msgs/Time", {"data": {"secs": 5.0, "nsecs": 7.0}}, {"data": {"secs": 5, "nsecs": 7}}),
+        ("geometry_msgs/PoseStamped", {"header": {"seq": 9.0}}, {"header": {"seq": 9}}),
+    ],
+)
+def test_numbers_without_fraction_are_integers(name: str, value: Any, same: Any) -> None:
+    assert converter(name).decode(value) == converter(name).decode(same)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "text"),
+    [
+        ("std_msgs/Int32", {"data": 3.5}, "data: 3.5 is not a int32"),
+        ("std_msgs/Int32", {"data": 3e9}, "data: 3000000000 is out of the range of int32"),
+        ("std_msgs/Int64", {"data": math.inf}, "data: inf is not a int64"),
+        ("std_msgs/Int64", {"data": math.nan}, "data: nan is not a int64"),
+        ("std_msgs/Int32MultiArray", {"data": [1.0, 2.5]}, r"data\[1\]: 2.5 is not a int32"),
+        ("std_msgs/UInt8MultiArray", {"data": [256.0]}, r"data\[0\]: 256 is out of the range of uint8"),
+        ("std_msgs/Bool", {"data": 1.0}, "data: 1.0 is not a bool"),
+        ("std_msgs/Time", {"data": {"secs": 1.5}}, "data: secs of a time is 1.5"),
+    ],
+)
+def test_numbers_with_fraction_are_refused_as_integers(name: str, value: Any, text: str) -> None:
+    with pytest.raises(ConversionError, match=text):
+        converter(name).decode(value)

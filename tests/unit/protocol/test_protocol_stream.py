@@ -345,3 +345,59 @@ def test_serialized_message_with_another_binary_beside_it() -> None:
     (message,) = stream.feed(binary(OTHER, b"y"), 0.0)
     assert isinstance(message, DataMessage)
     assert bytes(message.msg) == b"x"
+
+
+@pytest.mark.parametrize(("msg_id", "text"), [(7, "7"), (7.0, "7"), (-1, "-1"), (2**63, str(2**63))])
+@pytest.mark.parametrize("binary_first", [True, False, None])
+def test_an_integer_msg_id_is_its_text(msg_id: Any, text: str, binary_first: bool | None) -> None:
+    stream = ProtocolStream.for_engine()
+    if binary_first is None:
+        frames: list[str | bytes] = [starred({}, msgID=msg_id)]
+    else:
+        frames = [serialized(ID, msgID=msg_id), binary(ID, b"x")]
+        frames = frames[::-1] if binary_first else frames
+    (message,) = [event for frame in frames for event in stream.feed(frame, 0.0)]
+    assert isinstance(message, DataMessage)
+    assert message.msg_id == text
+
+
+@pytest.mark.parametrize("msg_id", [1.5, True, None, [], 10**400])
+def test_other_msg_ids_are_refused(msg_id: Any) -> None:
+    (fault,) = ProtocolStream.for_engine().feed(starred({}, msgID=msg_id), 0.0)
+    assert isinstance(fault, Fault)
+    assert fault.text.startswith("data.msgID: must be str")
+    assert fault.call is None
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        starred({}, msgID="c7", type="no class"),
+        starred({"k*": "short"}, msgID="c7"),
+        starred({"k": [[[[[[[[[[]]]]]]]]]]}, msgID="c7"),
+        json.dumps({"type": "DM", "data": {"iTag": "i", "type": "a/B", "msgID": "c7"}}),
+    ],
+)
+def test_a_refused_message_of_a_call_names_the_call(frame: str) -> None:
+    (fault,) = ProtocolStream.for_engine(Limits(max_depth=8)).feed(frame, 0.0)
+    assert isinstance(fault, Fault)
+    assert fault.call == ("i", "c7")
+    assert fault.text.startswith("i, msgID c7: ")
+
+
+@pytest.mark.parametrize("text", [starred({"k*": ID}, msgID="c7"), starred({"k*": ID}, msgID=7)])
+def test_a_call_whose_binary_values_stay_away_is_named(text: str) -> None:
+    stream = ProtocolStream.for_engine(Limits(expiry=1.0))
+    assert stream.feed(text, 0.0) == []
+    (fault,) = stream.expire(2.0)
+    assert isinstance(fault, Fault)
+    assert fault.call is not None
+    assert fault.text.startswith(f"{fault.call}: 1 of 1 binary values")
+
+
+def test_a_serialized_call_that_makes_room_is_named() -> None:
+    stream = ProtocolStream.for_engine()
+    assert stream.feed(serialized(ID, msgID="c7"), 0.0) == []
+    (fault,) = stream.drop_oldest(1)
+    assert isinstance(fault, Fault)
+    assert fault.call == ("i", "c7")

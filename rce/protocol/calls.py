@@ -1,0 +1,61 @@
+"""Which service call a message is of, also where the message as a whole is refused.
+
+A caller must hear of the end of its call. So what is refused is told with the interface and the ``msgID``
+that it names, as far as these can be read.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from rce.protocol.limits import MAX_MESSAGE_ID_LENGTH
+from rce.protocol.messages import NO_ID
+from rce.protocol.names import is_name
+
+
+class CallId(NamedTuple):
+    """A service call at an interface of a robot."""
+
+    i_tag: str
+    msg_id: str
+
+    def __str__(self) -> str:
+        return f"{self.i_tag}, msgID {self.msg_id}"
+
+
+def call_of(value: Any) -> CallId | None:
+    """Return the service call that a parsed text frame belongs to, ``None`` if it names none.
+
+    Example:
+        >>> call_of({"type": "DM", "data": {"iTag": "ask", "msgID": "7", "msg": 5}})
+        CallId(i_tag='ask', msg_id='7')
+    """
+    if not isinstance(value, dict) or value.get("type") != "DM":
+        return None
+    data = value.get("data")
+    if not isinstance(data, dict):
+        return None
+    return call_at(data.get("iTag"), text_id(data.get("msgID", NO_ID)))
+
+
+def call_at(i_tag: Any, msg_id: Any) -> CallId | None:
+    """Return a service call of an interface tag and a ``msgID``, ``None`` if they are none or no call's."""
+    if not isinstance(i_tag, str) or not is_name(i_tag) or not isinstance(msg_id, str):
+        return None
+    if msg_id == NO_ID or len(msg_id) > MAX_MESSAGE_ID_LENGTH:
+        return None
+    return CallId(i_tag, msg_id)
+
+
+def text_id(msg_id: Any) -> Any:
+    """Return a ``msgID`` as text if it is an integer, as clients in other languages write it, else unchanged.
+
+    A number without fraction is one: ``7.0`` is ``"7"``.
+    """
+    if type(msg_id) is float and msg_id.is_integer():
+        msg_id = int(msg_id)
+    return str(msg_id) if type(msg_id) is int and msg_id.bit_length() <= _MOST_BITS else msg_id
+
+
+_MOST_BITS = 256
+"""Of a number that is taken for an id; the writing of longer ones takes time."""
