@@ -9,13 +9,17 @@ from typing import TYPE_CHECKING
 
 from rce.fleet.dijkstra import shortest_path
 from rce.fleet.exceptions import ScenarioError
+from rce.fleet.lacam import DEFAULT_EFFORT, plan
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from rce.fleet.grid import GridMap
 
-_ATTEMPTS = 1000
+_ATTEMPTS = 200
+_EFFORT = DEFAULT_EFFORT
+_EFFORT_PER_ROBOT = 4000
+"""Moves of robots that are tried to find out whether all can get to their goals."""
 _HEADINGS = (0.0, pi / 2, pi, -pi / 2)
 
 
@@ -57,7 +61,8 @@ def make_scenario(
 
     Robots and boxes are drawn from the largest part of the map whose cells can reach one another, and they
     still can with all boxes in place. A hidden box stands on the shortest way of a robot if that is possible,
-    so that somebody finds it.
+    so that a robot finds it. On maps of narrow lanes there are fewer boxes than asked for, where more would
+    leave no room to pass: all robots can always get to their goals at once.
 
     Raises:
         ScenarioError: The map has no room for so many robots and boxes.
@@ -68,21 +73,60 @@ def make_scenario(
     # Robots need some cells to get around one another.
     if robots < 1 or 2 * robots + boxes_wanted > len(room):
         raise ScenarioError(f"{robots} robots and {boxes_wanted} boxes do not fit into {len(room)} cells")
+    best: Scenario | None = None
     for _ in range(_ATTEMPTS):
-        starts, goals = rng.sample(room, robots), rng.sample(room, robots)
-        if any(start == goal for start, goal in zip(starts, goals, strict=True)):
+        found = _draw(grid, room, robots, (known_boxes, hidden_boxes), rng)
+        if found is None:
             continue
-        spare = sorted(set(room).difference(starts, goals))
-        rng.shuffle(spare)
-        known = _place_boxes(grid, spare, known_boxes)
-        told = grid.with_blocked(grid.blocked.union(known))
-        ways = [cell for robot in range(robots) for cell in _way(told, starts[robot], goals[robot])]
-        rng.shuffle(ways)
-        hidden = _place_boxes(told, [cell for cell in [*ways, *spare] if cell in spare], hidden_boxes)
-        if len(known) + len(hidden) == boxes_wanted:
-            headings = tuple(rng.choice(_HEADINGS) for _ in starts)
-            return Scenario(grid, tuple(starts), headings, tuple(goals), known, hidden)
-    raise ScenarioError(f"no scenario was found for {robots} robots and {boxes_wanted} boxes")
+        if best is None or len(found.boxes) > len(best.boxes):
+            best = found
+        if len(best.boxes) == boxes_wanted:
+            break
+    if best is None:
+        raise ScenarioError(
+            f"no starts and goals were found for {robots} robots from which all can get to their goals; "
+            "take fewer robots or a map with wider lanes"
+        )
+    return best
+
+
+def _draw(
+    grid: GridMap, room: Sequence[int], robots: int, boxes: tuple[int, int], rng: Random
+) -> Scenario | None:
+    """Draw a scenario with at most so many known and hidden boxes; ``None`` if it has no joint plan."""
+    starts, goals = rng.sample(room, robots), rng.sample(room, robots)
+    if any(start == goal for start, goal in zip(starts, goals, strict=True)):
+        return None
+    if not solvable(grid, starts, goals):
+        return None
+    spare = sorted(set(room).difference(starts, goals))
+    rng.shuffle(spare)
+    known = _place_boxes(grid, spare, boxes[0])
+    known_grid = grid.with_blocked(grid.blocked.union(known))
+    ways = [cell for robot in range(robots) for cell in _way(known_grid, starts[robot], goals[robot])]
+    rng.shuffle(ways)
+    hidden = _place_boxes(known_grid, [cell for cell in [*ways, *spare] if cell in spare], boxes[1])
+    headings = tuple(rng.choice(_HEADINGS) for _ in starts)
+    for told, found in ((known, hidden), (known, ()), ((), hidden)):
+        if solvable(grid.with_blocked(grid.blocked.union(told, found)), starts, goals):
+            return Scenario(grid, tuple(starts), headings, tuple(goals), told, found)
+    return Scenario(grid, tuple(starts), headings, tuple(goals), (), ())
+
+
+def solvable(grid: GridMap, starts: Sequence[int], goals: Sequence[int]) -> bool:
+    """Whether a plan was found that brings every robot from its start to its goal, all at the same time.
+
+    Args:
+        grid: The map with everything blocked that stands there.
+        starts: Cells of the robots, all different.
+        goals: Where they are to be, all different.
+
+    Returns:
+        True only with a plan at hand; False also where the search gave up.
+    """
+    if not all(grid.connected((start, goal)) for start, goal in zip(starts, goals, strict=True)):
+        return False
+    return plan(grid, starts, goals, effort=max(_EFFORT, _EFFORT_PER_ROBOT * len(starts))).complete
 
 
 def given_scenario(grid: GridMap, pairs: Iterable[tuple[int, int]], *, seed: int = 0) -> Scenario:
@@ -117,21 +161,27 @@ def midway_cell(
         avoid: Cells that shall not be taken, such as those that robots were granted.
 
     Returns:
-        A cell whose blocking cuts no robot off its goal; ``None`` if no path has one.
+        A cell whose blocking leaves all robots a way to their goals at once; ``None`` if there is none.
     """
-    taken = {*goals.values(), *avoid, *(plan[0] for plan in plans.values() if plan)}
-    for plan in sorted(plans.values(), key=len, reverse=True):
-        middle = len(plan) / 2
-        for index in sorted(range(1, len(plan)), key=lambda index: abs(index - middle)):
-            cell = plan[index]
-            if cell in taken or cell in grid.blocked:
-                continue
-            shut = grid.with_blocked(grid.blocked | {cell})
-            if all(
-                shut.connected((path[0], goals[robot])) for robot, path in plans.items() if robot in goals
-            ):
-                return cell
+    bound = [robot for robot, path in plans.items() if path and robot in goals]
+    starts, ends = [plans[robot][0] for robot in bound], [goals[robot] for robot in bound]
+    if len(set(starts)) < len(starts):
+        return None
+    for cell in _from_the_middle(plans, {*goals.values(), *avoid, *grid.blocked}):
+        if solvable(grid.with_blocked(grid.blocked | {cell}), starts, ends):
+            return cell
     return None
+
+
+def _from_the_middle(plans: Mapping[str, Sequence[int]], taken: Collection[int]) -> Iterator[int]:
+    """Each cell of the paths that no robot stands in, once: of the longest path first, its middle first."""
+    seen = {*taken, *(path[0] for path in plans.values() if path)}
+    for path in sorted(plans.values(), key=len, reverse=True):
+        middle = len(path) / 2
+        for index in sorted(range(1, len(path)), key=lambda index: abs(index - middle)):
+            if path[index] not in seen:
+                seen.add(path[index])
+                yield path[index]
 
 
 def _place_boxes(grid: GridMap, candidates: Sequence[int], count: int) -> tuple[int, ...]:
@@ -141,7 +191,7 @@ def _place_boxes(grid: GridMap, candidates: Sequence[int], count: int) -> tuple[
         if len(placed) == count:
             break
         shut = grid.with_blocked({*grid.blocked, *placed, cell})
-        if cell not in placed and shut.connected(shut.neighbours[cell]):
+        if cell not in {*grid.blocked, *placed} and shut.connected(shut.neighbours[cell]):
             placed.append(cell)
     return tuple(sorted(placed))
 

@@ -45,6 +45,9 @@ def demo(
     seed: Annotated[int, typer.Option(min=0, help="Draws starts, goals, boxes and errors.")] = 0,
     timeout: Annotated[float, typer.Option(min=1, help="Seconds for a headless run.")] = TIMEOUT,
     report: Annotated[Path | None, typer.Option(help="File for the report of a headless run (JSON).")] = None,
+    blocked_cells: Annotated[
+        int, typer.Option(min=0, help="Block so many cells in a headless run; fewer where goals need them.")
+    ] = 1,
     world: Annotated[
         Path | None, typer.Option(help="Drive on this map (MovingAI .map).", exists=True, dir_okay=False)
     ] = None,
@@ -99,6 +102,7 @@ def demo(
                 core=core,
                 core_uri=core_uri,
                 machines=machines,
+                blocked_cells=blocked_cells,
             )
             show = typer.echo if verbose else _show_warning
             if headless:

@@ -66,7 +66,9 @@ class _Run:
     async def perform(self, stage: Stage) -> None:
         async with aiohttp.ClientSession() as session:
             station = StationApi(session, stage.page)
-            self.mission = Mission(station, self._play.scenario, stage.truth, self._say)
+            self.mission = Mission(
+                station, self._play.scenario, stage.truth, self._say, self._play.blocked_cells
+            )
             try:
                 await self.mission.run()
             finally:

@@ -1,4 +1,4 @@
-"""The headless run: every robot gets a goal, a cell is blocked under way, and all have to arrive."""
+"""The headless run: every robot gets a goal, cells are blocked under way, and all have to arrive."""
 
 from __future__ import annotations
 
@@ -30,12 +30,13 @@ class Mission:
         scenario: Robots and their goals.
         truth: Says what truly happens in the world.
         say: Gets lines for people.
+        blocked_cells: How many cells are blocked under way, where that leaves every goal in reach.
 
     Attributes:
         goals: Goal of each robot.
         reached: Robots that stand at their goals, by the planner's word and in truth.
         replans: How often each robot got a new path.
-        block: The cell that is blocked under way.
+        block: The cells that are blocked under way.
     """
 
     def __init__(
@@ -44,11 +45,12 @@ class Mission:
         scenario: Scenario,
         truth: Callable[[], WorldReport | None],
         say: Callable[[str], None],
+        blocked_cells: int = 1,
     ) -> None:
         self.goals = dict(zip(scenario.robots, scenario.goals, strict=True))
         self.reached: set[str] = set()
         self.replans = dict.fromkeys(scenario.robots, 0)
-        self.block = MidwayBlock(scenario.grid, self.goals)
+        self.block = MidwayBlock(scenario.grid, self.goals, blocked_cells)
         self._station = station
         self._truth = truth
         self._say = say
@@ -123,14 +125,14 @@ class Mission:
             goal = self.goals.get(robot.id)
             if goal is not None and robot.goal != goal:
                 await self._wish(self._station.set_goal(robot.id, goal))
-        cell = self.block.done
-        if cell is not None and cell not in {*fleet.blocked, *fleet.pending}:
-            await self._wish(self._station.block(cell, blocked=True))
+        for cell in self.block.done:
+            if cell not in {*fleet.blocked, *fleet.pending}:
+                await self._wish(self._station.block(cell, blocked=True))
 
     async def _block(self, fleet: FleetModel, truth: WorldReport) -> None:
         if not any(robot.distance_m > UNDER_WAY for robot in truth.robots):
             return
-        block, was_under_way = self.block, self.block.under_way
+        block, done = self.block, len(self.block.done)
         match block.look(fleet, truth.boxes, time.monotonic()):
             case Step.BLOCK:
                 on_path = [robot.id for robot in fleet.robots if block.cell in robot.plan]
@@ -138,9 +140,9 @@ class Mission:
                 if not await self._wish(self._station.block(block.cell, blocked=True)):
                     block.refused()
             case Step.FREE:
-                self._say(f"cell {block.cell} made nobody replan; freeing it")
+                self._say(f"freeing cell {block.cell}: no robot had to replan, or goals could not be reached")
                 await self._wish(self._station.block(block.cell, blocked=False))
-            case Step.NOTHING if was_under_way and block.done is not None:
+            case Step.NOTHING if len(block.done) > done:
                 self._say(f"cell {block.cell} is blocked, and holds a box")
 
     async def _wish(self, wish: Coroutine[Any, Any, None]) -> bool:

@@ -58,6 +58,7 @@ class Play:
         core: Which program is the core of the mode ``single``.
         core_uri: A ROS master that runs already and takes that program's place; none if empty.
         machines: What stands for the machines of the mode ``multi``.
+        blocked_cells: How many cells a headless run blocks while robots drive.
     """
 
     scenario: Scenario
@@ -69,6 +70,7 @@ class Play:
     core: CoreKind = CoreKind.RCE
     core_uri: str = ""
     machines: Machines = Machines.AUTO
+    blocked_cells: int = 1
 
     @property
     def account(self) -> Account:

@@ -59,6 +59,7 @@ class Result:
         """The report."""
         truth, mission, counters = self.truth, self.mission, self.counters
         scenario = self.scenario
+        blocked = [] if mission is None else mission.block.done
         distances = {} if truth is None else {robot.id: robot.distance_m for robot in truth.robots}
         return {
             "ok": self.ok,
@@ -81,7 +82,8 @@ class Result:
                 "messages": None if counters is None else counters.messages,
                 "dropped": None if counters is None else counters.dropped,
             },
-            "blocked_cell": None if mission is None else mission.block.done,
+            "blocked_cell": blocked[0] if blocked else None,
+            "blocked_cells": blocked,
             "seed": self.seed,
             "faults": self.faults,
         }

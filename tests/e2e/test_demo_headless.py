@@ -76,6 +76,27 @@ async def test_a_public_benchmark_map(rce_data: Path) -> None:
     assert (first["start_cell"], first["goal_cell"]) == (16 * 32 + 5, 24 * 32 + 31)
 
 
+RING = ["type octile", "height 3", "width 9", "map", ".........", ".@@@@@@@.", "........."]
+"""One lane around a wall: two robots with opposite ways pass on the two sides, if none of them is blocked."""
+
+
+@pytest.mark.timeout(240)
+@pytest.mark.parametrize("cells", [0, 2])
+async def test_blocked_cells_never_cut_off_a_goal(tmp_path: Path, cells: int) -> None:
+    world, scen = tmp_path / "ring.map", tmp_path / "ring.scen"
+    world.write_text("\n".join(RING) + "\n")
+    rows = [(1, 0, 7, 2), (7, 2, 1, 0)]
+    scen.write_text(
+        "version 1\n" + "".join(f"0\tring.map\t9\t3\t{x}\t{y}\t{u}\t{v}\t8\n" for x, y, u, v in rows)
+    )
+    code, report, text = await run_headless(
+        *("--world", world, "--scen", scen, "--robots", 2, "--blocked-cells", cells), timeout=TIMEOUT_S
+    )
+    assert code == 0, text
+    assert report["blocked_cells"] == []
+    assert all(robot["reached"] for robot in report["robots"])
+
+
 @pytest.mark.timeout(120)
 async def test_a_run_that_is_too_short_says_so() -> None:
     code, report, text = await run_headless("--robots", 1, timeout=1)

@@ -20,9 +20,9 @@ def test_the_middle_of_the_path_is_blocked_and_its_effect_seen() -> None:
     around = robot("a", cell=0, goal=3, plan=[0, 4, 5, 6, 7, 3], replans=1)
     assert block.look(fleet(around, pending=[cell]), (), 0.5) is Step.NOTHING
     assert block.look(fleet(around, blocked=[cell]), (), 0.7) is Step.NOTHING
-    assert block.done is None, "the box is not there yet"
+    assert not block.done, "the box is not there yet"
     assert block.look(fleet(around, blocked=[cell]), (cell,), 0.9) is Step.NOTHING
-    assert block.done == cell
+    assert block.done == [cell]
     assert not block.under_way
     assert block.look(fleet(robot("a", cell=0, goal=3, plan=ROW)), (), 9.0) is Step.NOTHING
 
@@ -75,3 +75,50 @@ def test_a_refused_cell_is_chosen_anew() -> None:
     block.refused()
     assert not block.under_way
     assert block.look(driving, (), 0.2) is Step.BLOCK
+
+
+RING = GridMap(rows=3, columns=5, blocked=frozenset({6, 7, 8}))
+"""One lane around a wall; with a cell of it blocked, robots cannot pass one another any more."""
+
+
+def test_no_cell_is_blocked_that_robots_need_to_pass_one_another() -> None:
+    block = MidwayBlock(RING, {"a": 14, "b": 0})
+    driving = fleet(
+        robot("a", cell=0, goal=14, plan=[0, 1, 2, 3, 4, 9, 14]),
+        robot("b", cell=14, goal=0, plan=[14, 13, 12, 11, 10, 5, 0]),
+    )
+    assert block.look(driving, (), 0.0) is Step.NOTHING
+    alone = MidwayBlock(RING, {"a": 14})
+    assert alone.look(fleet(robot("a", cell=0, goal=14, plan=[0, 1, 2, 3, 4, 9, 14])), (), 0.0) is Step.BLOCK
+
+
+def test_a_cell_that_came_to_cut_off_a_goal_is_freed() -> None:
+    block = MidwayBlock(RING, {"a": 4, "b": 3})
+    driving = (
+        robot("a", cell=0, goal=4, plan=[0, 1, 2, 3, 4], granted=[0]),
+        robot("b", cell=10, goal=3, plan=[10, 5, 0, 1, 2, 3], granted=[10]),
+    )
+    assert block.look(fleet(*driving), (), 0.0) is Step.BLOCK
+    cell = block.cell
+    crossed = (
+        robot("a", cell=4, goal=4, plan=[], replans=1),
+        robot("b", cell=13, goal=3, plan=[], replans=1),
+    )
+    assert block.look(fleet(*crossed, blocked=[cell]), (cell,), 1.0) is Step.FREE
+    assert block.cell == cell
+    assert block.done == []
+
+
+def test_several_cells_are_blocked_one_after_another() -> None:
+    block = MidwayBlock(GRID, {"a": 3}, count=2)
+    assert block.look(fleet(robot("a", cell=0, goal=3, plan=ROW)), (), 0.0) is Step.BLOCK
+    first = block.cell
+    around = robot("a", cell=0, goal=3, plan=[0, 4, 5, 6, 7, 3], replans=1)
+    block.look(fleet(around, blocked=[first]), (first,), 0.5)
+    assert block.look(fleet(around, blocked=[first]), (first,), 0.6) is Step.BLOCK
+    second = block.cell
+    assert second != first
+    further = robot("a", cell=0, goal=3, plan=[0, 4, 8, 9, 10, 11, 7, 3], replans=2)
+    block.look(fleet(further, blocked=[first, second]), (first, second), 0.9)
+    assert block.done == [first, second]
+    assert block.look(fleet(further, blocked=[first, second]), (first, second), 1.0) is Step.NOTHING

@@ -94,7 +94,7 @@ async def test_a_robot_is_sent_a_cell_is_blocked_and_it_arrives() -> None:
     await asyncio.wait_for(mission.run(), 5)
     assert station.goals == [("Robot1", 3)]
     (blocked,) = station.blocks
-    assert blocked == (mission.block.done, True)
+    assert blocked == (mission.block.done[0], True)
     assert mission.reached == {"Robot1"}
     assert mission.replans == {"Robot1": 1}
     ended = mission.duration
@@ -114,8 +114,16 @@ async def test_a_planner_that_was_restarted_is_told_again() -> None:
     mission = make(station)
     await asyncio.wait_for(mission.run(), 5)
     assert station.goals == [("Robot1", 3)] * 2
-    assert station.blocks == [(mission.block.done, True)] * 2
+    assert station.blocks == [(mission.block.done[0], True)] * 2
     assert mission.replans["Robot1"] == 2, "what the first planner counted is not forgotten"
+
+
+async def test_no_cell_is_blocked_when_none_is_asked_for() -> None:
+    station = PlayedStation()
+    mission = Mission(station, SCENARIO, station.truth, lambda _: None, blocked_cells=0)  # type: ignore[arg-type]
+    await asyncio.wait_for(mission.run(), 5)
+    assert station.blocks == []
+    assert mission.block.done == []
 
 
 async def test_a_refused_block_is_tried_again() -> None:
@@ -123,7 +131,7 @@ async def test_a_refused_block_is_tried_again() -> None:
     station.refuse_blocks = 2
     mission = make(station)
     await asyncio.wait_for(mission.run(), 5)
-    assert mission.block.done is not None
+    assert len(mission.block.done) == 1
 
 
 async def test_the_planners_word_is_not_enough() -> None:

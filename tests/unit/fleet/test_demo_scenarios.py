@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from rce.fleet.dijkstra import shortest_path
 from rce.fleet.exceptions import ScenarioError
 from rce.fleet.grid import GridMap
-from rce.fleet.scenario import given_scenario, make_scenario, midway_cell
+from rce.fleet.scenario import given_scenario, make_scenario, midway_cell, solvable
 
 
 @settings(max_examples=80, deadline=None)
@@ -39,6 +39,20 @@ def test_a_map_in_parts_is_used_in_its_largest_part_only() -> None:
     grid = GridMap(5, 8, blocked=frozenset(range(8, 16)))
     scenario = make_scenario(grid, 3, seed=1)
     assert min(*scenario.starts, *scenario.goals, *scenario.boxes) >= 16
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_boxes_on_one_lane_leave_robots_room_to_pass(seed: int) -> None:
+    ring = GridMap(3, 6, blocked=frozenset({7, 8, 9, 10}))
+    scenario = make_scenario(ring, 2, seed=seed)
+    assert set(scenario.known_boxes).isdisjoint(scenario.hidden_boxes)
+    assert solvable(ring.with_blocked(ring.blocked | scenario.boxes), scenario.starts, scenario.goals)
+
+
+def test_robots_that_can_never_pass_are_not_drawn() -> None:
+    scenario = make_scenario(GridMap(1, 12), 3, seed=1)
+    order = sorted(range(3), key=lambda robot: scenario.starts[robot])
+    assert [scenario.goals[robot] for robot in order] == sorted(scenario.goals)
 
 
 @pytest.mark.parametrize("robots", [0, 31, 100])
