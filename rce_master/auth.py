@@ -1,4 +1,4 @@
-"""Who may come in: passwords and bearer tokens."""
+"""Who may come in: passwords."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from argon2 import PasswordHasher
 from argon2.exceptions import InvalidHashError, VerificationError
 
 from rce_master.exceptions import TooManyFailures, TooManyLogins, WrongCredentials
-from rce_master.state.records import Token
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -30,8 +29,6 @@ HASH_WORKERS = 2
 """argon2 takes much memory and time on purpose; more at once would help an attacker only."""
 MAX_WAITING = 64
 """Unknown passwords that wait to be hashed; what comes then is told to try later, and holds nobody up."""
-TOKEN_LIFETIME_S = 30 * 24 * 3600.0
-TOKEN_PREFIX = "rce_"  # noqa: S105 - it marks a token, it is none
 
 
 def client_digest(password: str) -> str:
@@ -39,20 +36,15 @@ def client_digest(password: str) -> str:
     return hashlib.sha256(password.encode()).hexdigest()
 
 
-def token_digest(token: str) -> str:
-    """What is kept of a bearer token. It is random, so a plain hash is enough."""
-    return hashlib.sha256(token.encode()).hexdigest()
-
-
 class Authenticator:
-    """Checks passwords and tokens against the state's users.
+    """Checks passwords against the state's users.
 
     A password that was right once is known again by a keyed hash in memory, so that a whole fleet that
     reconnects at once costs one argon2 and not hundreds. Wrong ones are counted for each user: beyond a
     limit only a password that is known to be right is accepted for a while.
 
     Args:
-        tables: The state's tables, to read users and tokens from.
+        tables: The state's tables, to read users from.
         hasher: How passwords are hashed.
         clock: Seconds that never go back.
     """
@@ -114,31 +106,6 @@ class Authenticator:
         """
         async with self._turn(secrets.token_bytes(8)):
             return await asyncio.get_running_loop().run_in_executor(self._workers, self._hasher.hash, digest)
-
-    def bearer(self, token: str, now: float) -> User:
-        """Tell whose token it is.
-
-        Args:
-            token: As the client sent it.
-            now: Seconds since 1970.
-
-        Raises:
-            WrongCredentials: Unknown or expired.
-        """
-        record = self._tables.tokens.get(token_digest(token))
-        user = self._tables.users.get(record.user) if record else None
-        if record is None or user is None or record.expires <= now:
-            raise WrongCredentials("unknown or expired token; log in again")
-        return user
-
-    @staticmethod
-    def new_token(user: str, label: str, now: float, lifetime: float = TOKEN_LIFETIME_S) -> tuple[str, Token]:
-        """Make a bearer token: what the user gets, and what is kept of it."""
-        token = TOKEN_PREFIX + secrets.token_urlsafe(32)
-        record = Token(
-            digest=token_digest(token), user=user, label=label, created=now, expires=now + lifetime
-        )
-        return token, record
 
     def close(self) -> None:
         """Stop the worker threads."""

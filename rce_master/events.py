@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections import deque
 from itertools import islice
 from typing import TYPE_CHECKING
@@ -62,8 +63,18 @@ class EventLog:
         )
         self._next_id += 1
         self._events.append(event)
+        self.wake()
+
+    def wake(self) -> None:
+        """Wake all followers, to see whether they may still follow."""
         self._news.set()
         self._news = asyncio.Event()
+
+    async def wait_change(self, timeout: float) -> None:
+        """Wait for an event or a call of :meth:`wake`, at most ``timeout`` seconds."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout):
+                await self._news.wait()
 
     def since(self, id_: int, limit: int = CAPACITY) -> list[Event]:
         """List what came after an event, oldest first."""
@@ -81,9 +92,5 @@ class EventLog:
             At most a hundred events, oldest first; none if nothing came within ``timeout`` seconds.
         """
         if not self.since(id_, limit=1):
-            try:
-                async with asyncio.timeout(timeout):
-                    await self._news.wait()
-            except TimeoutError:
-                return []
+            await self.wait_change(timeout)
         return self.since(id_, limit=100)

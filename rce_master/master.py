@@ -23,6 +23,7 @@ from rce_master.realm import Realm
 from rce_master.reconciler import Reconciler
 from rce_master.state import commands
 from rce_master.state.records import User, UserRole
+from rce_master.tokens import Tokens
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 TICK_S = 0.5
+_ACCESS = ("users", "tokens")
+"""Tables that say who may follow what."""
 DEV_USER = "testUser"
 
 
@@ -92,12 +95,13 @@ class Master:
         lifetime = self._settings.token_lifetime
         self._contents = ContentStore(self._settings.state_dir / "bundles")
         packages = PackageOffice(realm, self._contents)
-        services = Services(realm, reconciler, authenticator, events, time.time, lifetime, packages)
+        tokens = Tokens(realm.tables)
+        services = Services(realm, reconciler, authenticator, events, time.time, lifetime, packages, tokens)
         try:
             async with asyncio.TaskGroup() as group:
                 workers = [
                     group.create_task(work)
-                    for work in (realm.run(), desk.run(), packages.run(), _tick(realm))
+                    for work in (realm.run(), desk.run(), packages.run(), tokens.run(realm), _tick(realm))
                 ]
                 try:
                     await self._serve(services, desk, on_ready)
@@ -157,6 +161,8 @@ async def _tick(realm: Realm) -> None:
 
 def _log_events(events: EventLog, changes: Changes) -> None:
     now = time.time()
+    if any(table in _ACCESS for table, _ in changes.written()):
+        events.wake()
     for happening in changes.happenings:
         events.add(happening, now)
         logger.info("%s %s %s", happening.kind, happening.subject, happening.text)

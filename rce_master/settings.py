@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 from rce.config.folders import default_state_dir
 from rce.config.settings import ANYWHERE
-from rce_master.auth import TOKEN_LIFETIME_S
 from rce_master.exceptions import MasterError
 from rce_master.state.settings import StateSettings
+from rce_master.tokens import TOKEN_LIFETIME_S
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -47,6 +47,10 @@ async def _interfaces(
     async with session.post(api / "login", json=login) as reply:
         token = (await reply.json())["token"]
     headers = {"Authorization": f"Bearer {token}"}
-    async with session.get(api / "interfaces", params={"user": user}, headers=headers) as reply:
-        found: list[dict[str, Any]] = (await reply.json())["interfaces"]
-        return found
+    try:
+        async with session.get(api / "interfaces", params={"user": user}, headers=headers) as reply:
+            found: list[dict[str, Any]] = (await reply.json())["interfaces"]
+            return found
+    finally:
+        async with session.delete(api / "login", headers=headers):
+            pass  # the token was given back

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable
 from http import HTTPStatus
 from typing import Any
 
 import aiohttp
 from yarl import URL
+
+_log = logging.getLogger(__name__)
 
 POLL_S = 1.0
 TIMEOUT = aiohttp.ClientTimeout(total=5)
@@ -34,21 +37,37 @@ class EngineWatch:
         self._last: dict[str, Any] = {}
 
     async def run(self) -> None:
-        """Watch until cancelled."""
+        """Watch until cancelled; then give the token back."""
         async with aiohttp.ClientSession(timeout=TIMEOUT, raise_for_status=True) as session:
-            while True:
-                try:
-                    state = await self._read(session)
-                except aiohttp.ClientResponseError as error:
-                    if error.status == HTTPStatus.UNAUTHORIZED:
-                        self._token = ""
-                    state = {"error": f"the master says {error.status}: {error.message}"}
-                except (aiohttp.ClientError, TimeoutError) as error:
-                    state = {"error": f"the master cannot be reached: {error}"}
-                if state != self._last:
-                    self._last = state
-                    self._on_state(state)
-                await asyncio.sleep(POLL_S)
+            try:
+                await self._watch(session)
+            finally:
+                await self._log_out(session)
+
+    async def _watch(self, session: aiohttp.ClientSession) -> None:
+        while True:
+            try:
+                state = await self._read(session)
+            except aiohttp.ClientResponseError as error:
+                if error.status == HTTPStatus.UNAUTHORIZED:
+                    self._token = ""
+                state = {"error": f"the master says {error.status}: {error.message}"}
+            except (aiohttp.ClientError, TimeoutError) as error:
+                state = {"error": f"the master cannot be reached: {error}"}
+            if state != self._last:
+                self._last = state
+                self._on_state(state)
+            await asyncio.sleep(POLL_S)
+
+    async def _log_out(self, session: aiohttp.ClientSession) -> None:
+        if not self._token:
+            return
+        headers = {"Authorization": f"Bearer {self._token}"}
+        try:
+            async with session.delete(self._api / "login", headers=headers):
+                self._token = ""
+        except (aiohttp.ClientError, TimeoutError) as error:
+            _log.info("the token of this station was not given back, it expires by itself: %s", error)
 
     async def _read(self, session: aiohttp.ClientSession) -> dict[str, Any]:
         if not self._token:

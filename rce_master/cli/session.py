@@ -1,16 +1,16 @@
-"""``rce login``, ``rce logout`` and ``rce token``."""
+"""``rce login`` and ``rce logout``."""
 
 from __future__ import annotations
 
+import contextlib
 import sys
-import time
 from typing import Annotated
 
 import typer
 
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
-from rce_master.cli.exceptions import NotLoggedIn
+from rce_master.cli.exceptions import ApiError, CliError
 
 DEFAULT_URL = "http://127.0.0.1:9000/"
 
@@ -30,10 +30,20 @@ async def _login(url: str, user: str, password: str) -> None:
         reply = await client.call(
             "POST", "/login", {"userID": user, "password": password, "label": "rce login"}
         )
+        await _give_back(url)
     file = credentials.save(
         credentials.Credentials(url=url, user=user, token=reply["token"], expires=reply["expires"])
     )
     typer.echo(f"logged in as {user} ({reply['role']}); the token is in {file}")
+
+
+async def _give_back(url: str) -> None:
+    """Give the token of the login until now back, if it is one at the same master."""
+    with contextlib.suppress(CliError, ApiError):  # none, unreadable or expired: nothing to give back
+        former = credentials.load()
+        if former.url == url:
+            async with ApiClient.of(former) as client:
+                await client.call("DELETE", "/login")
 
 
 def logout() -> None:
@@ -46,18 +56,6 @@ async def _logout() -> None:
         await client.call("DELETE", "/login")
     credentials.forget()
     typer.echo("logged out")
-
-
-def token() -> None:
-    """Print the token, for use by other programs: curl -H "Authorization: Bearer $(rce token)" ..."""
-    run(_token())
-
-
-async def _token() -> None:
-    found = credentials.load()
-    if found.expires <= time.time():
-        raise NotLoggedIn
-    typer.echo(found.token)
 
 
 def read_password(*, from_stdin: bool, confirm: bool = False, what: str = "Password") -> str:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from rce_master.auth import Authenticator, client_digest, token_digest
+from rce_master.auth import client_digest
 from rce_master.exceptions import Forbidden, Invalid, NotFound, WrongCredentials
 from rce_master.http import models
 from rce_master.http.routes import Call, RouteTable
 from rce_master.http.views import Views
 from rce_master.state import commands
 from rce_master.state.records import User, UserRole
+from rce_master.tokens import new_token, token_digest
 
 routes = RouteTable("account")
 
@@ -19,9 +20,18 @@ async def log_in(call: Call) -> models.TokenOut:
     body = call.read(models.LoginIn)
     services = call.services
     user = await services.authenticator.verify(body.userID, client_digest(body.password))
-    token, record = Authenticator.new_token(user.name, body.label, services.clock(), services.token_lifetime)
-    await services.realm.submit(commands.AddToken(token=record))
-    return models.TokenOut(token=token, userID=user.name, role=user.role.value, expires=record.expires)
+    lifetime = min(body.lifetime or services.token_lifetime, services.token_lifetime)
+    token, record = new_token(user.name, body.label, services.clock(), lifetime)
+    # What was used lately must not make room for this one.
+    uses = services.tokens.uses()
+    _, outcome = await services.realm.submit_all(
+        [uses, commands.AddToken(token=record, password=user.password)]
+    )
+    if outcome is not None:
+        raise outcome
+    return models.TokenOut(
+        token=token, userID=user.name, role=user.role.value, expires=record.expires, id=record.id
+    )
 
 
 @routes.route("DELETE", "/login", "Forget the token that this request carries", status=204)

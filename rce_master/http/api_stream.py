@@ -5,19 +5,17 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from enum import Enum
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import msgspec
 from aiohttp import web
 
 from rce.control.logs import LogLevel, LogStream, LogWish
 from rce.web.openapi import Query
+from rce_master.events import Event
 from rce_master.exceptions import Invalid
 from rce_master.http import models
-from rce_master.http.routes import OF_USER, Call, RouteTable
-
-if TYPE_CHECKING:
-    from rce_master.events import Event
+from rce_master.http.routes import ENDED, OF_USER, Call, RouteTable
 
 routes = RouteTable("stream")
 
@@ -123,6 +121,7 @@ async def stream_events(call: Call) -> web.StreamResponse:
         while True:
             news = await events.wait(last, HEARTBEAT_S)
             if not call.is_still_valid:
+                await response.write(_frame(_farewell(call, last)))
                 return response
             # A comment now and then keeps proxies from giving up, and finds out that a client is gone.
             mine = [event for event in news if scope in (None, event.user) and event.time >= born]
@@ -139,6 +138,18 @@ def _start(call: Call) -> int:
     if _EVENT_ID.fullmatch(resumed):
         return int(resumed)
     return call.number("since", call.services.events.last_id)
+
+
+def _farewell(call: Call, last: int) -> Event:
+    """Return the last event of a stream whose caller may not follow it any more."""
+    return Event(
+        id=last,
+        time=call.services.clock(),
+        kind="stream_ended",
+        user=call.caller.name,
+        subject=call.caller.name,
+        text=ENDED,
+    )
 
 
 def _frame(event: Event) -> bytes:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
-
 from aiohttp import web
 
 from rce.web.openapi import Query
 from rce_master.exceptions import Invalid
-from rce_master.http.routes import OF_USER, Call, RouteTable
+from rce_master.http.routes import ENDED, OF_USER, Call, RouteTable
 from rce_master.http.usage_models import UsageOut
 from rce_master.http.usage_views import UsageViews
 
@@ -52,8 +50,8 @@ async def stream_usage(call: Call) -> web.StreamResponse:
     try:
         await response.write(_frame(_usage(call, scope)))
         while True:
-            await asyncio.sleep(interval)
-            if not call.is_still_valid:
+            if not await call.lasts(interval):
+                await response.write(b": %s\n\n" % ENDED.encode())
                 return response
             await response.write(_frame(_usage(call, scope)))
     except ConnectionResetError:

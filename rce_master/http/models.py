@@ -34,6 +34,28 @@ class LoginIn(_In):
     password: Annotated[str, Field(repr=False)]
     """The password itself, not its hash."""
     label: Annotated[str, Field(max_length=128)] = ""
+    lifetime: Annotated[float, Field(ge=0)] = 0.0
+    """Seconds for which the token is to be good, at most as long as the master gives; 0: so long."""
+
+
+class RobotTokenIn(_In):
+    """A robot that is to have a token of its own."""
+
+    robot: Annotated[str, Field(max_length=256)]
+    label: Annotated[str, Field(max_length=128)] = ""
+    days: Annotated[float, Field(ge=0, le=36500)] = 0.0
+    """For how long it is good; 0: until it is revoked."""
+    replace: bool = False
+    """Take the place of the token that the robot has."""
+
+
+class ScopedTokenIn(_In):
+    """A token for a program that may do one thing."""
+
+    scope: Annotated[str, Field(pattern="^metrics$")]
+    label: Annotated[str, Field(max_length=128)] = ""
+    days: Annotated[float, Field(ge=0, le=36500)] = 0.0
+    """For how long it is good; 0: until it is revoked."""
 
 
 class UserIn(_In):
@@ -138,7 +160,37 @@ class TokenOut(BaseModel):
     userID: str  # noqa: N815 - its name everywhere in the protocol
     role: str
     expires: float
+    """Seconds since 1970; 0: never."""
+    id: str = ""
+    """By which it is listed and revoked; no secret."""
+    scope: str = ""
+    """What it is good for: all that the user may do (empty), ``robot:ID`` or ``metrics``."""
+
+
+class TokenListed(BaseModel):
+    """A token, without the text that it is used by."""
+
+    id: str
+    user: str
+    label: str
+    scope: str
+    """What it is good for: all that the user may do (empty), ``robot:ID`` or ``metrics``."""
+    robot: str
+    """The only robot that it is good for; else empty."""
+    created: float
     """Seconds since 1970."""
+    expires: float
+    """Seconds since 1970; 0: never."""
+    used: float
+    """When it was last used, in seconds since 1970; 0: never."""
+    current: bool
+    """Whether this request carries it."""
+
+
+class TokensOut(BaseModel):
+    """Tokens."""
+
+    tokens: list[TokenListed]
 
 
 class UserOut(BaseModel):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
@@ -23,8 +24,14 @@ if TYPE_CHECKING:
     from rce_master.realm import Realm
     from rce_master.reconciler import Reconciler
     from rce_master.state.records import User
+    from rce_master.tokens import Tokens
 
 M = TypeVar("M", bound=BaseModel)
+
+ACCESS_CHECK_S = 15.0
+"""How long after its expiry a token may still keep a stream open."""
+ENDED = "your access ended: the token was revoked or expired, or the user was changed; log in again"
+"""What streams say last when they end for that."""
 
 _NUMBER = re.compile(r"-?[0-9]{1,18}")
 
@@ -42,6 +49,7 @@ class Services:
     token_lifetime: float
     """Seconds."""
     packages: PackageOffice
+    tokens: Tokens
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +78,21 @@ class Call:
     def is_still_valid(self) -> bool:
         """Whether the caller could ask for the same now; for answers that go on for long."""
         try:
-            return self.services.authenticator.bearer(self.token, self.services.clock()) == self.user
+            user, _ = self.services.tokens.find(self.token)
         except WrongCredentials:
             return False
+        return user == self.user
+
+    async def lasts(self, seconds: float) -> bool:
+        """Wait; return False as soon as the caller could not ask for the same any more."""
+        loop = asyncio.get_running_loop()
+        end = loop.time() + seconds
+        while self.is_still_valid:
+            left = end - loop.time()
+            if left <= 0:
+                return True
+            await self.services.events.wait_change(min(left, ACCESS_CHECK_S))
+        return False
 
     @property
     def owner(self) -> str:

@@ -32,6 +32,7 @@ from rce_master.http import (
     api_packages,
     api_read,
     api_stream,
+    api_tokens,
     api_usage,
 )
 from rce_master.http.entry import Entry
@@ -53,6 +54,7 @@ MAX_BODY = 1 << 20
 
 ROUTES: list[Route] = [
     *api_account.routes,
+    *api_tokens.routes,
     *api_read.routes,
     *api_control.routes,
     *api_machines.routes,
@@ -119,7 +121,14 @@ def _bearer(request: web.Request, services: Services) -> tuple[str, User | None]
     kind, _, token = request.headers.get(hdrs.AUTHORIZATION, "").partition(" ")
     if kind.lower() != "bearer" or not token:
         return "", None
-    return token, services.authenticator.bearer(token.strip(), services.clock())
+    user, record = services.tokens.find(token.strip())
+    if record.robot:
+        raise Forbidden(
+            f"this token is good for robot {record.robot!r} only, not for the API; log in for one: rce login"
+        )
+    if record.scope:
+        raise Forbidden(f"this token is good for {record.scope} only; log in for another one: rce login")
+    return token.strip(), user
 
 
 def _health(services: Services) -> Handler:

@@ -47,9 +47,38 @@ class RemoveUser:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AddToken:
-    """Keep a bearer token; forgets expired ones of the same user."""
+    """Keep a bearer token; forgets expired ones of the same user, and a login too many."""
 
     token: Token
+    password: str = ""
+    """Stored hash of the password that was shown for it; refused if the user has another one by now."""
+    replaces: bool = False
+    """Of a robot's token: whether it takes the place of the one that is there."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoteTokenUses:
+    """Tokens were used."""
+
+    used: dict[str, float]
+    """By digest, in seconds since 1970."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RevokeToken:
+    """Forget a bearer token of a user; ends what was opened by it."""
+
+    user: str
+    id: str
+    """As :attr:`rce_master.state.records.Token.id`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RevokeRobotToken:
+    """Forget the token of a robot; ends the robot's session."""
+
+    user: str
+    robot: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,10 +168,14 @@ class FaultReported:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotLogin:
-    """A robot whose password was right wants to connect at a task set."""
+    """A robot that proved who it is wants to connect at a task set."""
 
     process: str
     id: str
+    credential: str = ""
+    """Digest of the token that it came with; empty: its user's password. Refused if it was revoked."""
+    password: str = ""
+    """Stored hash of the password that it came with; refused if the user has another one by now."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -300,6 +333,9 @@ Command: TypeAlias = (
     | RemoveUser
     | AddToken
     | RemoveToken
+    | NoteTokenUses
+    | RevokeToken
+    | RevokeRobotToken
     | AddPackageKey
     | RemovePackageKey
     | AddBundle

@@ -43,6 +43,11 @@ class User(Struct, frozen=True, kw_only=True):
     """Seconds since 1970."""
 
 
+TOKEN_ID_LENGTH = 12
+ROBOT_SCOPE = "robot:"
+METRICS_SCOPE = "metrics"
+
+
 class Token(Struct, frozen=True, kw_only=True):
     """A bearer token; only its digest is kept."""
 
@@ -52,7 +57,25 @@ class Token(Struct, frozen=True, kw_only=True):
     label: str
     created: float
     expires: float
-    """Seconds since 1970."""
+    """Seconds since 1970; 0: never."""
+    used: float = 0.0
+    """When it was last used, to the minute; 0: never."""
+    scope: str = ""
+    """What it is good for: all that its user may do (empty), or one of ``robot:ID`` and ``metrics``."""
+
+    @property
+    def id(self) -> str:
+        """What people call it by; it is no secret."""
+        return self.digest[:TOKEN_ID_LENGTH]
+
+    @property
+    def robot(self) -> str:
+        """The only robot ID that it is good for; empty: it is for other things."""
+        return self.scope.removeprefix(ROBOT_SCOPE) if self.scope.startswith(ROBOT_SCOPE) else ""
+
+    def is_expired(self, now: float) -> bool:
+        """Return whether it is worth nothing any more."""
+        return bool(self.expires) and self.expires <= now
 
 
 class PackageKey(Struct, frozen=True, kw_only=True):
@@ -139,6 +162,9 @@ class _Endpoint(Struct, frozen=True, kw_only=True):
 
 class Robot(_Endpoint, frozen=True, kw_only=True, tag=True):
     """A robot that logged in and is kept until its grace time is over."""
+
+    credential: str = ""
+    """Digest of the token that it last logged in by; empty: by its user's password."""
 
     @property
     def kind(self) -> EndpointKind:

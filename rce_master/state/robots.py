@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from rce.control.messages import TaskSetKind
 from rce.control.model import EndpointState, EndpointStatus
 from rce.protocol.names import EndpointId
-from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
+from rce_master.exceptions import Conflict, Forbidden, Invalid, LimitReached, NotFound
 from rce_master.state import endpoints
 from rce_master.state.lifecycle import RobotEvent, RobotSession, next_session
 from rce_master.state.records import Robot, RobotLive
@@ -25,8 +25,13 @@ def login(tx: Transaction, command: RobotLogin) -> None:
         name = EndpointId.parse(command.id)
     except ValueError as error:
         raise Invalid(str(error)) from None
-    if name.user not in tx.tables.users:
+    user = tx.tables.users.get(name.user)
+    if user is None:
         raise NotFound(f"there is no user {name.user!r}")
+    if command.credential and command.credential not in tx.tables.tokens:
+        raise Forbidden("the robot's token was revoked")
+    if command.password and command.password != user.password:
+        raise Forbidden("the password was changed")
     task_set = tx.tables.task_sets.get(command.process)
     if (
         task_set is None
@@ -39,7 +44,7 @@ def login(tx: Transaction, command: RobotLogin) -> None:
         _new(tx, name)
     elif not isinstance(there, Robot):
         raise Conflict(f"{name.tag!r} is a container of user {name.user!r}; a robot needs another robotID")
-    _enter(tx, command.id, command.process)
+    _enter(tx, command)
     tx.changes.answered = command.id
     tx.happen("robot_connected", command.id, f"at {command.process}")
 
@@ -52,7 +57,8 @@ def _new(tx: Transaction, name: EndpointId) -> None:
     tx.touch(str(name))
 
 
-def _enter(tx: Transaction, id_: str, process: str) -> None:
+def _enter(tx: Transaction, command: RobotLogin) -> None:
+    id_, process = command.id, command.process
     robot = tx.tables.robot(id_)
     assert robot is not None
     live = tx.tables.robot_live(id_)
@@ -61,9 +67,10 @@ def _enter(tx: Transaction, id_: str, process: str) -> None:
     if robot.task_set != process:
         if robot.task_set:
             endpoints.withdraw(tx, robot, "the robot connected elsewhere")
-        tx.put(replace(robot, task_set=process))
+        robot = replace(robot, task_set=process)
         tx.touch(id_)
         endpoints.touch_dialers(tx, id_)
+    tx.put(replace(robot, credential=command.credential))
     tx.put(replace(live, session=next_session(live.session, RobotEvent.LOGIN), since=tx.now, status=None))
 
 

@@ -40,6 +40,8 @@ class StateSettings:
     """Of one endpoint."""
     max_connections: int = 4000
     """Of one endpoint."""
+    max_tokens: int = 100
+    """Logins of one user; the one that was not used for longest makes room for a new one."""
     max_package_keys: int = 20
     """Of one user."""
     max_packages: int = 500

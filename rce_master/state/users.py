@@ -1,4 +1,4 @@
-"""Commands on users and tokens."""
+"""Commands on users."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from msgspec.structs import replace
 
 from rce.protocol.names import is_name
 from rce_master.exceptions import Conflict, Invalid, NotFound
-from rce_master.state import endpoints, packages, robots
+from rce_master.state import endpoints, packages, robots, tokens
 from rce_master.state.records import User, UserRole
 
 if TYPE_CHECKING:
     from rce_master.state.changes import Transaction
-    from rce_master.state.commands import AddToken, AddUser, RemoveToken, RemoveUser, SetPassword
+    from rce_master.state.commands import AddUser, RemoveUser, SetPassword
 
 
 def add_user(tx: Transaction, command: AddUser) -> None:
@@ -28,12 +28,18 @@ def add_user(tx: Transaction, command: AddUser) -> None:
 
 
 def set_password(tx: Transaction, command: SetPassword) -> None:
-    """Change a password; end the user's tokens and the sessions of their robots."""
+    """Change a password; end the user's logins, and the sessions of robots that came in by the password.
+
+    Tokens of robots and of programs stay: they were made so that the fleet does not hang on a password.
+    """
     user = _find(tx, command.name)
     tx.put(replace(user, password=command.password))
-    _forget_tokens(tx, user.name)
+    for token in tx.tables.tokens.by("user", user.name):
+        if not token.scope:
+            tokens.forget(tx, token, "the password was changed")
     for robot in tx.tables.robots(user.name):
-        robots.send_away(tx, robot, "the password was changed")
+        if not robot.credential:
+            robots.send_away(tx, robot, "the password was changed")
     tx.happen("user_password_changed", user.name, user=user.name)
 
 
@@ -45,27 +51,11 @@ def remove_user(tx: Transaction, command: RemoveUser) -> None:
         raise Conflict(f"{user.name!r} is the last administrator; make another one first")
     for endpoint in tx.tables.endpoints.by("user", user.name):
         endpoints.remove(tx, endpoint.id, "the user was removed")
-    _forget_tokens(tx, user.name)
+    for token in tx.tables.tokens.by("user", user.name):
+        tokens.forget(tx, token, "the user was removed")
     packages.forget_user(tx, user.name)
     tx.delete(tx.tables.users, user.name)
     tx.happen("user_removed", user.name, user="")
-
-
-def add_token(tx: Transaction, command: AddToken) -> None:
-    """Keep a token and forget what expired."""
-    token = command.token
-    _find(tx, token.user)
-    for old in tx.tables.tokens.by("user", token.user):
-        if old.expires <= token.created:
-            tx.delete(tx.tables.tokens, old.digest)
-    tx.put(token)
-
-
-def remove_token(tx: Transaction, command: RemoveToken) -> None:
-    """Forget a token."""
-    if command.digest not in tx.tables.tokens:
-        raise NotFound("there is no such token")
-    tx.delete(tx.tables.tokens, command.digest)
 
 
 def _find(tx: Transaction, name: str) -> User:
@@ -73,8 +63,3 @@ def _find(tx: Transaction, name: str) -> User:
     if user is None:
         raise NotFound(f"there is no user {name!r}")
     return user
-
-
-def _forget_tokens(tx: Transaction, user: str) -> None:
-    for token in tx.tables.tokens.by("user", user):
-        tx.delete(tx.tables.tokens, token.digest)

@@ -141,6 +141,7 @@ class Engine:
         self.folder = folder
         self.http_port, self.control_port, *rest = free_ports(3 + 2 * robots)
         self.runtime = runtime
+        self._token = ""
         self.container_link_port = rest[0]
         self.robot_ports = [tuple(rest[1 + 2 * i : 3 + 2 * i]) for i in range(robots)]
         self.env = {
@@ -198,6 +199,8 @@ class Engine:
         return True
 
     async def stop(self) -> None:
+        if self._token and self.master.running:
+            self._give_back()
         for program in reversed(self.programs):
             if program.running:
                 await program.stop()
@@ -213,7 +216,20 @@ class Engine:
             text = reply.read().decode()
             return json.loads(text) if "json" in reply.headers.get("Content-Type", "") else text
 
+    def _give_back(self) -> None:
+        """Log out, as every program does that logged in."""
+        headers = {"Authorization": f"Bearer {self._token}"}
+        request = urllib.request.Request(f"{self.url}api/v1/login", headers=headers, method="DELETE")
+        with contextlib.suppress(OSError), urllib.request.urlopen(request, timeout=10):
+            self._token = ""
+
     def token(self) -> str:
+        """Log in once; the token is good until the engine stops."""
+        if not self._token:
+            self._token = self._log_in()
+        return self._token
+
+    def _log_in(self) -> str:
         request = urllib.request.Request(
             f"{self.url}api/v1/login",
             data=json.dumps({"userID": "testUser", "password": "testUser"}).encode(),

@@ -30,6 +30,7 @@ class Played:
         app.router.add_get("/api/v1/fleet", self.fleet)
         app.router.add_put("/api/v1/{path:.*}", self.put)
         app.router.add_post("/api/v1/login", self.login)
+        app.router.add_delete("/api/v1/login", self.logout)
         app.router.add_get("/api/v1/interfaces", self.interfaces)
         return app
 
@@ -42,6 +43,10 @@ class Played:
 
     async def login(self, _: web.Request) -> web.Response:
         return self.answer or web.json_response({"token": "abc"})
+
+    async def logout(self, request: web.Request) -> web.Response:
+        self.heard.append(("logout", request.headers["Authorization"]))
+        return web.Response(status=204)
 
     async def interfaces(self, request: web.Request) -> web.Response:
         assert request.headers["Authorization"] == "Bearer abc"
@@ -111,8 +116,9 @@ async def test_nobody_there(server: TestServer, session: aiohttp.ClientSession) 
         await read_counters(url, "u", "p")
 
 
-async def test_counters_are_summed(server: TestServer) -> None:
+async def test_counters_are_summed_and_the_token_is_given_back(played: Played, server: TestServer) -> None:
     assert await read_counters(str(server.make_url("/")), "u", "p") == Counters(7, 1)
+    assert played.heard == [("logout", "Bearer abc")]
 
 
 async def test_a_refused_login(played: Played, server: TestServer) -> None:

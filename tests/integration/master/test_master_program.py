@@ -25,7 +25,8 @@ COMMANDS = {
     "user": "rce_master.cli.users:app",
     "login": "rce_master.cli.session:login",
     "logout": "rce_master.cli.session:logout",
-    "token": "rce_master.cli.session:token",
+    "robot": "rce_master.cli.tokens:robots",
+    "token": "rce_master.cli.tokens:tokens",
     "ps": "rce_master.cli.show:ps",
     "logs": "rce_master.cli.follow:logs",
     "events": "rce_master.cli.follow:events",
@@ -180,3 +181,24 @@ async def test_the_log_tells_no_secret_however_much_it_tells(tmp_path: Path) -> 
     assert [
         word for word in (secret, token, hashlib.sha256(b"testUser").hexdigest(), "argon2") if word in log
     ] == []
+
+
+async def test_tokens_are_listed_and_revoked_by_commands(tmp_path: Path) -> None:
+    async with master(tmp_path, "--dev") as url:
+        login = ("login", url, "--user", "testUser", "--password-stdin")
+        await rce(tmp_path, *login, text="testUser\n")
+        first = (await rce(tmp_path, "token")).strip()
+        await rce(tmp_path, *login, text="testUser\n")  # gives the first one back
+        listed = await rce(tmp_path, "token", "list")
+        assert listed.count("login") == 2, listed  # "this login", and its label
+        made = (await rce(tmp_path, "robot", "add", "R1")).split()[0]
+        assert made.startswith("rce_")
+        assert "robot:R1" in await rce(tmp_path, "robot", "list")
+        assert "has a token already" in await rce(tmp_path, "robot", "add", "R1", code=1)
+        await rce(tmp_path, "robot", "revoke", "R1")
+        assert "R1" not in await rce(tmp_path, "robot", "list")
+        id_ = (await rce(tmp_path, "token", "list")).splitlines()[1].split()[0]
+        await rce(tmp_path, "token", "revoke", id_)
+        assert "log in again" in await rce(tmp_path, "token", "list", code=1)
+        async with aiohttp.ClientSession(headers={"Authorization": f"Bearer {first}"}) as session:
+            assert (await session.get(f"{url}api/v1/user")).status == 401

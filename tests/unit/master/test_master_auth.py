@@ -84,35 +84,3 @@ async def test_a_changed_password_makes_the_old_one_worthless(gate: Gate) -> Non
     with pytest.raises(WrongCredentials):
         await gate.auth.verify("zoe", RIGHT)
     await gate.auth.verify("zoe", client_digest("new"))
-
-
-async def test_tokens_are_kept_as_digests_and_expire(gate: Gate) -> None:
-    token, record = gate.auth.new_token("zoe", "test", now=100.0)
-    gate.world.do(commands.AddToken(token=record))
-    assert token not in str(gate.world.state.tables.tokens[record.digest])
-    assert gate.auth.bearer(token, now=200.0).name == "zoe"
-    with pytest.raises(WrongCredentials):
-        gate.auth.bearer(token, now=record.expires)
-    with pytest.raises(WrongCredentials):
-        gate.auth.bearer("rce_guess", now=200.0)
-
-
-async def test_tokens_end_with_the_password_and_with_logging_out(gate: Gate) -> None:
-    token, record = gate.auth.new_token("zoe", "", now=0.0)
-    gate.world.do(commands.AddToken(token=record))
-    gate.world.do(commands.SetPassword(name="zoe", password="x"))
-    with pytest.raises(WrongCredentials):
-        gate.auth.bearer(token, now=1.0)
-    token, record = gate.auth.new_token("zoe", "", now=0.0)
-    gate.world.do(commands.AddToken(token=record))
-    gate.world.do(commands.RemoveToken(digest=record.digest))
-    with pytest.raises(WrongCredentials):
-        gate.auth.bearer(token, now=1.0)
-
-
-async def test_a_new_token_sweeps_out_expired_ones(gate: Gate) -> None:
-    _, old = gate.auth.new_token("zoe", "", now=0.0)
-    gate.world.do(commands.AddToken(token=old))
-    _, new = gate.auth.new_token("zoe", "", now=old.expires)
-    gate.world.do(commands.AddToken(token=new))
-    assert [t.digest for t in gate.world.state.tables.tokens] == [new.digest]

@@ -1,0 +1,132 @@
+"""``rce token`` and ``rce robot``: the tokens of logins, programs and robots."""
+
+from __future__ import annotations
+
+import time
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from rce_master.cli import credentials
+from rce_master.cli.client import ApiClient, run
+from rce_master.cli.exceptions import NotLoggedIn
+
+tokens = typer.Typer(invoke_without_command=True, help="Print, list, make and revoke tokens.")
+robots = typer.Typer(no_args_is_help=True, help="Give robots credentials of their own, and take them back.")
+
+OfUser = Annotated[str, typer.Option("--user", help="Whose; administrators only [yourself].")]
+Label = Annotated[str, typer.Option(help="What you call it.")]
+Days = Annotated[float, typer.Option(help="Days for which it is good; 0: until it is revoked.", min=0)]
+
+
+@tokens.callback()
+def token(context: typer.Context) -> None:
+    """Print the token, for use by other programs: curl -H "Authorization: Bearer $(rce token)" ..."""
+    if context.invoked_subcommand is None:
+        run(_print())
+
+
+async def _print() -> None:
+    found = credentials.load()
+    if found.expires <= time.time():
+        raise NotLoggedIn
+    typer.echo(found.token)
+
+
+@tokens.command("list")
+def list_tokens(user: OfUser = "") -> None:
+    """List your tokens, with expiry and last use."""
+    run(_list("/tokens", user))
+
+
+@tokens.command("new")
+def new_token(
+    metrics: Annotated[bool, typer.Option("--metrics", help="Good for reading /metrics only.")] = False,
+    label: Label = "",
+    days: Days = 0.0,
+) -> None:
+    """Make and print a token for a program."""
+    if not metrics:
+        raise typer.BadParameter("say what it is for: --metrics (for yourself, log in: rce login)")
+    run(_new("/tokens", {"scope": "metrics", "label": label, "days": days}, ""))
+
+
+@tokens.command("revoke")
+def revoke_tokens(
+    ids: Annotated[list[str], typer.Argument(metavar="ID...", help="As rce token list shows them.")],
+    user: OfUser = "",
+) -> None:
+    """Revoke tokens; what was opened by them ends."""
+    run(_revoke("/tokens", ids, user))
+
+
+@robots.command("add")
+def add_robot(
+    robot: Annotated[str, typer.Argument(help="The robot ID.")],
+    replace: Annotated[bool, typer.Option("--replace", help="In place of the token that it has.")] = False,
+    label: Label = "",
+    days: Days = 0.0,
+    user: OfUser = "",
+) -> None:
+    """Make and print a token that is good for this robot ID only: "token" in the robot's file."""
+    body = {"robot": robot, "label": label, "days": days, "replace": replace}
+    run(_new("/robot-tokens", body, user))
+
+
+@robots.command("list")
+def list_robots(user: OfUser = "") -> None:
+    """List the robots that have a token."""
+    run(_list("/robot-tokens", user))
+
+
+@robots.command("revoke")
+def revoke_robots(
+    names: Annotated[list[str], typer.Argument(metavar="ROBOT...", help="Robot IDs.")], user: OfUser = ""
+) -> None:
+    """Revoke robots' tokens; their sessions end."""
+    run(_revoke("/robot-tokens", names, user))
+
+
+async def _list(path: str, user: str) -> None:
+    async with ApiClient.of(credentials.load()) as client:
+        found = (await client.call("GET", path, query=_of(user)))["tokens"]
+    table = Table("id", "for", "label", "since", "expires", "last used", box=None)
+    for each in found:
+        table.add_row(
+            each["id"],
+            each["scope"] or ("this login" if each["current"] else "login"),
+            each["label"],
+            _day(each["created"]),
+            _day(each["expires"]),
+            _moment(each["used"]),
+        )
+    Console().print(table)
+
+
+async def _new(path: str, body: dict[str, Any], user: str) -> None:
+    async with ApiClient.of(credentials.load()) as client:
+        reply = await client.call("POST", path, body, query=_of(user))
+    typer.echo(reply["token"])
+    until = f"until {_day(reply['expires'])}" if reply["expires"] else "until it is revoked"
+    typer.echo(f"rce: good for {reply['scope']} of user {reply['userID']}, {until}; shown only now", err=True)
+
+
+async def _revoke(path: str, names: list[str], user: str) -> None:
+    async with ApiClient.of(credentials.load()) as client:
+        for name in names:
+            await client.call("DELETE", f"{path}/{name}", query=_of(user))
+            typer.echo(f"revoked {name}")
+
+
+def _of(user: str) -> dict[str, str | int]:
+    return {"user": user} if user else {}
+
+
+def _day(when: float) -> str:
+    return time.strftime("%Y-%m-%d", time.localtime(when)) if when else "never"
+
+
+def _moment(when: float) -> str:
+    return time.strftime("%Y-%m-%d %H:%M", time.localtime(when)) if when else "never"

@@ -1,0 +1,119 @@
+"""REST: tokens of logins, of robots and of programs."""
+
+from __future__ import annotations
+
+from rce.protocol.names import is_name
+from rce_master.exceptions import Forbidden, Invalid
+from rce_master.http import models
+from rce_master.http.routes import OF_USER, Call, RouteTable
+from rce_master.state import commands
+from rce_master.state.records import METRICS_SCOPE, ROBOT_SCOPE, Token
+from rce_master.tokens import new_token, token_digest
+
+routes = RouteTable("tokens")
+
+_DAY_S = 24 * 3600.0
+
+
+@routes.route("GET", "/tokens", "List a user's tokens", reply=models.TokensOut, query=(OF_USER,))
+async def list_tokens(call: Call) -> models.TokensOut:
+    """List tokens, never the texts that they are used by."""
+    return models.TokensOut(tokens=[_show(call, token) for token in _of(call)])
+
+
+@routes.route(
+    "POST",
+    "/tokens",
+    "Make a token for a program that may only read the metrics",
+    body=models.ScopedTokenIn,
+    reply=models.TokenOut,
+    status=201,
+    admin=True,
+)
+async def add_token(call: Call) -> models.TokenOut:
+    """Make a token with a scope."""
+    body = call.read(models.ScopedTokenIn)
+    return await _make(call, call.caller.name, body.label, METRICS_SCOPE, body.days)
+
+
+@routes.route(
+    "DELETE", "/tokens/{id}", "Revoke a token; ends what was opened by it", status=204, query=(OF_USER,)
+)
+async def revoke_token(call: Call) -> None:
+    """Revoke a token."""
+    await call.services.realm.submit(commands.RevokeToken(user=call.owner, id=call.path("id")))
+
+
+@routes.route(
+    "GET", "/robot-tokens", "List the tokens of a user's robots", reply=models.TokensOut, query=(OF_USER,)
+)
+async def list_robot_tokens(call: Call) -> models.TokensOut:
+    """List the robots that have a token."""
+    return models.TokensOut(tokens=[_show(call, token) for token in _of(call) if token.robot])
+
+
+@routes.route(
+    "POST",
+    "/robot-tokens",
+    "Make a token that is good for one robot ID only",
+    body=models.RobotTokenIn,
+    reply=models.TokenOut,
+    status=201,
+    query=(OF_USER,),
+)
+async def add_robot_token(call: Call) -> models.TokenOut:
+    """Make a robot's token."""
+    body = call.read(models.RobotTokenIn)
+    if not is_name(body.robot):
+        raise Invalid(
+            f"robot: {body.robot!r} is not a robot ID: use letters, digits and '_', beginning with a letter"
+        )
+    scope = ROBOT_SCOPE + body.robot
+    return await _make(call, call.owner, body.label, scope, body.days, replaces=body.replace)
+
+
+@routes.route(
+    "DELETE",
+    "/robot-tokens/{robot}",
+    "Revoke a robot's token; ends its session",
+    status=204,
+    query=(OF_USER,),
+)
+async def revoke_robot_token(call: Call) -> None:
+    """Revoke a robot's token."""
+    wanted = commands.RevokeRobotToken(user=call.owner, robot=call.path("robot"))
+    await call.services.realm.submit(wanted)
+
+
+async def _make(
+    call: Call, user: str, label: str, scope: str, days: float, *, replaces: bool = False
+) -> models.TokenOut:
+    services = call.services
+    owner = services.realm.tables.users.get(user)
+    if owner is None:
+        raise Forbidden(f"user {user!r} was removed meanwhile")
+    token, record = new_token(user, label, services.clock(), days * _DAY_S, scope=scope)
+    await services.realm.submit(commands.AddToken(token=record, replaces=replaces))
+    return models.TokenOut(
+        token=token, userID=user, role=owner.role.value, expires=record.expires, id=record.id, scope=scope
+    )
+
+
+def _of(call: Call) -> list[Token]:
+    now = call.services.clock()
+    found = call.services.realm.tables.tokens.by("user", call.owner)
+    return sorted((token for token in found if not token.is_expired(now)), key=lambda token: token.created)
+
+
+def _show(call: Call, token: Token) -> models.TokenListed:
+    return models.TokenListed(
+        id=token.id,
+        user=token.user,
+        label=token.label,
+        scope=token.scope,
+        robot=token.robot,
+        created=token.created,
+        expires=token.expires,
+        used=call.services.tokens.last_use(token),
+        current=token.digest == token_digest(call.token),
+    )

@@ -1,0 +1,75 @@
+"""Tokens over the REST API: listed, limited, revoked; what they opened ends."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+from rce_master.state.settings import StateSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from contextlib import AbstractAsyncContextManager
+
+    from integration.master.conftest import Site
+
+
+async def test_tokens_are_listed_without_their_text(site: Site) -> None:
+    await site.login()
+    listed = (await site.api("GET", "/tokens"))["tokens"]
+    assert [token["current"] for token in listed] == [True, False]
+    assert listed[0]["used"] > 0
+    assert listed[1]["used"] == 0
+    assert listed[0]["expires"] > listed[0]["created"]
+    assert site.token not in str(listed)
+
+
+async def test_revoked_token_ends_its_streams_with_reason(site: Site) -> None:
+    """Event streams and usage streams end at once, and say why."""
+    other = await site.login()
+    (other_id,) = [t["id"] for t in (await site.api("GET", "/tokens"))["tokens"] if not t["current"]]
+    headers = {"Authorization": f"Bearer {other}"}
+    async with (
+        site.session.get(f"{site.url}api/v1/events", headers=headers) as events,
+        site.session.get(f"{site.url}api/v1/usage/live?interval=3600", headers=headers) as usage,
+    ):
+        await events.content.readuntil(b"hello\n\n")
+        await usage.content.readuntil(b"\n\n")
+        await site.api("DELETE", f"/tokens/{other_id}", status=204)
+        async with asyncio.timeout(10):
+            said = await events.content.read(), await usage.content.read()
+    assert b"event: stream_ended" in said[0]
+    assert b"revoked or expired" in said[0]
+    assert b"revoked or expired" in said[1]
+    await site.api("GET", "/user", token=other, status=401)
+    await site.api("DELETE", f"/tokens/{other_id}", status=404)
+
+
+async def test_many_logins_keep_the_number_of_tokens_bounded(
+    run_site: Callable[..., AbstractAsyncContextManager[Site]],
+) -> None:
+    async with run_site(state=StateSettings(max_tokens=5)) as site:
+        for _ in range(20):
+            await site.login()
+            await site.api("GET", "/user")  # the one that is in use is never pushed out
+        assert len((await site.api("GET", "/tokens"))["tokens"]) == 5
+
+
+async def test_robot_token_is_not_for_the_api(site: Site) -> None:
+    made = await site.api("POST", "/robot-tokens", {"robot": "R1"}, status=201)
+    refusal = await site.api("GET", "/user", token=made["token"], status=403)
+    assert "good for robot 'R1' only" in refusal["error"]
+    assert (await site.api("GET", "/robot-tokens"))["tokens"][0]["robot"] == "R1"
+    await site.api("POST", "/robot-tokens", {"robot": "no name"}, status=422)
+    await site.api("DELETE", "/robot-tokens/R1", status=204)
+    await site.api("GET", "/user", token=made["token"], status=401)
+
+
+async def test_users_see_and_revoke_their_own_tokens_only(site: Site) -> None:
+    await site.api("POST", "/users", {"name": "anna", "password": "one"}, status=201)
+    anna = await site.login("anna", "one")
+    (own,) = (await site.api("GET", "/tokens", user="testUser"))["tokens"]
+    await site.api("GET", "/tokens", token=anna, status=403, user="testUser")
+    await site.api("DELETE", f"/tokens/{own['id']}", token=anna, status=404)
+    await site.api("POST", "/tokens", {"scope": "metrics"}, token=anna, status=403)
+    assert len((await site.api("GET", "/tokens", user="anna"))["tokens"]) == 1
