@@ -4,11 +4,14 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: help install demo test test-quick lint format bench lock clean
+PARALLEL := -n auto --dist loadgroup --durations=25
+
+.PHONY: help install demo test test-all test-quick lint format bench lock clean
 
 help:
 	@echo "make demo    engine, containers and a simulated fleet, with its web page"
 	@echo "make test    everything: linters, types, unit, integration and end-to-end tests"
+	@echo "make test-all  make test without linters and types        make test-quick  the unit tests"
 	@echo "make lint    ruff and mypy        make format   rewrite the layout"
 	@echo "make bench   measure              make lock     pin the dependencies anew"
 	@echo "make install only the set-up      make clean    remove what make made"
@@ -26,10 +29,13 @@ demo: install
 	@exec $(BIN)/rce demo $(ARGS)
 
 test: lint
-	$(BIN)/python -m pytest $(ARGS)
+	@$(MAKE) --no-print-directory test-all
+
+test-all: install
+	$(BIN)/python -m pytest $(PARALLEL) $(ARGS)
 
 test-quick: install
-	$(BIN)/python -m pytest tests/unit $(ARGS)
+	$(BIN)/python -m pytest -n logical --durations=5 tests/unit $(ARGS)
 
 lint: install
 	$(BIN)/ruff check .

@@ -21,6 +21,7 @@ import pytest
 
 REQUIRE_ALL = os.environ.get("RCE_REQUIRE_ALL") == "1"
 LEAK_PATIENCE_S = 3.0
+WORKERS_PER_CORE = 2
 
 # Nothing fails for being slow: not on a busy machine, nor at the first run, which makes hypothesis's tables.
 hypothesis.settings.register_profile(
@@ -168,6 +169,23 @@ def missing(tool: str) -> str | None:
     return None if check() else reason
 
 
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Remove the cgroups of test runs that were killed, once a run."""
+    from support.leaks import sweep_dead_cgroups
+
+    if not _is_worker(session.config):
+        sweep_dead_cgroups()
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    """Return how many tests run at once: most wait for processes and the clock half of their time."""
+    return WORKERS_PER_CORE * len(os.sched_getaffinity(0))
+
+
+def _is_worker(config: pytest.Config) -> bool:
+    return hasattr(config, "workerinput")
+
+
 def pytest_runtest_setup(item: pytest.Item) -> None:
     for marker in item.iter_markers("needs"):
         for tool in marker.args:
@@ -187,12 +205,11 @@ def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.Tes
     return report
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _no_cgroups_of_the_dead() -> None:
-    """Remove the cgroups of test runs that were killed."""
-    from support.leaks import sweep_dead_cgroups
-
-    sweep_dead_cgroups()
+@pytest.fixture
+def short_folder() -> Iterator[Path]:
+    """A folder for sockets: their paths have at most 107 bytes, and ``tmp_path`` is long in parallel runs."""
+    with tempfile.TemporaryDirectory(prefix="rce-", dir="/tmp") as name:
+        yield Path(name)
 
 
 @pytest.fixture(scope="session")

@@ -11,8 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from support.engine import Program, free_ports, running_engine, until
+from support.engine import Program, running_engine, until
 from support.leaks import Traces, sweep_cgroups
+from support.ports import free_ports
 from support.stranger import ask_for_echo, stranger
 
 pytestmark = [pytest.mark.e2e, pytest.mark.timeout(120)]

@@ -13,7 +13,8 @@ import aiohttp
 import psutil
 import pytest
 from support.demo import run_headless, running_demo
-from support.engine import engine_processes, free_ports, until
+from support.engine import engine_processes, until
+from support.ports import free_port
 
 from rce.ros.xmlrpc import RpcClient
 from rce_client.demo.exceptions import StationError
@@ -60,7 +61,7 @@ async def test_single_with_a_real_roscore() -> None:
 
 @pytest.mark.timeout(120)
 async def test_the_page_of_a_single_core_and_its_end() -> None:
-    options = ("--mode", "single", "--robots", 1, "--core-port", free_ports(1)[0], "--no-auto")
+    options = ("--mode", "single", "--robots", 1, "--core-port", free_port(), "--no-auto")
     async with running_demo(*options) as demo, aiohttp.ClientSession() as session:
         station = StationApi(session, demo.page)
 
@@ -119,7 +120,7 @@ async def test_machines_of_many_masters_share_only_what_they_must() -> None:
 @pytest.mark.timeout(200)
 @pytest.mark.parametrize("mode", ["single", "multi"])
 async def test_a_killed_planner_and_a_killed_move_client_come_back(mode: str) -> None:
-    options = ("--mode", mode, "--robots", 2, "--core-port", free_ports(1)[0], "--no-auto")
+    options = ("--mode", mode, "--robots", 2, "--core-port", free_port(), "--no-auto")
     async with running_demo(*options) as demo, aiohttp.ClientSession() as session:
         station = StationApi(session, demo.page)
         await until(lambda: _is(_state(station), "idle"), timeout=40, what="the robot is in its place")
@@ -192,7 +193,7 @@ async def _state(station: StationApi) -> str:
 async def test_nothing_is_left_when_the_demo_is_killed(mode: str) -> None:
     interfaces = set(psutil.net_if_addrs())
     async with running_demo(
-        *("--mode", mode, "--robots", 2, "--core-port", free_ports(1)[0], "--no-auto")
+        *("--mode", mode, "--robots", 2, "--core-port", free_port(), "--no-auto")
     ) as demo:
         children = psutil.Process(demo.process.pid).children(recursive=True)
         assert len(children) >= 6

@@ -14,8 +14,9 @@ from pathlib import Path
 
 import psutil
 import pytest
-from support.engine import Program, engine_processes, free_ports, until
+from support.engine import Program, engine_processes, until
 from support.leaks import sweep_cgroups
+from support.ports import free_ports
 from support.stranger import check_echo, stranger, wire_echo
 
 pytestmark = [pytest.mark.e2e, pytest.mark.timeout(120)]

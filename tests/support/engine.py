@@ -6,10 +6,8 @@ import asyncio
 import contextlib
 import json
 import os
-import random
 import shutil
 import signal
-import socket
 import sys
 import tempfile
 import urllib.request
@@ -20,20 +18,10 @@ from typing import Any
 import psutil
 
 from support.leaks import sweep_cgroups
+from support.ports import free_ports
 
 READY_TIMEOUT_S = 30.0
 STOP_TIMEOUT_S = 30.0
-
-
-def free_ports(count: int) -> list[int]:
-    """Find TCP ports that nobody uses now, below those that the system gives to outgoing connections."""
-    found: list[int] = []
-    while len(found) < count:
-        port = random.randrange(15_000, 32_000)
-        with contextlib.suppress(OSError), socket.create_server(("127.0.0.1", port)):
-            if port not in found:
-                found.append(port)
-    return found
 
 
 async def until(

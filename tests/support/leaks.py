@@ -156,11 +156,10 @@ def sweep_cgroups(folder: Path) -> list[Path]:
 def sweep_dead_cgroups() -> None:
     """Remove what killed test runs left: cgroups of task sets with nothing in them for long.
 
-    Those of task sets that run are not harmed: they make theirs again with their next container.
+    Younger ones may be those of a test run beside this one.
     """
     for cgroup in task_set_cgroups():
-        cells = files.children(cgroup)
-        for one in (*filter(_is_old, cells), cgroup):
+        for one in filter(_is_old, (*files.children(cgroup), cgroup)):
             with contextlib.suppress(OSError):
                 one.rmdir()
 

@@ -16,7 +16,7 @@ from rce.ros.multimaster.filters import SyncLists
 from rce.ros.multimaster.settings import DiscoverySettings
 from rce.ros.multimaster.sync import MasterSync, SyncSettings
 from rce.ros.node import Node
-from support.engine import free_ports
+from support.ports import free_port
 
 STRING = "std_msgs/String"
 FAST = 10.0
@@ -31,14 +31,14 @@ class Neighbourhood:
     """Masters of one test share a multicast port that no other test uses."""
 
     def __init__(self) -> None:
-        self.port = free_ports(1)[0]
+        self.port = free_port()
 
     def settings(self, master_uri: str, **more: object) -> DiscoverySettings:
         values = {
             "master_uri": master_uri,
             "mcast_group": "226.0.0.0@127.0.0.1",
             "mcast_port": self.port,
-            "rpc_port": free_ports(1)[0],
+            "rpc_port": free_port(),
             "heartbeat_hz": FAST,
             "rosmaster_hz": FAST,
         }
@@ -118,7 +118,7 @@ async def process(*argv: str, env: dict[str, str]) -> AsyncIterator[asyncio.subp
 @asynccontextmanager
 async def real_master(home: Path, port: int | None = None) -> AsyncIterator[str]:
     """A ``rosmaster --core``; yields its URI."""
-    port = port or free_ports(1)[0]
+    port = port or free_port()
     uri = f"http://127.0.0.1:{port}/"
     async with process("/usr/bin/rosmaster", "--core", "-p", str(port), env=ros_environment(uri, home)):
         async with asyncio.timeout(30):

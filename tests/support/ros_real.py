@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import os
 import signal
-import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import psutil
 from rce.ros.core import Core
 from rce.ros.errors import XmlRpcError
 from rce.ros.xmlrpc import RpcClient
+from support.ports import free_port
 
 PATIENCE_S = 45.0
 """Seconds that a program of a real ROS may take: some start slowly."""
@@ -155,13 +155,6 @@ async def end(process: asyncio.subprocess.Process, number: signal.Signals) -> No
         for child in family:
             with contextlib.suppress(psutil.NoSuchProcess):
                 child.kill()
-
-
-def free_port() -> int:
-    """A port that nobody uses now."""
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port: int = taken.getsockname()[1]
-    return port
 
 
 @contextlib.asynccontextmanager

@@ -13,7 +13,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
-from support.engine import free_ports
+from support.ports import free_ports
 
 from rce.config.client import loads
 from rce.ros.core import Core

@@ -6,7 +6,8 @@ import asyncio
 from typing import TYPE_CHECKING
 
 import pytest
-from support.ros_real import GRAPHS, free_port
+from support.ports import free_port
+from support.ros_real import GRAPHS
 
 from rce.ros.node import Node
 from tests.integration.client.test_ros_bridge import EMPTY, STRING, config, program, ros_string, write

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import socket
 from collections import Counter
 from typing import TYPE_CHECKING
 
 import pytest
+from support.ports import free_port
 from websockets.asyncio.client import connect
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -132,12 +132,6 @@ def hello() -> Hello:
 
 def headers(secret: str = SECRET.reveal()) -> dict[str, str]:
     return {"Authorization": f"Bearer {secret}"}
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 async def test_hello_welcome_sync_and_messages_both_ways() -> None:

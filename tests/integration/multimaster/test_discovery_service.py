@@ -8,8 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from support.engine import Program, free_ports
+from support.engine import Program
 from support.multimaster import STRING, Neighbourhood, node
+from support.ports import free_ports
 
 from rce.ros.core import Core
 from rce.ros.errors import MasterUnreachable

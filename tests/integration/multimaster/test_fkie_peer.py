@@ -10,8 +10,8 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
-from support.engine import free_ports
 from support.multimaster import STRING, Neighbourhood, node
+from support.ports import free_ports
 
 from rce.ros.core import Core
 

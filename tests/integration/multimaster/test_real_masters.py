@@ -10,8 +10,8 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
-from support.engine import free_ports
 from support.multimaster import STRING, Neighbourhood, node, process, real_master, ros_environment
+from support.ports import free_port, free_ports
 
 TALKER = """
 import rospy
@@ -202,7 +202,7 @@ async def _discovery_process(
         "-c",
         "import typer; from rce.cli.discovery import discovery; typer.run(discovery)",
         *("--master-uri", uri, "--mcast-group", "226.0.0.0@127.0.0.1", "--mcast-port", str(mcast_port)),
-        *("--heartbeat-hz", "10", "--rpc-port", str(free_ports(1)[0]), *more),
+        *("--heartbeat-hz", "10", "--rpc-port", str(free_port()), *more),
         stdout=asyncio.subprocess.DEVNULL,
     )
     try:

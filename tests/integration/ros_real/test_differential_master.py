@@ -20,7 +20,8 @@ from xmlrpc.client import Fault, ServerProxy
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from support.ros_real import free_port, ros_environment
+from support.ports import free_port
+from support.ros_real import ros_environment
 
 from rce.ros.core import Graph
 

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from support.ros_real import Graph, free_port
+from support.ports import free_port
+from support.ros_real import Graph
 
 from rce.ros.node import Node
 

@@ -10,7 +10,8 @@ from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 import pytest
-from support.ros_real import Graph, free_port, our_graph
+from support.ports import free_port
+from support.ros_real import Graph, our_graph
 
 from rce.ros.errors import ServiceFault
 from rce.ros.node import Node

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.ros_real import Graph, free_port
+from support.ports import free_port
+from support.ros_real import Graph
 
 from rce.ros.node import Node
 

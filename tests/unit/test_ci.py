@@ -1,0 +1,45 @@
+"""What continuous integration runs: lint, then tests, each once, and any failure fails the run."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from support.ports import END, FIRST, free_ports, slice_of
+
+ROOT = Path(__file__).parents[2]
+
+
+def run_ci(folder: Path, lint: int, tests: int) -> subprocess.CompletedProcess[str]:
+    """Run ``.ci/run`` where ``make`` only notes what it is asked for."""
+    (folder / ".ci").mkdir()
+    shutil.copy(ROOT / ".ci" / "run", folder / ".ci" / "run")
+    (folder / ".ci" / "packages.txt").write_text("# none\n\ndpkg  # is everywhere\n")
+    rules = "{0}:\n\t@echo {0} >> asked; exit {1}\n"
+    (folder / "Makefile").write_text(rules.format("lint", lint) + rules.format("test-all", tests))
+    environ = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
+    return subprocess.run(
+        [folder / ".ci" / "run"], env=environ, capture_output=True, text=True, timeout=60, check=False
+    )
+
+
+@pytest.mark.skipif(shutil.which("dpkg-query") is None, reason=".ci/run is for Debian")
+@pytest.mark.parametrize(("lint", "tests"), [(0, 0), (1, 0), (0, 1), (1, 1)])
+def test_any_failure_fails_the_run_and_nothing_runs_twice(tmp_path: Path, lint: int, tests: int) -> None:
+    done = run_ci(tmp_path, lint, tests)
+    assert (done.returncode == 0) == (lint == tests == 0), done
+    assert (tmp_path / "asked").read_text().split() == ["lint", "test-all"]
+
+
+def test_workers_have_ports_of_their_own() -> None:
+    for workers in (1, 2, 7):
+        slices = [slice_of(f"gw{number}", workers) for number in range(workers)]
+        ports = [port for ports in slices for port in ports]
+        assert len(ports) == len(set(ports))
+        assert FIRST <= min(ports) <= max(ports) < END
+    assert slice_of("", 1) == range(FIRST, END)
+    found = free_ports(500)
+    assert len(set(found)) == 500
