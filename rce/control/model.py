@@ -104,7 +104,10 @@ class LinkAddress(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class LinkSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """One end of a link to a peer endpoint. Exactly one of the two ends has ``dial`` set."""
+    """One end of a link to a peer endpoint. Exactly one of the two ends has ``dial`` set.
+
+    The link of an endpoint with itself is here once, and nobody dials it.
+    """
 
     id: str
     peer: str

@@ -6,6 +6,9 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING
 
+import msgspec
+
+from rce.link.carrier import LocalCarrier
 from rce.link.channel import Channel
 from rce.link.dialer import keep_dialed
 from rce.link.link import Link, add_traffic
@@ -56,7 +59,10 @@ class Endpoint:
         self._on_fault = on_fault
         self._slots: dict[str, InterfaceSlot] = {}
         self._links: dict[str, Link] = {}
-        self._channels: dict[int, Channel] = {}
+        self._far_ends: dict[str, Link] = {}
+        """The other ends of links of this endpoint with itself."""
+        self._channels: dict[tuple[int, str], Channel] = {}
+        """By number and interface: both ends of a connection may be here."""
         self._backlog = Backlog(on_growth)
         self._pacer: Pacer | None = None
         self._former_traffic = (0, 0)
@@ -76,7 +82,8 @@ class Endpoint:
     @property
     def connections(self) -> tuple[int, ...]:
         """Ids of the established connections, in order."""
-        return tuple(sorted(number for number, channel in self._channels.items() if channel.established))
+        half = {number for (number, _), channel in self._channels.items() if not channel.established}
+        return tuple(sorted({number for number, _ in self._channels} - half))
 
     def usage(self) -> dict[str, InterfaceUsage]:
         """Return the counters of every interface by tag, since it was made."""
@@ -153,7 +160,9 @@ class Endpoint:
     async def _remove(self, spec: EndpointSpec) -> None:
         interfaces = {interface.tag: interface for interface in spec.interfaces}
         links = {link.id: link for link in spec.links}
-        connections = {connection.id: connection for connection in spec.connections}
+        connections = {
+            _key(end): end for connection in spec.connections for end in self._ends(connection, links)
+        }
         self._refused &= {*spec.interfaces, *spec.connections}
         slots = [slot for tag, slot in self._slots.items() if interfaces.get(tag) != slot.spec]
         gone = [
@@ -162,7 +171,7 @@ class Endpoint:
         self._drop_channels(
             channel
             for channel in list(self._channels.values())
-            if connections.get(channel.number) != channel.spec
+            if connections.get(_key(channel.spec)) != channel.spec
             or channel.slot in slots
             or channel.link in gone
         )
@@ -173,7 +182,7 @@ class Endpoint:
         for channel in list(channels):
             channel.link.remove(channel)
             channel.slot.remove(channel)
-            del self._channels[channel.number]
+            del self._channels[_key(channel.spec)]
 
     def _drop_links(self, links: list[Link]) -> list[Carrier]:
         """Forget links; return the carriers that are still closing."""
@@ -181,6 +190,7 @@ class Endpoint:
             self._hub.unregister(link)
             self._stop_dialing(link)
             del self._links[link.spec.id]
+        links += [far for link in links if (far := self._far_ends.pop(link.spec.id, None)) is not None]
         carriers = [carrier for link in links if (carrier := link.detach()) is not None]
         for link in links:
             self._former_traffic = add_traffic(self._former_traffic, link.traffic)
@@ -212,21 +222,25 @@ class Endpoint:
     # Adding
 
     def _add(self, spec: EndpointSpec) -> None:
+        links = {link.id: link for link in spec.links}
         for link in spec.links:
             self._put_link(link)
         for interface in spec.interfaces:
             if interface.tag not in self._slots and interface not in self._refused:
                 self._add_slot(interface)
         for connection in spec.connections:
-            if connection.id not in self._channels and connection not in self._refused:
-                self._add_channel(connection)
+            for end in self._ends(connection, links):
+                if _key(end) not in self._channels and connection not in self._refused:
+                    self._add_channel(connection, end)
 
     def _put_link(self, spec: LinkSpec) -> None:
         link = self._links.get(spec.id)
         if link is None:
             link = self._links[spec.id] = Link(spec, self._hub.limits)
             link.pace(self._pacer)
-            if spec.dial:
+            if spec.peer == str(self.id):
+                self._far_ends[spec.id] = _bend_back(link)
+            elif spec.dial:
                 self._dial(link)
             else:
                 self._hub.register(link)
@@ -269,14 +283,24 @@ class Endpoint:
         await slot.start()
         self._starts.pop(slot, None)
 
-    def _add_channel(self, spec: ConnectionSpec) -> None:
-        slot = self._slots.get(spec.interface)
-        link = self._links.get(spec.link)
+    def _ends(self, connection: ConnectionSpec, links: Mapping[str, LinkSpec]) -> tuple[ConnectionSpec, ...]:
+        """Return the ends of a connection that are here: both, if it joins interfaces of this endpoint."""
+        link = links.get(connection.link)
+        if link is None or link.peer != str(self.id):
+            return (connection,)
+        there, here = connection.interface, connection.peer_interface
+        return connection, msgspec.structs.replace(connection, interface=here, peer_interface=there)
+
+    def _add_channel(self, connection: ConnectionSpec, end: ConnectionSpec) -> None:
+        slot = self._slots.get(end.interface)
+        link = self._links.get(end.link)
         if slot is None or link is None:
-            missing = f"interface {spec.interface}" if slot is None else f"link {spec.link}"
-            self._refuse(spec, f"connection {spec.id}: there is no {missing}")
+            missing = f"interface {end.interface}" if slot is None else f"link {end.link}"
+            self._refuse(connection, f"connection {end.id}: there is no {missing}")
             return
-        channel = self._channels[spec.id] = Channel(spec, slot, link, self._backlog)
+        if end is not connection:
+            link = self._far_ends[end.link]
+        channel = self._channels[_key(end)] = Channel(end, slot, link, self._backlog)
         slot.add(channel)
         link.add(channel)
 
@@ -292,6 +316,19 @@ class Endpoint:
     def _tell(self) -> None:
         self._notice = None
         self._on_change()
+
+
+def _key(end: ConnectionSpec) -> tuple[int, str]:
+    return end.id, end.interface
+
+
+def _bend_back(link: Link) -> Link:
+    """Make the other end of the link of an endpoint with itself, and join the two for good."""
+    far = Link(link.spec, link.limits)
+    one, other = LocalCarrier.pair()
+    link.attach(one)
+    far.attach(other)
+    return far
 
 
 def _is_same_link(old: LinkSpec, new: LinkSpec | None) -> bool:

@@ -72,7 +72,7 @@ async def lay(span: Span, conn: Connection, node: Node) -> None:
     match span.role:
         case Role.SUBSCRIBER:
             uplink = Uplink(conn, await conn.publisher(span.tag, span.cls, raw=True))
-            await node.subscribe_serialized(span.addr, span.cls, uplink.send)
+            await node.subscribe_serialized(span.addr, span.cls, uplink.send, hears_own=False)
         case Role.PUBLISHER:
             publisher = await node.advertise(span.addr, span.cls)
             await conn.subscriber(span.tag, span.cls, publisher.publish_serialized, raw=True)

@@ -88,10 +88,10 @@ def check(config: ClientConfig, types: TypeRegistry, source: str) -> None:
     """Check what only matters to a bridge.
 
     Raises:
-        ConfigError: A class is not known here, or a topic would go round in circles; every fault is listed.
+        ConfigError: A class is not known here, or a service would be asked of itself; every fault is listed.
     """
     faults = []
-    directions: dict[str, Role] = {}
+    services: dict[str, Role] = {}
     for index, item in enumerate(config.interfaces):
         if item.endpoint != config.robot or not item.addr:
             continue
@@ -103,9 +103,14 @@ def check(config: ClientConfig, types: TypeRegistry, source: str) -> None:
                 types.message(item.cls)
         except TypesError as error:
             faults.append(Fault(f"{place}.iCls", str(error)))
-        name = item.addr.lstrip("/")
-        if directions.setdefault(name, item.kind.role) is item.kind.role.complement:
-            faults.append(Fault(f"{place}.addr", f"{item.addr} goes to the cloud and comes from it: a loop"))
+        role = item.kind.role
+        if role.is_service and services.setdefault(item.addr.lstrip("/"), role) is role.complement:
+            faults.append(
+                Fault(
+                    f"{place}.addr",
+                    f"service {item.addr} is answered in the cloud and called from it: a loop",
+                )
+            )
     if faults:
         raise ConfigError(source, faults)
 

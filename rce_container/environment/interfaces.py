@@ -91,13 +91,15 @@ class PublisherInterface(RosInterface):
 
 
 class SubscriberInterface(RosInterface):
-    """Sends to the peers what is published in the container."""
+    """Sends to the peers what nodes of the container publish, not what its own interfaces do."""
 
     subscriber: Subscriber | None = None
 
     async def open(self) -> None:
         """Subscribe to the topic."""
-        self.subscriber = await self.node.subscribe_serialized(self.addr, self.cls, self._forward)
+        self.subscriber = await self.node.subscribe_serialized(
+            self.addr, self.cls, self._forward, hears_own=False
+        )
 
     def _forward(self, payload: bytes, latched: bool) -> None:
         self.port.send(payload, latched=latched)

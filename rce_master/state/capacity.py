@@ -88,6 +88,8 @@ def company(tables: Tables, container: Container) -> Counter[str]:
     """
     found: Counter[str] = Counter()
     for link in tables.links.by("endpoint", container.id):
+        if link.a == link.b:
+            continue
         peer = tables.endpoints[link.peer(container.id)]
         found.update(_processes_near(tables, peer.task_set))
     group = container.resources.group

@@ -68,7 +68,7 @@ def _size(endpoint: Endpoint) -> int:
 
 
 def _check_link(tables: Tables, link: Link) -> None:
-    assert link.a < link.b, f"{link.id}: ends out of order"
+    assert link.a <= link.b, f"{link.id}: ends out of order"
     assert link.token, f"{link.id}: no token"
     assert link.connections, f"{link.id}: no connection"
     a, b = tables.endpoints.get(link.a), tables.endpoints.get(link.b)

@@ -207,11 +207,11 @@ class Connection(Struct, frozen=True, kw_only=True):
 
 
 class Link(Struct, frozen=True, kw_only=True):
-    """What joins two endpoints of a user; it is there while it has a connection."""
+    """What joins two endpoints of a user, or two interfaces of one; it is there while it has a connection."""
 
     id: str
     a: str
-    """Endpoint id; always the smaller one of the two."""
+    """Endpoint id; never the greater one of the two."""
     b: str
     token: str
     connections: dict[int, Connection] = {}

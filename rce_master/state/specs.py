@@ -50,7 +50,7 @@ def _with_contents(tables: Tables, spec: EndpointSpec, container: Container) -> 
 
 def _link_spec(tables: Tables, link: Link, id_: str) -> LinkSpec:
     peer = link.peer(id_)
-    dial = endpoints.dials(tables, link, id_)
+    dial = peer != id_ and endpoints.dials(tables, link, id_)
     return LinkSpec(
         id=link.id,
         peer=peer,

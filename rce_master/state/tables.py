@@ -170,7 +170,9 @@ class Tables:
             user=lambda e: [e.user],
             task_set=lambda e: [e.task_set],
         )
-        self.links = Table[Link]("links", type_=Link, key=lambda k: k.id, endpoint=lambda k: [k.a, k.b])
+        self.links = Table[Link](
+            "links", type_=Link, key=lambda k: k.id, endpoint=lambda k: dict.fromkeys((k.a, k.b))
+        )
         self.task_sets = Table[TaskSet]("task_sets", type_=TaskSet, key=lambda s: s.process)
         self.counters = Table[Counter]("counters", type_=Counter, key=lambda c: c.name)
         self.drains = Table[Drain]("drains", type_=Drain, key=lambda d: d.process)

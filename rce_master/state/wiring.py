@@ -70,7 +70,7 @@ def remove_interface(tx: Transaction, command: RemoveInterface) -> None:
     tx.touch(endpoint.id)
     for link in tx.tables.links.by("endpoint", endpoint.id):
         rest = {
-            n: c for n, c in link.connections.items() if _interface_of(link, c, endpoint.id) != command.tag
+            n: c for n, c in link.connections.items() if command.tag not in _ends_at(link, c, endpoint.id)
         }
         if len(rest) < len(link.connections):
             tx.put_link(replace(link, connections=rest))
@@ -104,7 +104,7 @@ def disconnect(tx: Transaction, command: Disconnect) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Pair:
-    """Two interfaces, in the order of their endpoints' ids."""
+    """Two interfaces, in the order of their endpoints' ids; of one endpoint in the order of their tags."""
 
     a: Endpoint
     interface_a: InterfaceSpec
@@ -114,9 +114,8 @@ class _Pair:
 
 def _pair(tx: Transaction, user: str, tag_a: str, tag_b: str) -> _Pair:
     one, other = _locate(tx, user, tag_a), _locate(tx, user, tag_b)
-    if one[0].id == other[0].id:
-        raise Invalid(f"{tag_a!r} and {tag_b!r} are of the same endpoint; a connection joins two endpoints")
-    (a, interface_a), (b, interface_b) = sorted((one, other), key=lambda end: end[0].id)
+    ends = sorted((one, other), key=lambda end: (end[0].id, end[1].tag))
+    (a, interface_a), (b, interface_b) = ends
     return _Pair(a, interface_a, b, interface_b)
 
 
@@ -150,7 +149,7 @@ def _check_room(tx: Transaction, endpoint: Endpoint, interface: InterfaceSpec, r
     links = tx.tables.links.by("endpoint", endpoint.id)
     if role is Role.SERVICE_PROVIDER:
         taken = any(
-            _interface_of(link, c, endpoint.id) == interface.tag
+            interface.tag in _ends_at(link, c, endpoint.id)
             for link in links
             for c in link.connections.values()
         )
@@ -168,8 +167,10 @@ def _connection(link: Link, pair: _Pair) -> Connection | None:
     return next((c for c in link.connections.values() if (c.interface_a, c.interface_b) == wanted), None)
 
 
-def _interface_of(link: Link, connection: Connection, endpoint: str) -> str:
-    return connection.interface_a if endpoint == link.a else connection.interface_b
+def _ends_at(link: Link, connection: Connection, endpoint: str) -> tuple[str, ...]:
+    """Return the tags of the interfaces of an endpoint that a connection joins: both, if it has no other."""
+    ends = ((link.a, connection.interface_a), (link.b, connection.interface_b))
+    return tuple(tag for id_, tag in ends if id_ == endpoint)
 
 
 def _endpoint(tx: Transaction, user: str, tag: str) -> Endpoint:

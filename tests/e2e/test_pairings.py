@@ -95,22 +95,25 @@ async def test_provider_that_dies_answers_its_callers_with_an_error() -> None:
 @pytest.mark.parametrize("runtime", ["process", pytest.param("namespace", marks=pytest.mark.needs("bwrap"))])
 @pytest.mark.parametrize("machines", ["one machine", "two machines"])
 async def test_container_with_container_and_with_robot(runtime: str, machines: str) -> None:
-    """The robot's words go to container a, on to the echo node of container b, and back through a."""
+    """The robot's words go to the echo node of container a, on to that of container b, and back."""
     async with (
         running_engine(runtime=runtime, apart=machines == "two machines") as engine,
         stranger(engine.url) as robot,
     ):
         for tag in ("a", "b"):
             await robot.send("CC", {"containerTag": tag})
-        node = {"containerTag": "b", "nodeTag": "echo", "pkg": "Test", "exe": "stringEcho.py"}
+        nodes = [
+            {"containerTag": tag, "nodeTag": "echo", "pkg": "Test", "exe": "stringEcho.py"}
+            for tag in ("a", "b")
+        ]
         await robot.send(
             "CN",
             {
-                "addNodes": [node],
+                "addNodes": nodes,
                 "addInterfaces": [
                     interface("testRobot", "say", "SubscriberConverter"),
-                    interface("a", "say", "PublisherInterface", addr="/to_b"),
-                    interface("a", "onward", "SubscriberInterface", addr="/to_b"),
+                    interface("a", "say", "PublisherInterface", addr="/stringEchoReq"),
+                    interface("a", "onward", "SubscriberInterface", addr="/stringEchoResp"),
                     interface("b", "request", "PublisherInterface", addr="/stringEchoReq"),
                     interface("b", "response", "SubscriberInterface", addr="/stringEchoResp"),
                     interface("testRobot", "hear", "PublisherConverter"),
@@ -141,3 +144,61 @@ async def test_container_with_container_and_with_robot(runtime: str, machines: s
         await robot.publish("say", STRING, {"data": "hello"})
         assert await robot.receive("hear") == {"data": "hello"}
         assert robot.errors == []
+
+
+async def test_interfaces_of_one_endpoint_and_a_topic_in_both_directions() -> None:
+    """As in the original engine: a robot with itself, a container with itself, and no echo of a bridge."""
+    async with (
+        running_engine() as engine,
+        stranger(engine.url, robot="first") as first,
+        stranger(engine.url, robot="second") as second,
+    ):
+        await first.send("CC", {"containerTag": "box"})
+        node = {"containerTag": "box", "nodeTag": "echo", "pkg": "Test", "exe": "stringEcho.py"}
+        await first.send(
+            "CN",
+            {
+                "addNodes": [node],
+                "addInterfaces": [
+                    interface("first", "out", "SubscriberConverter"),
+                    interface("first", "in", "PublisherConverter"),
+                    interface("box", "there", "PublisherInterface", addr="/relay"),
+                    interface("box", "back", "SubscriberInterface", addr="/relay"),
+                    interface("box", "from", "SubscriberInterface", addr="/stringEchoResp"),
+                    interface("box", "to", "PublisherInterface", addr="/relay"),
+                    interface("box", "request", "PublisherInterface", addr="/stringEchoReq"),
+                    interface("second", "request", "SubscriberConverter"),
+                    interface("second", "own_out", "SubscriberConverter"),
+                    interface("second", "own_in", "PublisherConverter"),
+                    interface("second", "own_ask", "ServiceProviderConverter", ECHO),
+                    interface("second", "answer", "ServiceClientConverter", ECHO),
+                    interface("box", "response", "SubscriberInterface", addr="/stringEchoResp"),
+                ],
+            },
+        )
+        pairs = [
+            ("first/out", "box/there"),
+            ("first/in", "box/back"),
+            ("first/in", "box/response"),
+            ("box/from", "box/to"),
+            ("second/request", "box/request"),
+            ("second/own_in", "second/own_out"),
+            ("second/own_ask", "second/answer"),
+        ]
+        await first.send("CX", {"connect": [{"tagA": a, "tagB": b} for a, b in pairs]})
+        await first.wait_status({"out": True, "in": True})
+        await second.wait_status({"own_in": True, "own_out": True, "own_ask": True, "request": True})
+        await until(
+            lambda: all(one["established"] for one in engine.get("/api/v1/connections")["connections"]),
+            what="all connections are established",
+        )
+        await second.publish("own_out", STRING, {"data": "to myself"})
+        assert await second.receive("own_in") == {"data": "to myself"}
+        answering = asyncio.create_task(answer_calls(second, 1))
+        assert await second.call("own_ask", ECHO, {"data": "myself"}) == {"data": "re: myself"}
+        await answering
+        await first.publish("out", STRING, {"data": "own words"})
+        await second.publish("request", STRING, {"data": "a node's words"})
+        assert await first.receive("in") == {"data": "a node's words"}
+        assert first.queue("in").empty(), "neither its own words nor those of another interface come back"
+        assert first.errors == second.errors == []

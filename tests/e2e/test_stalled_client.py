@@ -8,6 +8,7 @@ import hashlib
 import json
 import struct
 from collections.abc import AsyncIterator
+from pathlib import Path
 from urllib.parse import urlencode
 
 import pytest
@@ -49,7 +50,7 @@ async def client_that_can_stall(engine: Engine, robot: str) -> AsyncIterator[Cli
 
 
 async def wire(camera: Stranger) -> None:
-    """Camera -> topic /image in a container -> healthy and stalled."""
+    """Camera -> topic /image in a container -> a node -> topic /copy -> healthy and stalled."""
 
     def interface(endpoint: str, tag: str, kind: str, **more: str) -> dict[str, str]:
         names = {"endpointTag": endpoint, "interfaceTag": tag, "interfaceType": kind}
@@ -59,13 +60,43 @@ async def wire(camera: Stranger) -> None:
     interfaces = [
         interface("camera", "out", "SubscriberForwarder"),
         interface("box", "in", "PublisherInterface", addr="/image"),
-        interface("box", "out", "SubscriberInterface", addr="/image"),
+        interface("box", "out", "SubscriberInterface", addr="/copy"),
         interface("healthy", "in", "PublisherForwarder"),
         interface("stalled", "in", "PublisherForwarder"),
     ]
-    await camera.send("CN", {"addInterfaces": interfaces})
+    node = {"containerTag": "box", "nodeTag": "relay", "pkg": "relays", "exe": "relay.py"}
+    await camera.send("CN", {"addNodes": [node], "addInterfaces": interfaces})
     pairs = [("camera/out", "box/in"), ("healthy/in", "box/out"), ("stalled/in", "box/out")]
     await camera.send("CX", {"connect": [{"tagA": a, "tagB": b} for a, b in pairs]})
+
+
+RELAY = """#!/usr/bin/env python3
+from rce.ros.node import Node, run
+
+
+async def main():
+    async with Node("relay") as node:
+        copies = await node.advertise("/copy", "sensor_msgs/Image")
+        await node.subscribe_serialized(
+            "/image", "sensor_msgs/Image", lambda payload, _: copies.publish_serialized(payload)
+        )
+        await node.spin()
+
+
+run(main())
+"""
+
+
+@pytest.fixture
+def packages(tmp_path: Path) -> Path:
+    """A package whose node repeats images on another topic."""
+    package = tmp_path / "packages" / "relays"
+    package.mkdir(parents=True)
+    package.joinpath("package.yaml").write_text("name: relays\nversion: 1.0.0\n")
+    node = package / "relay.py"
+    node.write_text(RELAY)
+    node.chmod(0o755)
+    return package.parent
 
 
 class Stream:
@@ -76,6 +107,7 @@ class Stream:
         self.healthy = healthy
         self.sent = 0
         self._path = engine.processes_of("rce-robot") + engine.processes_of("rce_container.environment")
+        self._path += engine.processes_of("relay.py")
 
     async def run(self, count: int) -> int:
         """Send ``count`` more images; returns the most memory of the engine's data path meanwhile, bytes."""
@@ -113,9 +145,9 @@ async def newest_image(socket: ClientConnection) -> int:
         assert json.loads(frame)["type"] != "ER", frame
 
 
-async def test_a_client_that_stops_reading_harms_only_itself() -> None:
+async def test_a_client_that_stops_reading_harms_only_itself(packages: Path) -> None:
     async with (
-        running_engine() as engine,
+        running_engine(packages=packages) as engine,
         stranger(engine.url, robot="camera") as camera,
         stranger(engine.url, robot="healthy") as healthy,
         client_that_can_stall(engine, "stalled") as stalled,

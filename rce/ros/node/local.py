@@ -76,8 +76,8 @@ class Parcel:
 class Taker(Protocol):
     """What a local link's messages are given to."""
 
-    def deliver_parcel(self, parcel: Parcel, latched: bool) -> None:
-        """Take a message; must neither wait nor raise."""
+    def deliver_parcel(self, parcel: Parcel, latched: bool, uri: str) -> None:
+        """Take a message of the node with this slave API; must neither wait nor raise."""
 
 
 class LocalLink:
@@ -143,4 +143,4 @@ class LocalLink:
             self.bytes_in += len(parcel)
             if latched:
                 self.kept = parcel
-            self._taker.deliver_parcel(parcel, latched)
+            self._taker.deliver_parcel(parcel, latched, self.uri)

@@ -172,6 +172,7 @@ class Node(GraphMember):
         callback: SerializedCallback,
         *,
         queue_size: int = DEFAULT_QUEUE,
+        hears_own: bool = True,
     ) -> Subscriber:
         """Take the messages of a topic as they are on the wire.
 
@@ -181,6 +182,7 @@ class Node(GraphMember):
             callback: Called with ``(payload, latched)``; ``latched`` is what the publisher says of itself.
                 Plain function or coroutine function, as for :meth:`subscribe`.
             queue_size: As for :meth:`subscribe`.
+            hears_own: Whether it takes what this node itself publishes; a bridge does not.
 
         Raises:
             TypeMismatch: This node subscribes to the topic with another type.
@@ -190,10 +192,10 @@ class Node(GraphMember):
         runtime = self._running
         name = self.resolve(topic)
         sink = sink_for(callback, queue_size, name, runtime.tasks)
-        if kind == ANY:
-            return await self._topics.subscribe(runtime, name, None, sink, decodes=False)
-        known = kind if isinstance(kind, TypeName) else runtime.types.message(kind)
-        return await self._topics.subscribe(runtime, name, known, sink, decodes=False)
+        known: MessageType | TypeName | None = None
+        if kind != ANY:
+            known = kind if isinstance(kind, TypeName) else runtime.types.message(kind)
+        return await self._topics.subscribe(runtime, name, known, sink, decodes=False, hears_own=hears_own)
 
     # ------------------------------------------------------------------ services
 

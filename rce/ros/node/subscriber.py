@@ -169,6 +169,7 @@ class Subscriber:
         changed: asyncio.Event,
         *,
         decodes: bool,
+        hears_own: bool,
     ) -> None:
         self.topic = topic
         """The topic's global name."""
@@ -176,6 +177,8 @@ class Subscriber:
         """Takes what arrives."""
         self.decodes = decodes
         """Whether the sink's messages are read: objects will do."""
+        self.hears_own = hears_own
+        """Whether it takes what its own node publishes."""
         self._kind = None if isinstance(kind, TypeName) else kind
         self._release = release
         self._connected = connected

@@ -38,6 +38,9 @@ class TopicInput:
         self.links: list[InputLink | LocalLink] = []
         self.changed = asyncio.Event()
         self._runtime = runtime
+        self._own_uri = runtime.master.slave_uri
+        self._publishers: set[str] = set()
+        """The slave APIs of all publishers, as the master named them last."""
         self._following: dict[str, asyncio.Task[None]] = {}
         self._orphans: set[str] = set()
         """Publishers that a restarted master has not named yet: followed until their connection ends."""
@@ -58,19 +61,26 @@ class TopicInput:
         """Tell how many publishers have accepted the subscription."""
         return sum(link.is_greeted for link in self.links)
 
-    def deliver(self, payload: bytes, latched: bool) -> None:
-        """Give a message to all subscribers."""
+    def deliver(self, payload: bytes, latched: bool, uri: str) -> None:
+        """Give a message of a publisher's to all subscribers."""
+        own = uri == self._own_uri
         for subscriber in self.subscribers:
-            subscriber.sink.deliver(payload, latched)
+            if subscriber.hears_own or not own:
+                subscriber.sink.deliver(payload, latched)
 
-    def deliver_parcel(self, parcel: Parcel, latched: bool) -> None:
+    def deliver_parcel(self, parcel: Parcel, latched: bool, uri: str) -> None:
         """Give a message of a publisher of this process to all subscribers."""
+        own = uri == self._own_uri
         for subscriber in self.subscribers:
-            subscriber.sink.deliver(parcel if subscriber.decodes else parcel.payload(), latched)
+            if subscriber.hears_own or not own:
+                subscriber.sink.deliver(parcel if subscriber.decodes else parcel.payload(), latched)
 
     def catch_up(self, subscriber: Subscriber) -> None:
         """Give a subscriber that came later the latched messages; they come only once over a connection."""
+        self._follow_publishers()
         for link in self.links:
+            if link.uri == self._own_uri and not subscriber.hears_own:
+                continue
             if isinstance(link.kept, Parcel) and not subscriber.decodes:
                 subscriber.sink.deliver(link.kept.payload(), True)
             elif link.kept is not None:
@@ -83,7 +93,13 @@ class TopicInput:
             uris: The publishers.
             of_new_master: The master was restarted and may not know all yet: connections that are there stay.
         """
-        wanted = set(uris)
+        self._publishers = set(uris)
+        self._follow_publishers(of_new_master=of_new_master)
+
+    def _follow_publishers(self, *, of_new_master: bool = False) -> None:
+        wanted = set(self._publishers)
+        if not any(subscriber.hears_own for subscriber in self.subscribers):
+            wanted.discard(self._own_uri)
         if of_new_master:
             self._orphans |= {link.uri for link in self.links}
         self._orphans -= wanted
@@ -209,7 +225,7 @@ class InputLink:
             self.bytes_in += len(payload)
             if self._latched:
                 self.kept = payload
-            self._target.deliver(payload, self._latched)
+            self._target.deliver(payload, self._latched, self.uri)
             return
         self.is_greeted = True
         try:

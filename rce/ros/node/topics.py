@@ -63,7 +63,14 @@ class Topics:
         return publisher
 
     async def subscribe(
-        self, runtime: Runtime, topic: str, kind: MessageType | TypeName | None, sink: Sink, *, decodes: bool
+        self,
+        runtime: Runtime,
+        topic: str,
+        kind: MessageType | TypeName | None,
+        sink: Sink,
+        *,
+        decodes: bool,
+        hears_own: bool = True,
     ) -> Subscriber:
         """Make a subscriber; return once the master knows of it. Publishers are connected to after that.
 
@@ -73,6 +80,7 @@ class Topics:
             kind: Its type; ``None`` for any. Its name and checksum will do if nothing is decoded.
             sink: Takes the messages.
             decodes: Whether the messages are read: the objects of publishers of this process will do.
+            hears_own: Whether it takes what this node publishes.
 
         Raises:
             TypeMismatch: The node subscribes to the topic with another type already.
@@ -92,7 +100,16 @@ class Topics:
                 source.close()
                 await runtime.master.unregister_subscriber(topic)
 
-        subscriber = Subscriber(topic, kind, sink, release, source.connected, source.changed, decodes=decodes)
+        subscriber = Subscriber(
+            topic,
+            kind,
+            sink,
+            release,
+            source.connected,
+            source.changed,
+            decodes=decodes,
+            hears_own=hears_own,
+        )
         source.subscribers = [*source.subscribers, subscriber]  # a new list: one may be in use by a delivery
         if is_first:
             try:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 from msgspec.structs import replace
 
-from rce.control.model import ConnectionSpec, InterfaceSpec
+from rce.control.model import ConnectionSpec, InterfaceSpec, LinkSpec
 
 if TYPE_CHECKING:
     from .conftest import Rig
@@ -168,3 +168,45 @@ async def test_interfaces_are_closed_though_nobody_waits(rig: Rig) -> None:
     await a.endpoint.apply(a.spec)
     assert a.endpoint.interfaces == {}
     assert a.faults == []
+
+
+async def test_two_interfaces_of_one_endpoint_are_joined(rig: Rig) -> None:
+    """Topic and service; an end that is made anew is joined again, and all end when the link does."""
+    party = rig.party("a", await rig.hub())
+    types = {
+        "out": "SubscriberConverter",
+        "in": "PublisherConverter",
+        "ask": "ServiceProviderConverter",
+        "serve": "ServiceClientConverter",
+    }
+    link = LinkSpec(id="L", peer=party.spec.id, token="secret", dial=False)
+    connections = [
+        ConnectionSpec(id=1, link="L", interface="in", peer_interface="out"),
+        ConnectionSpec(id=2, link="L", interface="ask", peer_interface="serve"),
+    ]
+    await party.apply(types, [link], connections)
+    await party.connected(1, 2)
+    party.fakes["out"].port.send(b"hello")
+    assert await party.fakes["in"].received.get() == (b"hello", False)
+    assert await party.fakes["ask"].port.call(b"loud") == b"LOUD"
+    old = party.fakes["in"]
+    await party.apply({**types, "in": "PublisherForwarder"})
+    await party.connected(1, 2)
+    party.fakes["out"].port.send(b"again")
+    assert await party.fakes["in"].received.get() == (b"again", False)
+    assert old.received.empty()
+    assert party.faults == []
+    await party.apply(connections=connections[:1])
+    await party.connected(1)
+    await party.apply(links=[], connections=[])
+    await party.connected()
+    assert not any(party.endpoint.interfaces.values())
+
+
+async def test_a_connection_with_itself_to_nothing_is_told_once(rig: Rig) -> None:
+    party = rig.party("a", await rig.hub())
+    link = LinkSpec(id="L", peer=party.spec.id, token="secret", dial=False)
+    wrong = [ConnectionSpec(id=1, link="L", interface="out", peer_interface="none")]
+    await party.apply({"out": "SubscriberConverter"}, [link], wrong)
+    await party.apply()
+    assert party.faults == ["connection 1: there is no interface none"]

@@ -105,6 +105,35 @@ async def test_a_node_hears_itself(make_node: MakeNode) -> None:
         assert await collect(subscriber, 1) == ["echo"]
 
 
+@pytest.mark.parametrize("intra_process", [True, False])
+async def test_a_bridge_hears_all_but_itself(make_node: MakeNode, intra_process: bool) -> None:
+    """Whether another subscriber of the same node hears the node's own messages or not."""
+    heard: list[bytes] = []
+    arrived = asyncio.Event()
+
+    def hear(payload: bytes, latched: bool) -> None:
+        heard.append(payload)
+        arrived.set()
+
+    async with make_node("a", intra_process=intra_process) as a, make_node("b") as b:
+        bridge = await a.subscribe_serialized("t", STRING, hear, hears_own=False)
+        own = await a.advertise("t", STRING)
+        other = await b.advertise("t", STRING)
+        await other.wait_for_subscribers(timeout=20)
+        assert own.connections == 0
+        own.publish(data="own")
+        subscriber = await a.subscribe("t", STRING)
+        await subscriber.wait_for_publishers(2, timeout=20)
+        own.publish(data="also own")
+        assert await collect(subscriber, 1) == ["also own"]
+        other.publish(data="other")
+        assert await collect(subscriber, 1) == ["other"]
+        async with asyncio.timeout(20):
+            await arrived.wait()
+        assert heard == [other.type.serialize({"data": "other"})]
+        assert bridge.connections == 2
+
+
 async def test_names_are_resolved_and_remapped(core: Core, make_node: MakeNode) -> None:
     argv = ["t:=/other", "__name:=renamed"]
     async with make_node("a", namespace="ns", argv=argv) as a, make_node("b") as b:

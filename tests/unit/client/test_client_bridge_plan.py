@@ -61,10 +61,16 @@ def test_interfaces_without_addr_are_made_as_they_are() -> None:
     assert request.add_interfaces[0].interface_type == "SubscriberConverter"
 
 
+def test_a_topic_may_be_bridged_in_both_directions() -> None:
+    read = config(own("a", "SubscriberConverter", "/x"), own("b", "PublisherConverter", "x"))
+    check(read, TypeRegistry(), "file")
+    assert [span.tag for span in make_plan(read).spans] == ["a", "b"]
+
+
 def test_every_fault_is_found() -> None:
     read = config(
-        own("a", "SubscriberConverter", "/x"),
-        own("b", "PublisherConverter", "x"),
+        own("a", "ServiceProviderConverter", "/x", "std_srvs/Empty"),
+        own("b", "ServiceClientConverter", "x", "std_srvs/Empty"),
         own("c", "PublisherConverter", "/y", "none/Such"),
         own("d", "ServiceProviderConverter", "/z", "none/Service"),
         own("e", "PublisherConverter", cls="none/NotBridged"),

@@ -85,8 +85,40 @@ def test_connections_need_complementing_roles_and_one_class(world: World) -> Non
         world.connect("rob/sub", "nobody/x")
     with pytest.raises(Invalid, match="write ENDPOINT/INTERFACE"):
         world.connect("rob", "c/sub")
-    with pytest.raises(Invalid, match="same endpoint"):
+    with pytest.raises(Invalid, match="must be the same"):
         world.connect("c/sub", "c/number")
+    with pytest.raises(Invalid, match="do not complete each other"):
+        world.connect("c/sub", "c/sub")
+
+
+def test_two_interfaces_of_one_endpoint_are_connected(world: World) -> None:
+    """The endpoint is told of one link with itself, which nobody dials."""
+    world.wired()
+    world.interface("c/from", "SubscriberInterface")
+    world.interface("c/to", "PublisherInterface")
+    before = len(world.spec("c").connections)
+    world.connect("c/to", "c/from")
+    world.connect("c/from", "c/to")
+    spec = world.spec("c")
+    (link,) = [link for link in spec.links if link.peer == spec.id]
+    assert not link.dial
+    assert len(spec.connections) == before + 1
+    assert {(c.interface, c.peer_interface) for c in spec.connections if c.link == link.id} == {
+        ("from", "to")
+    }
+    world.do(commands.RemoveInterface(user="anna", endpoint="c", tag="to"))
+    assert [link.peer for link in world.spec("c").links if link.peer == spec.id] == []
+
+
+def test_a_service_of_an_endpoint_for_itself_takes_one_connection(world: World) -> None:
+    world.wired()
+    for name in ("a_ask", "z_ask"):
+        world.interface(f"c/{name}", "ServiceProviderInterface", cls="std_srvs/Empty")
+        world.interface("c/serve", "ServiceClientInterface", cls="std_srvs/Empty")
+        world.interface("c/other", "ServiceClientInterface", cls="std_srvs/Empty")
+        world.connect(f"c/{name}", "c/serve")
+        with pytest.raises(Conflict, match="takes one connection"):
+            world.connect(f"c/{name}", "c/other")
 
 
 def test_a_service_provider_takes_one_connection(world: World) -> None:
