@@ -43,6 +43,10 @@ def command(
     allow_origin: Annotated[
         list[str] | None, typer.Option(help="Let pages of this origin use the server; may be repeated.")
     ] = None,
+    trusted_proxy: Annotated[
+        list[str] | None,
+        typer.Option(help="Believe this proxy's (or network's) X-Forwarded-For; may be repeated."),
+    ] = None,
     robot_grace: Annotated[
         float | None, typer.Option(help="Seconds that a robot's interfaces outlive its connection [60].")
     ] = None,
@@ -93,6 +97,7 @@ def command(
             tls_cert=tls_cert,
             tls_key=tls_key,
             allowed_origins=tuple(allow_origin or ()),
+            trusted_proxies=tuple(trusted_proxy or chosen.trusted_proxies),
             token_lifetime=chosen.token_lifetime,
             state=StateSettings(
                 robot_grace=chosen.robot_grace,

@@ -3,50 +3,69 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import hashlib
+import hmac
 import secrets
 import time
-from collections import Counter, OrderedDict, deque
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar
 
 from argon2 import PasswordHasher
 from argon2.exceptions import InvalidHashError, VerificationError
 
+from rce.guard.turns import CrowdedError, Turns
 from rce_master.exceptions import TooManyFailures, TooManyLogins, WrongCredentials
+from rce_master.state.records import KnownLogin
+from rce_master.throttle import MAX_DELAY_S, FailureThrottle
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import Awaitable, Callable
 
     from rce_master.state.records import User
     from rce_master.state.tables import Tables
 
-MAX_FAILURES = 10
-FAILURE_WINDOW_S = 60.0
-CACHE_SIZE = 4096
+T = TypeVar("T")
+
 HASH_WORKERS = 2
 """argon2 takes much memory and time on purpose; more at once would help an attacker only."""
 MAX_WAITING = 64
-"""Unknown passwords that wait to be hashed; what comes then is told to try later, and holds nobody up."""
+"""Unknown passwords that wait to be hashed; when there are more, the address with the most must try later."""
+MAX_JOINED = 32
+"""Logins with the same password that wait for a check which is put off."""
 
 
 def client_digest(password: str) -> str:
     """What a client sends instead of a password: its SHA-256 in hex."""
-    return hashlib.sha256(password.encode()).hexdigest()
+    return hashlib.sha256(password.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+@dataclass(eq=False, slots=True)
+class _Check:
+    """A password that is being looked at; all who come with the same one meanwhile wait for it together."""
+
+    put_off: bool
+    result: asyncio.Task[bool | TooManyLogins]
+    joined: int = 0
 
 
 class Authenticator:
     """Checks passwords against the state's users.
 
-    A password that was right once is known again by a keyed hash in memory, so that a whole fleet that
-    reconnects at once costs one argon2 and not hundreds. Wrong ones are counted for each user: beyond a
-    limit only a password that is known to be right is accepted for a while.
+    A password that was right once is known again by a keyed mark of it, so that a whole fleet that reconnects
+    at once costs one argon2 and not hundreds, and is never slowed down by somebody who guesses. Marks are
+    kept in the store, also over a restart. The key is not: a copy of the store alone helps to guess no more
+    than argon2 allows.
+
+    Unknown passwords take turns by address and user, and are slowed down where they fail often
+    (:mod:`rce_master.throttle`).
 
     Args:
-        tables: The state's tables, to read users from.
+        tables: The state's tables, to read users and marks from.
         hasher: How passwords are hashed.
         clock: Seconds that never go back.
+        key: Of the marks; a new one makes all of them worthless. None: a random one.
+        remember: Keeps a user's mark; without it none is kept.
     """
 
     def __init__(
@@ -55,78 +74,115 @@ class Authenticator:
         *,
         hasher: PasswordHasher | None = None,
         clock: Callable[[], float] = time.monotonic,
+        key: bytes | None = None,
+        remember: Callable[[KnownLogin], Awaitable[object]] | None = None,
     ) -> None:
         self._tables = tables
         self._hasher = hasher or PasswordHasher()
         self._clock = clock
-        self._key = secrets.token_bytes(32)
-        self._known: OrderedDict[bytes, None] = OrderedDict()
-        self._failures: OrderedDict[str, deque[float]] = OrderedDict()
+        self._key = secrets.token_bytes(32) if key is None else key
+        self._remember = remember
+        self._known: dict[str, str] = {}
+        """Marks by user, of this run; those of earlier ones are in the tables."""
+        self._throttle = FailureThrottle()
         self._workers = ThreadPoolExecutor(HASH_WORKERS, thread_name_prefix="argon2")
-        self._slots = asyncio.Semaphore(HASH_WORKERS)
-        self._waiting: Counter[bytes] = Counter()
+        self._turns = Turns(HASH_WORKERS, waiting=MAX_WAITING)
+        self._checks: dict[str, _Check] = {}
         # Checked for unknown users, so that the time it takes does not tell who exists.
         self._nobody = self._hasher.hash(secrets.token_hex())
 
-    async def verify(self, name: str, digest: str) -> User:
+    async def verify(self, name: str, digest: str, address: str = "") -> User:
         """Check a password.
 
         Args:
             name: The user's name.
             digest: SHA-256 of the password in hex, as clients send it.
+            address: Where it comes from.
 
         Raises:
             WrongCredentials: The user is unknown or the password wrong.
-            TooManyFailures: It was wrong too often lately.
+            TooManyFailures: Too many from this address were wrong lately.
             TooManyLogins: Too many wait to be checked.
         """
         user = self._tables.users.get(name)
         stored = user.password if user else self._nobody
         mark = self._mark(name, stored, digest)
-        if not self._is_known(mark):
-            self._check_failures(name)
-            async with self._turn(mark):
-                right = self._is_known(mark)
-                if not right:  # nor did somebody who waited before us find out that it is
-                    self._check_failures(name)
-                    right = await self._matches(stored, digest)
+        if not self._is_known(name, mark):
+            right = await self._check(name, stored, digest, mark, address)
             if not right or user is None:
-                self._note_failure(name)
                 raise WrongCredentials("unknown user or wrong password")
-            self._know(mark)
+            await self._know(name, mark)
         if user is None or self._tables.users.get(name) != user:
             raise WrongCredentials("unknown user or wrong password")
         return user
 
-    async def hash(self, digest: str) -> str:
+    async def hash(self, digest: str, asker: str = "") -> str:
         """Hash a password's digest for the store.
+
+        Args:
+            digest: SHA-256 of the password in hex.
+            asker: The user on whose behalf it is done.
 
         Raises:
             TooManyLogins: Too many wait for the same.
         """
-        async with self._turn(secrets.token_bytes(8)):
-            return await asyncio.get_running_loop().run_in_executor(self._workers, self._hasher.hash, digest)
+        try:
+            async with self._turns.turn("", asker):
+                return await self._in_worker(self._hasher.hash, digest)
+        except CrowdedError:
+            raise TooManyLogins from None
 
     def close(self) -> None:
         """Stop the worker threads."""
+        for check in self._checks.values():
+            check.result.cancel()
         self._workers.shutdown()
 
-    @contextlib.asynccontextmanager
-    async def _turn(self, mark: bytes) -> AsyncIterator[None]:
-        """Wait for a worker thread, unless too many others wait; those who wait for the same are one."""
-        if mark not in self._waiting and len(self._waiting) >= MAX_WAITING:
-            raise TooManyLogins
-        self._waiting[mark] += 1
-        try:
-            async with self._slots:
-                yield
-        finally:
-            self._waiting[mark] -= 1
-            if not self._waiting[mark]:
-                del self._waiting[mark]
+    async def _check(self, name: str, stored: str, digest: str, mark: str, address: str) -> bool:
+        """Check a password that is not known, or wait for somebody else's check of the same one."""
+        while True:
+            check = self._checks.get(mark)
+            if check is None:
+                check = self._begin(name, stored, digest, mark, address)
+            elif check.put_off and check.joined >= MAX_JOINED:
+                raise TooManyFailures(MAX_DELAY_S)
+            own = not check.joined
+            check.joined += 1
+            # Not cancelled with the login that began it: others may wait for it.
+            outcome = await asyncio.shield(check.result)
+            if isinstance(outcome, bool):
+                return outcome
+            if own:
+                raise outcome
 
-    async def _matches(self, stored: str, digest: str) -> bool:
-        return await asyncio.get_running_loop().run_in_executor(self._workers, self._compare, stored, digest)
+    def _begin(self, name: str, stored: str, digest: str, mark: str, address: str) -> _Check:
+        delay = self._throttle.admit(address, name, self._clock())
+        work = self._look(name, stored, digest, address, delay)
+        check = self._checks[mark] = _Check(bool(delay), asyncio.get_running_loop().create_task(work))
+        check.result.add_done_callback(lambda _: self._checks.pop(mark))
+        return check
+
+    async def _look(
+        self, name: str, stored: str, digest: str, address: str, delay: float
+    ) -> bool | TooManyLogins:
+        if delay:
+            self._throttle.delayed += 1
+            try:
+                await asyncio.sleep(delay)
+            finally:
+                self._throttle.delayed -= 1
+        try:
+            async with self._turns.turn(address, name):
+                right = await self._in_worker(self._compare, stored, digest)
+        except CrowdedError:
+            self._throttle.passed(address, name, self._clock())
+            return TooManyLogins()
+        if right:
+            self._throttle.passed(address, name, self._clock())
+        return right
+
+    async def _in_worker(self, work: Callable[..., T], *args: str) -> T:
+        return await asyncio.get_running_loop().run_in_executor(self._workers, work, *args)
 
     def _compare(self, stored: str, digest: str) -> bool:
         try:
@@ -134,33 +190,19 @@ class Authenticator:
         except (VerificationError, InvalidHashError):
             return False
 
-    def _mark(self, name: str, stored: str, digest: str) -> bytes:
+    def _mark(self, name: str, stored: str, digest: str) -> str:
         # The stored hash is part of it: a changed password makes old marks worthless.
-        text = f"{name}\0{stored}\0{digest}".encode()
-        return hashlib.blake2b(text, key=self._key, digest_size=32).digest()
+        text = f"{name}\0{stored}\0{digest}".encode("utf-8", "surrogatepass")
+        return hashlib.blake2b(text, key=self._key, digest_size=32).hexdigest()
 
-    def _is_known(self, mark: bytes) -> bool:
-        if mark not in self._known:
-            return False
-        self._known.move_to_end(mark)
-        return True
+    def _is_known(self, name: str, mark: str) -> bool:
+        kept = self._tables.known_logins.get(name)
+        known = (self._known.get(name, ""), "" if kept is None else kept.mark)
+        return any(hmac.compare_digest(mark, one) for one in known)
 
-    def _know(self, mark: bytes) -> None:
-        self._known[mark] = None
-        if len(self._known) > CACHE_SIZE:
-            self._known.popitem(last=False)
-
-    def _check_failures(self, name: str) -> None:
-        failures = self._failures.get(name)
-        if failures is None or len(failures) < MAX_FAILURES:
+    async def _know(self, name: str, mark: str) -> None:
+        if self._known.get(name) == mark:
             return
-        wait = failures[0] + FAILURE_WINDOW_S - self._clock()
-        if wait > 0:
-            raise TooManyFailures(wait)
-
-    def _note_failure(self, name: str) -> None:
-        failures = self._failures.setdefault(name, deque(maxlen=MAX_FAILURES))
-        failures.append(self._clock())
-        self._failures.move_to_end(name)
-        if len(self._failures) > CACHE_SIZE:
-            self._failures.popitem(last=False)
+        self._known[name] = mark
+        if self._remember is not None:
+            await self._remember(KnownLogin(user=name, mark=mark))

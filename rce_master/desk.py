@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from rce.control.messages import ClientReply, ClientRequest, Left, Login, LoginReply
 from rce_master import requests
-from rce_master.exceptions import MasterError, Refused, TooManyFailures, WrongCredentials
+from rce_master.exceptions import MasterError, Refused, TooManyFailures, TooManyLogins, WrongCredentials
 from rce_master.state import commands
 
 if TYPE_CHECKING:
@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 MAX_PENDING = 1000
-"""Logins and requests in work at the same time; beyond it, the channels they come by wait."""
+"""Requests in work at the same time; beyond it, the channels they come by wait."""
+MAX_LOGINS = 4096
+"""Logins in work; beyond it robots are told to try later. Nothing else waits for a login that is put off."""
 
 _UNAUTHORIZED, _CONFLICT, _TOO_MANY, _UNAVAILABLE = 401, 409, 429, 503
 
@@ -71,9 +73,7 @@ class Desk:
         process = peer.process
         match message:
             case Login():
-                visit = _Visit(process, f"{message.user}/{message.robot}")
-                self._visits.add(visit)
-                await self._spawn(self._login(peer, message, visit))
+                self._take_login(peer, message)
             case ClientRequest():
                 await self._request(peer, message)
             case _:
@@ -82,7 +82,8 @@ class Desk:
 
     async def _spawn(self, work: Coroutine[None, None, None]) -> None:
         await self._pending.acquire()
-        self._group.create_task(self._guard(work))
+        task = self._group.create_task(self._guard(work))
+        task.add_done_callback(lambda _: self._pending.release())
 
     async def _guard(self, work: Coroutine[None, None, None]) -> None:
         try:
@@ -90,10 +91,17 @@ class Desk:
         except Exception:
             # A fault of ours in one answer; its asker runs into a timeout, everybody else goes on.
             logger.exception("could not answer")
-        finally:
-            self._pending.release()
 
     # Logins
+
+    def _take_login(self, peer: Peer, login: Login) -> None:
+        if len(self._visits) >= MAX_LOGINS:
+            reason = str(TooManyLogins())
+            peer.send(LoginReply(request=login.request, status=_UNAVAILABLE, reason=reason))
+            return
+        visit = _Visit(peer.process, f"{login.user}/{login.robot}")
+        self._visits.add(visit)
+        self._group.create_task(self._guard(self._login(peer, login, visit)))
 
     async def _login(self, peer: Peer, login: Login, visit: _Visit) -> None:
         try:
@@ -107,7 +115,7 @@ class Desk:
 
     async def _answer_login(self, process: str, id_: str, login: Login) -> LoginReply:
         try:
-            await self._authenticator.verify(login.user, login.password)
+            await self._authenticator.verify(login.user, login.password, login.address)
             await self._realm.submit(commands.RobotLogin(process=process, id=id_))
             return LoginReply(request=login.request, endpoint=self._realm.spec(id_))
         except WrongCredentials as error:

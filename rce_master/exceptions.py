@@ -23,6 +23,8 @@
 
 from __future__ import annotations
 
+import math
+
 
 class MasterError(Exception):
     """Base of all errors of the master."""
@@ -89,7 +91,7 @@ class WrongCredentials(AuthError):  # noqa: N818
 
 
 class TooManyFailures(AuthError):  # noqa: N818
-    """Too many wrong passwords for this user.
+    """Too many wrong passwords for this user from this address.
 
     Attributes:
         retry_after: Seconds until the next attempt is looked at.
@@ -100,11 +102,14 @@ class TooManyFailures(AuthError):  # noqa: N818
         super().__init__(retry_after)
 
     def __str__(self) -> str:
-        return f"too many failed logins; try again in {self.retry_after:.0f} s"
+        return (
+            "too many failed logins for this user from your address; "
+            f"try again in {math.ceil(self.retry_after)} s"
+        )
 
 
 class TooManyLogins(AuthError):  # noqa: N818
-    """Too many logins wait to be checked."""
+    """Too many logins from this address wait to be checked."""
 
     def __str__(self) -> str:
         return "too many log in at the same time; try again in a moment"

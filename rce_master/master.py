@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rce.control.server import ControlServer
+from rce.guard.proxies import TrustedProxies
 from rce.web.server import HttpServer
 from rce_master.auth import Authenticator, client_digest
 from rce_master.bundles.contents import ContentStore
@@ -90,18 +91,38 @@ class Master:
         events = EventLog(time.time())
         realm.listeners.append(lambda changes: _log_events(events, changes))
         reconciler = Reconciler(realm)
-        authenticator = Authenticator(realm.tables, hasher=self._hasher)
+        authenticator = Authenticator(
+            realm.tables,
+            hasher=self._hasher,
+            key=self._secret.derive("known logins"),
+            remember=lambda login: realm.enqueue([commands.RememberLogin(login=login)]),
+        )
         desk = Desk(realm, reconciler, authenticator)
         lifetime = self._settings.token_lifetime
         self._contents = ContentStore(self._settings.state_dir / "bundles")
         packages = PackageOffice(realm, self._contents)
-        tokens = Tokens(realm.tables)
-        services = Services(realm, reconciler, authenticator, events, time.time, lifetime, packages, tokens)
+        services = Services(
+            realm,
+            reconciler,
+            authenticator,
+            events,
+            time.time,
+            lifetime,
+            packages,
+            Tokens(realm.tables),
+            TrustedProxies(self._settings.trusted_proxies),
+        )
         try:
             async with asyncio.TaskGroup() as group:
                 workers = [
                     group.create_task(work)
-                    for work in (realm.run(), desk.run(), packages.run(), tokens.run(realm), _tick(realm))
+                    for work in (
+                        realm.run(),
+                        desk.run(),
+                        packages.run(),
+                        services.tokens.run(realm),
+                        _tick(realm),
+                    )
                 ]
                 try:
                     await self._serve(services, desk, on_ready)

@@ -32,6 +32,8 @@ class MasterSettings:
     tls_cert: Path | None = None
     tls_key: Path | None = None
     allowed_origins: tuple[str, ...] = ()
+    trusted_proxies: tuple[str, ...] = ()
+    """Addresses or networks of proxies whose ``X-Forwarded-For`` is believed."""
     token_lifetime: float = TOKEN_LIFETIME_S
     """Seconds."""
     state: StateSettings = field(default_factory=StateSettings)

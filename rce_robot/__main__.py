@@ -43,7 +43,10 @@ def _pick(settings: EngineSettings) -> dict[str, Any]:
     sizes = {"user_memory": "user_memory", "memory": "memory"}
     return {
         **chosen(settings.robot, {name: name for name in names}),
-        **chosen(settings.robot, {"origins": "origin", "strangers": "strangers"}),
+        **chosen(
+            settings.robot,
+            {"origins": "origin", "strangers": "strangers", "trusted_proxies": "trusted_proxy"},
+        ),
         **{name: size // MEGABYTE for name, size in chosen(settings.robot, sizes).items()},
         **chosen(settings.container, {"package_path": "package_path"}),
     }
@@ -69,6 +72,10 @@ def robot(
     secret_file: SecretFile = None,
     origin: Annotated[
         list[str] | None, typer.Option(help="Origin of web pages that may connect; may be repeated.")
+    ] = None,
+    trusted_proxy: Annotated[
+        list[str] | None,
+        typer.Option(help="Believe this proxy's (or network's) X-Forwarded-For; may be repeated."),
     ] = None,
     user_memory: Annotated[
         int,
@@ -97,6 +104,7 @@ def robot(
         public_url=public_url,
         machine=machine,
         origins=tuple(origin or ()),
+        trusted_proxies=tuple(trusted_proxy or ()),
         user_memory=user_memory * MEGABYTE,
         memory=memory * MEGABYTE,
         strangers_per_address=strangers,

@@ -20,6 +20,7 @@ from rce.control.channel import TaskSetChannel
 from rce.control.messages import MachineInfo
 from rce.control.model import LinkAddress
 from rce.guard.lobby import Lobby
+from rce.guard.proxies import TrustedProxies
 from rce.link import LinkHub
 from rce.link.address import in_url, is_any, own_address
 from rce.link.listening import listen_on
@@ -97,7 +98,9 @@ class App:
             control = f"ws://{in_url(self.master)}:{self.control_port}"
             channel = TaskSetChannel(control, self.secret, task_set.hello, task_set.handle)
             task_set.use(channel)
-            gate = Gate(task_set, settings.session, settings.origins)
+            gate = Gate(
+                task_set, settings.session, settings.origins, TrustedProxies(settings.trusted_proxies)
+            )
             async with asyncio.TaskGroup() as tasks:
                 running = [tasks.create_task(channel.run())]
                 async with serve_robots(gate, settings, listener, lobby):

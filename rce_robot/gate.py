@@ -8,6 +8,7 @@ from urllib.parse import urlsplit
 
 from websockets.protocol import State
 
+from rce.guard.proxies import TrustedProxies
 from rce.protocol.exceptions import HandshakeError
 from rce.protocol.http import read_credentials
 from rce.protocol.names import EndpointId
@@ -33,7 +34,7 @@ _FORBIDDEN, _CONFLICT = 403, 409
 class House(Protocol):
     """Who lives here, and who knows who may."""
 
-    async def log_in(self, credentials: Credentials) -> EndpointSpec:
+    async def log_in(self, credentials: Credentials, address: str) -> EndpointSpec:
         """Ask the master; raises :class:`HandshakeError` with its answer if the robot may not come in."""
 
     def find(self, id: EndpointId) -> Namespace | None:  # noqa: A002
@@ -46,10 +47,17 @@ class House(Protocol):
 class Gate:
     """Answers handshakes. Used as ``process_request`` of the WebSocket server."""
 
-    def __init__(self, house: House, settings: SessionSettings, origins: Collection[str]) -> None:
+    def __init__(
+        self,
+        house: House,
+        settings: SessionSettings,
+        origins: Collection[str],
+        proxies: TrustedProxies | None = None,
+    ) -> None:
         self._house = house
         self._settings = settings
         self._origins = origins
+        self._proxies = proxies or TrustedProxies()
 
     async def admit(self, connection: ServerConnection, request: Request) -> Response | None:
         """Let a robot in (None), or say why not."""
@@ -60,7 +68,9 @@ class Gate:
         try:
             self._check_origin(request.headers.get("Origin"))
             credentials = read_credentials(urlsplit(request.path).query)
-            namespace = await self._claim(credentials)
+            forwarded = request.headers.get_all("X-Forwarded-For")
+            address = self._proxies.origin(connection.remote_address, forwarded)
+            namespace = await self._claim(credentials, address)
         except HandshakeError as error:
             _log.info("refused %s: %s %s", connection.remote_address, error.status, error.reason)
             return connection.respond(error.status, f"{error.reason}\n")
@@ -79,16 +89,16 @@ class Gate:
         if origin is not None and origin not in self._origins and "*" not in self._origins:
             raise HandshakeError(_FORBIDDEN, f"Origin {origin} may not connect here.")
 
-    async def _claim(self, credentials: Credentials) -> Namespace:
+    async def _claim(self, credentials: Credentials, address: str) -> Namespace:
         """Log in. A former connection of the robot that turns out to be dead makes room for the new one."""
         try:
-            spec = await self._house.log_in(credentials)
+            spec = await self._house.log_in(credentials, address)
         except HandshakeError as error:
             namespace = self._house.find(EndpointId(credentials.user, credentials.robot))
             former = None if namespace is None else namespace.session
             if error.status != _CONFLICT or former is None or await former.probe():
                 raise
-            spec = await self._house.log_in(credentials)
+            spec = await self._house.log_in(credentials, address)
         return await self._house.settle(spec)
 
 

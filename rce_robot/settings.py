@@ -48,6 +48,8 @@ class RobotSettings:
     machine: str = ""
     origins: tuple[str, ...] = ()
     """Origins whose pages may connect; robots and programs send none. ``*`` is any."""
+    trusted_proxies: tuple[str, ...] = ()
+    """Addresses or networks of proxies whose ``X-Forwarded-For`` is believed."""
     login_timeout: float = 8.0
     """How long a robot at the door waits for a master that is away."""
     open_timeout: float = 20.0

@@ -57,7 +57,7 @@ class Channel(Protocol):
     def send(self, message: ToMaster) -> None:
         """Send, or drop while the master is away."""
 
-    async def login(self, user: str, robot: str, password: str) -> LoginReply:
+    async def login(self, user: str, robot: str, password: str, address: str = "") -> LoginReply:
         """Ask whether a robot may come in; raises :class:`ControlError` if the master stays away."""
 
     async def client_request(self, id: str, type: str, data: object) -> ClientReply:  # noqa: A002
@@ -167,7 +167,7 @@ class RobotTaskSet:
 
     # What the gate asks: rce_robot.gate.House
 
-    async def log_in(self, credentials: Credentials) -> EndpointSpec:
+    async def log_in(self, credentials: Credentials, address: str) -> EndpointSpec:
         """Ask the master whether a robot may come in.
 
         Raises:
@@ -175,7 +175,9 @@ class RobotTaskSet:
         """
         try:
             async with asyncio.timeout(self._settings.login_timeout):
-                reply = await self._channel.login(credentials.user, credentials.robot, credentials.password)
+                reply = await self._channel.login(
+                    credentials.user, credentials.robot, credentials.password, address
+                )
         except (ControlError, TimeoutError) as error:
             reason = "The master cannot be reached, so nobody can log in now. Try again."
             raise HandshakeError(_UNAVAILABLE, reason) from error

@@ -112,6 +112,7 @@ def programs(settings: EngineSettings) -> Iterable[Program]:
         *_options({"state-dir": state / "master", "robot-grace": settings.master.robot_grace}),
         *_options({"container-grace": settings.master.container_grace}),
         *_options({"token-lifetime": settings.master.token_lifetime}),
+        *_repeat("trusted-proxy", settings.master.trusted_proxies),
         *_options({"max-slots": settings.master.max_slots, "max-cpu": settings.master.max_cpu}),
         *_options({"max-memory": f"{settings.master.max_memory}B"}),
         *(control + common),
@@ -126,6 +127,7 @@ def programs(settings: EngineSettings) -> Iterable[Program]:
             *_options({"link-port": _next(settings.robot.link_port, 2 * index)}),
             *_options({"public-host": settings.robot.public_host, "public-url": settings.robot.public_url}),
             *_repeat("origin", settings.robot.origins),
+            *_repeat("trusted-proxy", settings.robot.trusted_proxies),
             *_options(
                 {"user-memory": settings.robot.user_memory >> 20, "memory": settings.robot.memory >> 20}
             ),

@@ -66,6 +66,16 @@ def _as_bytes(value: Any) -> Any:
     return read_memory(value)
 
 
+def _check_network(text: str) -> str:
+    try:
+        ipaddress.ip_network(text, strict=False)
+    except ValueError:
+        raise ValueError("must be an IP address or a network such as 10.0.0.0/8") from None
+    return text
+
+
+Address = Annotated[str, AfterValidator(_check_network)]
+"""An IP address or network."""
 Host = Annotated[str, AfterValidator(_check_host)]
 Port = Annotated[int, Field(ge=0, le=65535)]
 """A TCP port; 0 takes a free one."""
@@ -87,6 +97,8 @@ class MasterSettings(Strict):
     """How long a container task set may be away until its containers are placed elsewhere."""
     token_lifetime: Seconds = 30 * 86400.0
     """How long an API token is valid."""
+    trusted_proxies: tuple[Address, ...] = Field(default=(), strict=False)
+    """Addresses or networks of proxies whose ``X-Forwarded-For`` is believed."""
     max_slots: int = Field(default=0, ge=0)
     """Slots that the containers of one user may take together; 0 for no limit. Administrators have none."""
     max_cpu: Annotated[float, BeforeValidator(_as_cores)] = 0.0
@@ -111,6 +123,8 @@ class RobotSettings(Strict):
     """The whole URL that clients are sent to, where a proxy stands in front."""
     origins: tuple[str, ...] = Field(default=(), strict=False)
     """Origins whose web pages may connect; ``*`` is any."""
+    trusted_proxies: tuple[Address, ...] = Field(default=(), strict=False)
+    """Addresses or networks of proxies whose ``X-Forwarded-For`` is believed."""
     user_memory: Annotated[int, BeforeValidator(_as_bytes), Field(ge=1 << 20)] = 512 << 20
     """Bytes of messages that may wait for all robots of a user; written as other memory."""
     memory: Annotated[int, BeforeValidator(_as_bytes)] = 0

@@ -118,14 +118,22 @@ class TaskSetChannel:
         except asyncio.QueueFull:
             self._abort(f"{MAX_QUEUED} messages wait for the master")
 
-    async def login(self, user: str, robot: str, password: str) -> LoginReply:
+    async def login(self, user: str, robot: str, password: str, address: str = "") -> LoginReply:
         """Ask whether a robot may come in.
+
+        Args:
+            user: Whose robot it says that it is.
+            robot: Its ID.
+            password: As it sent it.
+            address: Where it connects from.
 
         Raises:
             MasterUnavailableError: No answer in time.
             UnsendableError: It holds something that cannot be sent.
         """
-        message = Login(request=next(self._numbers), user=user, robot=robot, password=password)
+        message = Login(
+            request=next(self._numbers), user=user, robot=robot, password=password, address=address
+        )
         return await self._request(message, LoginReply)
 
     async def client_request(self, id: str, type: str, data: Any) -> ClientReply:  # noqa: A002 - wire names

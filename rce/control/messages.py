@@ -124,6 +124,8 @@ class Login(_Message, frozen=True, kw_only=True, omit_defaults=True):
     robot: str
     password: str
     """SHA-256 of the password, in hex, as the client sent it."""
+    address: str = ""
+    """Where the robot connects from, as :func:`rce.guard.lobby.address_of` writes it."""
 
 
 class Left(_Message, frozen=True, kw_only=True, omit_defaults=True):
@@ -215,7 +217,7 @@ class LoginReply(_Message, frozen=True, kw_only=True, omit_defaults=True):
     endpoint: EndpointSpec | None = None
     """The robot's desired state if it may come in."""
     status: int = 200
-    """HTTP status for the handshake: 200, 401, 409 (already connected), 503."""
+    """HTTP status for the handshake: 200, 401, 409 (already connected), 429, 503."""
     reason: str = ""
 
 

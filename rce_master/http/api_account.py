@@ -19,7 +19,7 @@ async def log_in(call: Call) -> models.TokenOut:
     """Check a password and make a token."""
     body = call.read(models.LoginIn)
     services = call.services
-    user = await services.authenticator.verify(body.userID, client_digest(body.password))
+    user = await services.authenticator.verify(body.userID, client_digest(body.password), call.address)
     lifetime = min(body.lifetime or services.token_lifetime, services.token_lifetime)
     token, record = new_token(user.name, body.label, services.clock(), lifetime)
     # What was used lately must not make room for this one.
@@ -63,7 +63,7 @@ async def add_user(call: Call) -> models.UserOut:
     user = User(
         name=body.name,
         role=UserRole(body.role),
-        password=await services.authenticator.hash(client_digest(body.password)),
+        password=await services.authenticator.hash(client_digest(body.password), call.caller.name),
         created=services.clock(),
     )
     await services.realm.submit(commands.AddUser(user=user))
@@ -95,7 +95,7 @@ async def set_password(call: Call) -> None:
     if name == call.caller.name:
         await _check_old(call, body.old_password)
     digest = client_digest(body.password)
-    hashed = await services.authenticator.hash(digest)
+    hashed = await services.authenticator.hash(digest, call.caller.name)
     await services.realm.submit(commands.SetPassword(name=name, password=hashed))
 
 
@@ -104,7 +104,7 @@ async def _check_old(call: Call, password: str) -> None:
     if not password:
         raise Invalid("old_password: is missing; to change your own password, give the one until now")
     try:
-        await call.services.authenticator.verify(call.caller.name, client_digest(password))
+        await call.services.authenticator.verify(call.caller.name, client_digest(password), call.address)
     except WrongCredentials:
         raise Forbidden("old_password: is wrong") from None
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from rce.guard.proxies import TrustedProxies
 from rce.web.openapi import Operation, Query
 from rce_master.exceptions import Forbidden, Invalid, NotFound, WrongCredentials
 from rce_master.state.records import UserRole
@@ -50,6 +51,7 @@ class Services:
     """Seconds."""
     packages: PackageOffice
     tokens: Tokens
+    proxies: TrustedProxies = field(default_factory=TrustedProxies)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +64,13 @@ class Call:
     """None only on routes that are open to everybody."""
     token: str
     body: BaseModel | None
+
+    @property
+    def address(self) -> str:
+        """Where the request comes from, as far as proxies that are trusted tell."""
+        transport = self.request.transport
+        peer = None if transport is None else transport.get_extra_info("peername")
+        return self.services.proxies.origin(peer, self.request.headers.getall("X-Forwarded-For", ()))
 
     @property
     def caller(self) -> User:

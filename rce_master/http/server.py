@@ -6,6 +6,7 @@ import asyncio
 import ipaddress
 import json
 import logging
+import math
 from typing import TYPE_CHECKING, Any
 
 from aiohttp import hdrs, web
@@ -227,7 +228,7 @@ def _status(error: MasterError) -> int:
 def _headers(error: MasterError) -> dict[str, str]:
     match error:
         case TooManyFailures():
-            return {hdrs.RETRY_AFTER: f"{error.retry_after:.0f}"}
+            return {hdrs.RETRY_AFTER: str(math.ceil(error.retry_after))}
         case TooManyLogins():
             return {hdrs.RETRY_AFTER: "1"}
         case AuthError():

@@ -14,6 +14,7 @@ from rce_master.state.records import (
     Counter,
     Drain,
     Endpoint,
+    KnownLogin,
     Link,
     Move,
     PackageKey,
@@ -137,6 +138,7 @@ class Transaction:
         self,
         record: User
         | Token
+        | KnownLogin
         | PackageKey
         | Bundle
         | Endpoint
@@ -227,6 +229,7 @@ class Transaction:
         by_type: dict[type, Table[Any]] = {
             User: tables.users,
             Token: tables.tokens,
+            KnownLogin: tables.known_logins,
             PackageKey: tables.package_keys,
             Bundle: tables.bundles,
             Robot: tables.endpoints,

@@ -14,7 +14,7 @@ from rce.control.model import Resources
 if TYPE_CHECKING:
     from rce.control.messages import Hello
     from rce.control.model import EndpointStatus, InterfaceSpec, NodeSpec, ParameterValue
-    from rce_master.state.records import Bundle, PackageKey, Token, User
+    from rce_master.state.records import Bundle, KnownLogin, PackageKey, Token, User
 
 
 _NO_WISHES = Resources()
@@ -86,6 +86,13 @@ class RemoveToken:
     """Forget a bearer token."""
 
     digest: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RememberLogin:
+    """Keep the mark of a password that was right."""
+
+    login: KnownLogin
 
 
 # Packages that users bring
@@ -336,6 +343,7 @@ Command: TypeAlias = (
     | NoteTokenUses
     | RevokeToken
     | RevokeRobotToken
+    | RememberLogin
     | AddPackageKey
     | RemovePackageKey
     | AddBundle

@@ -38,6 +38,7 @@ _HANDLERS: dict[type, Callable[[Transaction, Any], None]] = {
     commands.AddUser: users.add_user,
     commands.SetPassword: users.set_password,
     commands.RemoveUser: users.remove_user,
+    commands.RememberLogin: users.remember_login,
     commands.AddToken: tokens.add,
     commands.RemoveToken: tokens.remove,
     commands.NoteTokenUses: tokens.note_uses,

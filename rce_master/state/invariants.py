@@ -29,8 +29,8 @@ def validate(tables: Tables) -> None:
     _check_connections(tables)
     _check_observed(tables)
     _check_moves(tables)
-    for record in (*tables.bundles, *tables.package_keys):
-        assert record.user in tables.users, f"{record.id}: its user is unknown"
+    for record in (*tables.bundles, *tables.package_keys, *tables.known_logins):
+        assert record.user in tables.users, f"{record}: its user is unknown"
 
 
 def _check_indexes(tables: Tables) -> None:

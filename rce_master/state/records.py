@@ -78,6 +78,14 @@ class Token(Struct, frozen=True, kw_only=True):
         return bool(self.expires) and self.expires <= now
 
 
+class KnownLogin(Struct, frozen=True, kw_only=True):
+    """A password that was right once, so that it need not be hashed again."""
+
+    user: str
+    mark: str
+    """Keyed hash, in hex, over user, stored password and what the client sent."""
+
+
 class PackageKey(Struct, frozen=True, kw_only=True):
     """A public key by which a user signs packages."""
 

@@ -13,6 +13,7 @@ from rce_master.state.records import (
     Counter,
     Drain,
     Endpoint,
+    KnownLogin,
     Link,
     Live,
     Move,
@@ -140,6 +141,7 @@ class Table(Generic[R]):
 class Tables:
     """All tables.
 
+    - ``known_logins``: at most one for each user.
     - ``endpoints``: robots and containers; both in one table, because a tag is unique among both.
     - ``links``: one for each pair of endpoints that has a connection.
     - ``live``: exactly one record for each endpoint.
@@ -152,6 +154,7 @@ class Tables:
     def __init__(self) -> None:
         self.users = Table[User]("users", type_=User, key=lambda u: u.name)
         self.tokens = Table[Token]("tokens", type_=Token, key=lambda t: t.digest, user=lambda t: [t.user])
+        self.known_logins = Table[KnownLogin]("known_logins", type_=KnownLogin, key=lambda k: k.user)
         self.package_keys = Table[PackageKey](
             "package_keys", type_=PackageKey, key=lambda k: k.id, user=lambda k: [k.user]
         )
@@ -191,6 +194,7 @@ class Tables:
         return (
             self.users,
             self.tokens,
+            self.known_logins,
             self.package_keys,
             self.bundles,
             self.endpoints,

@@ -13,7 +13,7 @@ from rce_master.state.records import User, UserRole
 
 if TYPE_CHECKING:
     from rce_master.state.changes import Transaction
-    from rce_master.state.commands import AddUser, RemoveUser, SetPassword
+    from rce_master.state.commands import AddUser, RememberLogin, RemoveUser, SetPassword
 
 
 def add_user(tx: Transaction, command: AddUser) -> None:
@@ -34,6 +34,7 @@ def set_password(tx: Transaction, command: SetPassword) -> None:
     """
     user = _find(tx, command.name)
     tx.put(replace(user, password=command.password))
+    _forget_login(tx, user.name)
     for token in tx.tables.tokens.by("user", user.name):
         if not token.scope:
             tokens.forget(tx, token, "the password was changed")
@@ -51,6 +52,7 @@ def remove_user(tx: Transaction, command: RemoveUser) -> None:
         raise Conflict(f"{user.name!r} is the last administrator; make another one first")
     for endpoint in tx.tables.endpoints.by("user", user.name):
         endpoints.remove(tx, endpoint.id, "the user was removed")
+    _forget_login(tx, user.name)
     for token in tx.tables.tokens.by("user", user.name):
         tokens.forget(tx, token, "the user was removed")
     packages.forget_user(tx, user.name)
@@ -58,8 +60,20 @@ def remove_user(tx: Transaction, command: RemoveUser) -> None:
     tx.happen("user_removed", user.name, user="")
 
 
+def remember_login(tx: Transaction, command: RememberLogin) -> None:
+    """Keep the mark of a password that was right, for a user who is still there."""
+    login = command.login
+    if login.user in tx.tables.users and tx.tables.known_logins.get(login.user) != login:
+        tx.put(login)
+
+
 def _find(tx: Transaction, name: str) -> User:
     user = tx.tables.users.get(name)
     if user is None:
         raise NotFound(f"there is no user {name!r}")
     return user
+
+
+def _forget_login(tx: Transaction, user: str) -> None:
+    if user in tx.tables.known_logins:
+        tx.delete(tx.tables.known_logins, user)

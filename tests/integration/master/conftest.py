@@ -133,9 +133,9 @@ class Site:
 
 @asynccontextmanager
 async def running_site(
-    store: Store | None = None, state_dir: Path = Path("unused"), **options: Any
+    store: Store | None = None, state_dir: Path = Path("unused"), *, log_in: bool = True, **options: Any
 ) -> AsyncIterator[Site]:
-    """Run a master in development mode on free ports."""
+    """Run a master in development mode on free ports, and log in."""
     settings = MasterSettings(
         bind=LOOPBACK, http_port=0, control_port=0, state_dir=state_dir, dev=True, **options
     )
@@ -149,7 +149,7 @@ async def running_site(
             await task
         async with aiohttp.ClientSession() as session:
             site = Site(ready.result(), session)
-            site.token = await site.login()
+            site.token = await site.login() if log_in else ""
             yield site
     finally:
         task.cancel()

@@ -31,11 +31,17 @@ SETTINGS = EngineSettings(
         http_port=1,
         control_port=2,
         token_lifetime=3.0,
+        trusted_proxies=("10.0.0.0/8",),
         max_slots=4,
         max_cpu=1.5,
         max_memory=8 << 10,
     ),
-    robot=RobotSettings(count=2, public_host="robots.example.org", origins=("https://a.example",)),
+    robot=RobotSettings(
+        count=2,
+        public_host="robots.example.org",
+        origins=("https://a.example",),
+        trusted_proxies=("10.1.1.1",),
+    ),
     container=ContainerSettings(
         runtime=Runtime.PROCESS,
         labels=("gpu", "lidar"),
@@ -69,6 +75,8 @@ def test_what_is_set_arrives() -> None:
     contexts = parsed(SETTINGS)
     assert contexts["master"].params["token_lifetime"] == 3.0
     assert contexts["master"].params["max_slots"] == 4
+    assert list(contexts["master"].params["trusted_proxy"]) == ["10.0.0.0/8"]
+    assert list(contexts["robot1"].params["trusted_proxy"]) == ["10.1.1.1"]
     assert contexts["container"].params["allow_requirements"]
     assert contexts["container"].params["pip_args"] == "--no-index --pre"
     params = contexts["container"].params

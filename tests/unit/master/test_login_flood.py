@@ -1,72 +1,116 @@
-"""Many logins at once hold nobody up who is known."""
+"""Many logins at once hold nobody up who is known, and others by one check at most."""
 
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections.abc import AsyncIterator
+from typing import Literal
 
 import pytest
 from argon2 import PasswordHasher
 from support.master_world import World
 
-from rce_master.auth import HASH_WORKERS, MAX_FAILURES, MAX_WAITING, Authenticator, client_digest
+from rce_master.auth import HASH_WORKERS, MAX_WAITING, Authenticator, client_digest
 from rce_master.exceptions import TooManyFailures, TooManyLogins, WrongCredentials
 from rce_master.state import commands
 from rce_master.state.records import User, UserRole
 
 RIGHT = client_digest("right")
-HASHER = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
+CROWDS = 4
+
+
+class HeldHasher(PasswordHasher):
+    """Checks nothing until it is let go."""
+
+    def __init__(self) -> None:
+        super().__init__(time_cost=1, memory_cost=8, parallelism=1)
+        self.go = threading.Event()
+        self.go.set()
+        self.verified: list[str] = []
+
+    def verify(self, hash: str | bytes, password: str | bytes) -> Literal[True]:  # noqa: A002
+        self.verified.append(str(password))
+        assert self.go.wait(60)
+        return super().verify(hash, password)
+
+
+async def settle() -> None:
+    """Let everything happen that waits for no worker thread."""
+    for _ in range(10):
+        await asyncio.sleep(0)
+
+
+class Door:
+    def __init__(self) -> None:
+        self.hasher = HeldHasher()
+        world = World()
+        for name in ("zoe", "yan"):
+            user = User(name=name, role=UserRole.USER, password=self.hasher.hash(RIGHT), created=0.0)
+            world.do(commands.AddUser(user=user))
+        self.auth = Authenticator(world.state.tables, hasher=self.hasher)
+        self.outcomes: list[type] = []
+        self.sent = 0
+
+    async def log_in(self, name: str, digest: str, address: str) -> None:
+        try:
+            await self.auth.verify(name, digest, address)
+        except (WrongCredentials, TooManyFailures, TooManyLogins) as error:
+            self.outcomes.append(type(error))
+
+    async def flood(self, group: asyncio.TaskGroup, count: int, address: str) -> None:
+        for _ in range(count):
+            self.sent += 1
+            guess = client_digest(f"guess {self.sent}")
+            group.create_task(self.log_in(f"nobody{self.sent}", guess, address))
+        await settle()
 
 
 @pytest.fixture
-async def auth() -> AsyncIterator[Authenticator]:
-    world = World()
-    user = User(name="zoe", role=UserRole.USER, password=HASHER.hash(RIGHT), created=0.0)
-    world.do(commands.AddUser(user=user))
-    made = Authenticator(world.state.tables, hasher=HASHER)
+async def door() -> AsyncIterator[Door]:
+    made = Door()
     yield made
-    made.close()
+    made.hasher.go.set()
+    made.auth.close()
 
 
-async def held(auth: Authenticator, group: asyncio.TaskGroup, count: int, user: str = "") -> list[object]:
-    """Begin logins while no worker thread is free; returns where their results come."""
-    results: list[object] = []
-
-    async def log_in(number: int) -> None:
-        try:
-            results.append(await auth.verify(user or f"nobody{number}", client_digest(str(number))))
-        except (WrongCredentials, TooManyFailures) as error:
-            results.append(type(error))
-
-    for number in range(count):
-        group.create_task(log_in(number))
-    await asyncio.sleep(0)
-    return results
-
-
-async def test_what_is_beyond_the_queue_is_refused_at_once_and_known_people_come_in(
-    auth: Authenticator,
-) -> None:
-    await auth.verify("zoe", RIGHT)
-    for _ in range(HASH_WORKERS):
-        await auth._slots.acquire()
+async def test_a_flood_from_one_address_holds_up_another_by_its_own_checks_only(door: Door) -> None:
+    """Whoever is known comes in without a turn; who is not has the next one, though the queue is full."""
+    await door.auth.verify("zoe", RIGHT, "home")
+    door.hasher.go.clear()
     async with asyncio.TaskGroup() as group:
-        results = await held(auth, group, MAX_WAITING)
-        with pytest.raises(TooManyLogins):
-            await auth.verify("one_more", RIGHT)
-        assert (await auth.verify("zoe", RIGHT)).name == "zoe"
-        assert results == []
-        for _ in range(HASH_WORKERS):
-            auth._slots.release()
-    assert results == [WrongCredentials] * MAX_WAITING
-    with pytest.raises(WrongCredentials):
-        await auth.verify("one_more", RIGHT)
+        await door.flood(group, HASH_WORKERS + MAX_WAITING, "bad")
+        assert (await door.auth.verify("zoe", RIGHT, "home")).name == "zoe"
+        await door.flood(group, 5, "bad")
+        assert door.outcomes == [TooManyLogins] * 5
+        stranger = group.create_task(door.auth.verify("yan", RIGHT, "elsewhere"))
+        await settle()
+        assert not stranger.done()
+        door.hasher.go.set()
+    assert stranger.result().name == "yan"
+    # After those that were begun before and at most one from the flood.
+    assert door.hasher.verified.index(RIGHT, 1) <= 1 + HASH_WORKERS + 1
 
 
-async def test_wrong_passwords_that_waited_together_are_counted_all_the_same(auth: Authenticator) -> None:
-    for _ in range(HASH_WORKERS - 1):
-        await auth._slots.acquire()
+async def test_many_addresses_share_what_there_is(door: Door) -> None:
+    door.hasher.go.clear()
     async with asyncio.TaskGroup() as group:
-        results = await held(auth, group, MAX_FAILURES + 5, "zoe")
-    assert results.count(WrongCredentials) == MAX_FAILURES
-    assert results.count(TooManyFailures) == 5
+        for number in range(CROWDS):
+            await door.flood(group, MAX_WAITING, f"bad{number}")
+        begun = len(door.hasher.verified)
+        stranger = group.create_task(door.auth.verify("yan", RIGHT, "elsewhere"))
+        await settle()
+        door.hasher.go.set()
+    assert stranger.result().name == "yan"
+    assert door.hasher.verified.index(RIGHT) <= begun + CROWDS + HASH_WORKERS
+
+
+async def test_wrong_passwords_that_wait_together_are_counted_all_the_same(door: Door) -> None:
+    door.hasher.go.clear()
+    async with asyncio.TaskGroup() as group:
+        for number in range(20):
+            group.create_task(door.log_in("zoe", client_digest(str(number)), "bad"))
+        await settle()
+        assert door.outcomes == [TooManyFailures] * 9
+        door.hasher.go.set()
+    assert door.outcomes.count(WrongCredentials) == 11

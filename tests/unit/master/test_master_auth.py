@@ -8,11 +8,14 @@ import pytest
 from argon2 import PasswordHasher
 from support.master_world import World
 
-from rce_master.auth import MAX_FAILURES, Authenticator, client_digest
+from rce_master.auth import Authenticator, client_digest
 from rce_master.exceptions import TooManyFailures, WrongCredentials
 from rce_master.state import commands
-from rce_master.state.records import User, UserRole
+from rce_master.state.records import KnownLogin, User, UserRole
+from rce_master.state.tables import Tables
+from rce_master.throttle import FREE, PACE_S
 
+KEY = b"a key"
 RIGHT, WRONG = client_digest("right"), client_digest("wrong")
 
 
@@ -27,13 +30,16 @@ class CountingHasher(PasswordHasher):
 
 
 class Gate:
-    def __init__(self) -> None:
+    def __init__(self, tables: Tables | None = None, hasher: CountingHasher | None = None) -> None:
         self.world = World()
-        self.hasher = CountingHasher()
+        self.hasher = hasher or CountingHasher()
         self.now = 0.0
-        user = User(name="zoe", role=UserRole.USER, password=self.hasher.hash(RIGHT), created=0.0)
+        self.password = self.hasher.hash(RIGHT)
+        user = User(name="zoe", role=UserRole.USER, password=self.password, created=0.0)
         self.world.do(commands.AddUser(user=user))
-        self.auth = Authenticator(self.world.state.tables, hasher=self.hasher, clock=lambda: self.now)
+        self.auth = Authenticator(
+            tables or self.world.state.tables, hasher=self.hasher, clock=lambda: self.now, key=KEY
+        )
 
 
 @pytest.fixture
@@ -51,8 +57,15 @@ async def test_right_and_wrong_passwords(gate: Gate) -> None:
 
 
 async def test_a_storm_of_reconnects_costs_one_hash(gate: Gate) -> None:
-    gate.auth._slots = asyncio.Semaphore(1)
-    await asyncio.gather(*(gate.auth.verify("zoe", RIGHT) for _ in range(200)))
+    await asyncio.gather(*(gate.auth.verify("zoe", RIGHT, "192.0.2.1") for _ in range(200)))
+    assert gate.hasher.verified == 1
+
+
+async def test_a_login_that_is_given_up_takes_no_other_with_it(gate: Gate) -> None:
+    first, second = (asyncio.create_task(gate.auth.verify("zoe", RIGHT)) for _ in range(2))
+    await asyncio.sleep(0)
+    first.cancel()
+    assert (await second).name == "zoe"
     assert gate.hasher.verified == 1
 
 
@@ -62,17 +75,73 @@ async def test_an_unknown_user_takes_a_hash_too(gate: Gate) -> None:
     assert gate.hasher.verified == 1
 
 
-async def test_too_many_failures_lock_out_guesses_but_not_who_is_known(gate: Gate) -> None:
-    await gate.auth.verify("zoe", RIGHT)
-    for _ in range(MAX_FAILURES):
+async def guess(gate: Gate, count: int, address: str = "192.0.2.66") -> None:
+    for number in range(count):
         with pytest.raises(WrongCredentials):
-            await gate.auth.verify("zoe", WRONG)
-    verified = gate.hasher.verified
-    with pytest.raises(TooManyFailures, match="try again in 60 s"):
-        await gate.auth.verify("zoe", client_digest("another guess"))
-    assert gate.hasher.verified == verified
+            await gate.auth.verify("zoe", client_digest(f"guess {number}"), address)
+
+
+async def test_guesses_from_one_address_hold_up_nobody_else(gate: Gate) -> None:
+    """A password that is right gets in from elsewhere at once, though no check of it was ever made."""
+    await guess(gate, FREE)
+    delayed = asyncio.create_task(gate.auth.verify("zoe", client_digest("eleventh"), "192.0.2.66"))
+    await asyncio.sleep(0)
+    with pytest.raises(TooManyFailures, match="from your address; try again in 6 s"):
+        await gate.auth.verify("zoe", client_digest("twelfth"), "192.0.2.66")
+    assert gate.hasher.verified == FREE
+    assert (await gate.auth.verify("zoe", RIGHT, "192.0.2.1")).name == "zoe"
+    assert (await gate.auth.verify("zoe", RIGHT, "192.0.2.66")).name == "zoe"
+    assert not delayed.done()
+    delayed.cancel()
+
+
+async def test_who_is_right_is_slowed_down_and_not_refused(
+    gate: Gate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Behind one address with somebody who guesses, an unknown password waits, and then gets in."""
+    slept = []
+
+    async def sleep(seconds: float) -> None:
+        slept.append(seconds)
+
+    await guess(gate, FREE)
+    monkeypatch.setattr("rce_master.auth.asyncio.sleep", sleep)
+    assert (await gate.auth.verify("zoe", RIGHT, "192.0.2.66")).name == "zoe"
+    assert slept == [PACE_S]
+
+
+async def test_a_right_password_is_known_over_a_restart(gate: Gate) -> None:
+    """Guesses come first after the restart, from the fleet's own address; the fleet gets in at once."""
+    kept = []
+
+    async def remember(login: KnownLogin) -> None:
+        kept.append(login)
+        gate.world.do(commands.RememberLogin(login=login))
+
+    tables = gate.world.state.tables
+    gate.auth._remember, gate.auth._key = remember, KEY
     await gate.auth.verify("zoe", RIGHT)
-    gate.now = 61.0
+    assert [login.user for login in kept] == ["zoe"]
+    assert RIGHT not in kept[0].mark
+    restarted = Gate(tables, gate.hasher)
+    try:
+        await guess(restarted, FREE)
+        before = gate.hasher.verified
+        assert (await restarted.auth.verify("zoe", RIGHT, "192.0.2.66")).name == "zoe"
+        assert gate.hasher.verified == before
+        new = await restarted.auth.hash(client_digest("new"))
+        gate.world.do(commands.SetPassword(name="zoe", password=new))
+        assert len(tables.known_logins) == 0
+        with pytest.raises(WrongCredentials):
+            await restarted.auth.verify("zoe", RIGHT, "192.0.2.1")
+    finally:
+        restarted.auth.close()
+
+
+async def test_marks_made_with_another_key_are_worth_nothing(gate: Gate) -> None:
+    forged = KnownLogin(user="zoe", mark=gate.auth._mark("zoe", gate.password, WRONG))
+    gate.auth._key = b"another key"
+    gate.world.do(commands.RememberLogin(login=forged))
     with pytest.raises(WrongCredentials):
         await gate.auth.verify("zoe", WRONG)
 

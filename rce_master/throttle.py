@@ -1,0 +1,64 @@
+"""Slows down who guesses passwords, by address and user (pure: the time is an argument).
+
+A check that fails costs a token of two buckets: that of the address and user, and that of the address. When a
+bucket is empty the next check has to wait for a token; only when that takes longer than anybody waits at a
+door it is refused. A check that succeeds costs nothing, so a fleet behind one address is never slowed down
+by itself, and wrong passwords from one address cost those at other addresses nothing.
+"""
+
+from __future__ import annotations
+
+from rce.guard.rates import Rates
+from rce_master.exceptions import TooManyFailures
+
+FREE = 10
+"""Failures of a user at an address that are not slowed down."""
+PACE_S = 3.0
+"""Seconds for each further one."""
+FREE_OF_ADDRESS = 100
+"""The same of all users at an address."""
+PACE_OF_ADDRESS_S = 0.5
+MAX_DELAY_S = 5.0
+"""Longest that a check is put off; less than a robot endpoint waits for the master's answer."""
+MAX_DELAYED = 256
+"""Checks that are put off at the same time."""
+_LONGEST_NAME = 64
+
+
+class FailureThrottle:
+    """Counts failures and says how long the next check has to wait."""
+
+    def __init__(self) -> None:
+        self._pairs = Rates(per_second=1 / PACE_S, burst=FREE)
+        self._addresses = Rates(per_second=1 / PACE_OF_ADDRESS_S, burst=FREE_OF_ADDRESS)
+        self.delayed = 0
+        """Checks that are put off now; to be counted by whoever waits."""
+
+    def admit(self, address: str, user: str, now: float) -> float:
+        """Count a check as a failure, until :meth:`passed` takes it back.
+
+        Args:
+            address: Where it comes from.
+            user: Whose password it is said to be; need not exist.
+            now: Seconds of a clock that never goes back.
+
+        Returns:
+            Seconds to wait before the check.
+
+        Raises:
+            TooManyFailures: It would have to wait too long; nothing was counted.
+        """
+        delay = max(self._pairs.reserve(_pair(address, user), now), self._addresses.reserve(address, now))
+        if delay > MAX_DELAY_S or (delay and self.delayed >= MAX_DELAYED):
+            self.passed(address, user, now)
+            raise TooManyFailures(max(1.0, delay))
+        return delay
+
+    def passed(self, address: str, user: str, now: float) -> None:
+        """Take back what :meth:`admit` counted: the check succeeded, or was not made."""
+        self._pairs.give_back(_pair(address, user), now)
+        self._addresses.give_back(address, now)
+
+
+def _pair(address: str, user: str) -> str:
+    return f"{address} {user[:_LONGEST_NAME]}"

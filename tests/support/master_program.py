@@ -1,0 +1,86 @@
+"""``rce-master`` and the ``rce`` commands for it as real processes."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SCRIPT = "from rce.cli.main import build_app; from importlib.metadata import EntryPoint;"
+COMMANDS = {
+    "user": "rce_master.cli.users:app",
+    "login": "rce_master.cli.session:login",
+    "logout": "rce_master.cli.session:logout",
+    "robot": "rce_master.cli.tokens:robots",
+    "token": "rce_master.cli.tokens:tokens",
+    "ps": "rce_master.cli.show:ps",
+    "logs": "rce_master.cli.follow:logs",
+    "events": "rce_master.cli.follow:events",
+}
+
+
+def environment(folder: Path) -> dict[str, str]:
+    return {
+        **{key: value for key, value in os.environ.items() if not key.startswith("RCE_")},
+        "RCE_SECRET": "a secret for the tests",
+        "RCE_LOGIN_FILE": str(folder / "login.json"),
+        "XDG_STATE_HOME": str(folder / "home"),
+    }
+
+
+async def rce(folder: Path, command: str, *args: str, text: str = "", code: int = 0) -> str:
+    """Run a command of the ``rce`` program; returns what it printed."""
+    point = f"[EntryPoint({command!r}, {COMMANDS[command]!r}, 'rce.commands')]"
+    process = await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-c",
+        f"{SCRIPT} build_app({point})(prog_name='rce')",
+        command,
+        *args,
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
+        env=environment(folder),
+    )
+    output, _ = await process.communicate(text.encode())
+    assert process.returncode == code, output.decode()
+    return output.decode()
+
+
+@asynccontextmanager
+async def master(folder: Path, *args: str, end: signal.Signals = signal.SIGTERM) -> AsyncIterator[str]:
+    """Run ``rce-master`` and give its address."""
+    with (folder / "master.log").open("ab") as log:
+        process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            *(
+                "-m",
+                "rce_master",
+                "--http-port",
+                "0",
+                "--control-port",
+                "0",
+                "--state-dir",
+                str(folder / "state"),
+            ),
+            *args,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=log,
+            env=environment(folder),
+        )
+    try:
+        assert process.stdout is not None
+        line = (await asyncio.wait_for(process.stdout.readline(), 30)).decode()
+        assert line.startswith("rce-master ready: http://127.0.0.1:"), line
+        yield line.split()[-1]
+    finally:
+        process.send_signal(end)
+        code = await process.wait()
+    assert code == (0 if end != signal.SIGKILL else -signal.SIGKILL)
