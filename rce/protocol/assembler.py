@@ -19,7 +19,7 @@ from rce.protocol.exceptions import AssemblyError
 from rce.protocol.limits import DEFAULT_LIMITS, Limits
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator
 
 ID_LENGTH = 32
 """Length of the id at the start of a binary frame, in bytes."""
@@ -119,6 +119,34 @@ class Assembler:
         if id_ in self._awaited:
             raise AssemblyError(f"binary value {id_} is referred to twice")
         return self._await(value, {id_: (holder, 0)}, size, now)
+
+    def add_references(
+        self, value: Any, ids: Collection[str], holder: dict[str, Any], size: int, now: float
+    ) -> tuple[bool, list[str]]:
+        """Take a message of which it is known already which binary values it refers to.
+
+        Args:
+            value: What :meth:`add_binary` returns when it is complete.
+            ids: What it refers to, each 32 hexadecimal characters.
+            holder: Where the binary values are put, by id.
+            size: As for :meth:`add_message`.
+            now: Seconds on the caller's clock.
+
+        Returns:
+            As :meth:`add_message`.
+
+        Raises:
+            AssemblyError: Another message refers to one of the ids.
+        """
+        for id_ in ids:
+            if id_ in self._awaited:
+                raise AssemblyError(f"binary value {id_} is referred to twice")
+        return self._await(value, {id_: (holder, id_) for id_ in ids}, size, now)
+
+    @property
+    def awaited(self) -> list[str]:
+        """The ids of the binary values that messages wait for."""
+        return list(self._awaited)
 
     def _await(
         self, value: Any, places: dict[str, tuple[Any, Any]], size: int, now: float

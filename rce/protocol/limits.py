@@ -12,8 +12,12 @@ MAX_MESSAGE_ID_LENGTH = 255
 class Limits:
     """Limits of one connection."""
 
-    max_text: int = 64 * 2**20
+    max_text: int = 16 * 2**20
     """Longest text frame: characters if given as ``str``, else bytes."""
+    max_elements: int = 200_000
+    """Objects, lists and members of objects in one text; counted before it is parsed."""
+    max_values: int = 2_000_000
+    """All values in one text, those in lists too."""
     max_request: int = 2**20
     """The same for what is no data message: requests are carried out by the one master of all robots."""
     max_binary: int = 64 * 2**20

@@ -88,6 +88,10 @@ _ITEMS: dict[str, type[Struct]] = {
 }
 _CONNECTION_ITEMS: dict[str, type[Struct]] = {"connect": Connection, "disconnect": Connection}
 
+_MAX_ITEMS = 1024
+"""Items of all lists of one ``CN`` or ``CX``: each is read on its own."""
+_MAX_FAULTS = 32
+"""Wrong items of one ``CN`` or ``CX`` that are told of one by one."""
 _MAX_QUOTED = 80
 _SHORT = 4096
 
@@ -291,6 +295,11 @@ def _below(place: str, key: str) -> str:
 
 def _read_items(data: dict[str, Any], kinds: dict[str, type[Struct]]) -> dict[str, Any]:
     """Read each item of each list on its own, so that a bad one harms no other."""
+    count = sum(len(items) for key in kinds if isinstance(items := data.get(key), list))
+    if count > _MAX_ITEMS:
+        raise MessageError(
+            "data", f"{count} items are over the limit of {_MAX_ITEMS}; send them in several messages"
+        )
     read: dict[str, Any] = {}
     faults: list[str] = []
     for key, cls in kinds.items():
@@ -310,6 +319,8 @@ def _read_items(data: dict[str, Any], kinds: dict[str, type[Struct]]) -> dict[st
                 faults.append(str(error))
             else:
                 good.append(made)
+    if len(faults) > _MAX_FAULTS:
+        faults[_MAX_FAULTS:] = [f"data: {len(faults) - _MAX_FAULTS} more items are wrong"]
     read["faults"] = faults
     return read
 

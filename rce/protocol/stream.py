@@ -31,6 +31,7 @@ from rce.protocol.reading import (
     message_from_json,
     parse_json,
 )
+from rce.protocol.weight import Address, find_address, is_light
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -53,7 +54,25 @@ class Fault(Struct, frozen=True):
         return cls(problem if call is None else f"{call}: {problem}", call)
 
 
-Event: TypeAlias = ClientMessage | Fault
+class LargeData(Struct, frozen=True):
+    """A data message that costs too much to be parsed where it came in: :func:`rce.protocol.large.read_large`.
+
+    It is given out as it came. If it turns out to refer to binary values, give their ids to
+    :meth:`ProtocolStream.await_binaries`; it comes out again when they are there.
+    """
+
+    address: Address
+    text: bytes
+    binaries: dict[str, memoryview] = {}
+    """By id."""
+
+    @property
+    def size(self) -> int:
+        """Bytes of all its frames."""
+        return len(self.text) + sum(map(len, self.binaries.values()))
+
+
+Event: TypeAlias = ClientMessage | LargeData | Fault
 """What comes out of a stream."""
 
 
@@ -77,6 +96,20 @@ class _Serialized:
         return DataMessage(data.i_tag, data.type, self.holder[0], data.msg_id)
 
 
+class _WaitingLarge:
+    """A large message that waits for its binary values."""
+
+    __slots__ = ("_large", "binaries")
+
+    def __init__(self, large: LargeData) -> None:
+        self._large = large
+        self.binaries: dict[str, Any] = {}
+
+    def message(self) -> LargeData:
+        """Return the message with its binary values."""
+        return LargeData(self._large.address, self._large.text, self.binaries)
+
+
 class ProtocolStream:
     """Reads one peer's frames.
 
@@ -84,15 +117,18 @@ class ProtocolStream:
     Binary values in messages are memoryviews of the frames they came in.
     """
 
-    def __init__(self, accept: Collection[str], limits: Limits = DEFAULT_LIMITS) -> None:
+    def __init__(
+        self, accept: Collection[str], limits: Limits = DEFAULT_LIMITS, *, defer_large: bool = False
+    ) -> None:
         self._accept = accept
         self._limits = limits
+        self._defer_large = defer_large
         self._assembler = Assembler(limits)
 
     @classmethod
     def for_engine(cls, limits: Limits = DEFAULT_LIMITS) -> Self:
-        """Make the engine's side, which reads what clients send."""
-        return cls(UPWARD, limits)
+        """Make the engine's side, which reads what clients send, and leaves large messages to others."""
+        return cls(UPWARD, limits, defer_large=True)
 
     @classmethod
     def for_client(cls, limits: Limits = DEFAULT_LIMITS) -> Self:
@@ -128,6 +164,8 @@ class ProtocolStream:
         limits = self._limits
         if len(text) > limits.max_text:
             return [Fault(f"a text frame of {len(text)} is longer than the limit of {limits.max_text}")]
+        if self._defer_large and isinstance(text, bytes) and not is_light(text):
+            return [self._defer(text)]
         shallow = is_shallow(text, limits.max_depth)
         starred = _may_be_starred(text)
         value: Any = None
@@ -153,6 +191,23 @@ class ProtocolStream:
         except ProtocolError as error:
             return [Fault.of(str(error), call_of(value))]
         return self._events(value if complete else None, dropped)
+
+    def await_binaries(self, large: LargeData, ids: Collection[str], now: float) -> list[Event]:
+        """Have a large message wait for the binary values that it refers to.
+
+        Args:
+            large: As it came out.
+            ids: The ids that were found in it, in order.
+            now: Seconds on the caller's clock.
+        """
+        waiting = _WaitingLarge(large)
+        try:
+            complete, dropped = self._assembler.add_references(
+                waiting, ids, waiting.binaries, len(large.text), now
+            )
+        except ProtocolError as error:
+            return [Fault(str(error))]
+        return self._events(waiting if complete else None, dropped)
 
     def feed_binary(self, frame: Binary, now: float) -> list[Event]:
         """Take a binary frame, which is kept and must not be changed afterwards.
@@ -185,9 +240,19 @@ class ProtocolStream:
             events.append(self._message(value))
         return events
 
+    def _defer(self, text: bytes) -> Event:
+        address = find_address(text)
+        if address is None:
+            return Fault(
+                f"a text of {len(text)} bytes is too large for a request, and no data message: "
+                "it has no iTag in its first or last 4096 bytes"
+            )
+        return LargeData(address, text)
+
     def _message(self, value: Any) -> Event:
-        if type(value) is _Serialized:
-            return value.message()
+        if type(value) is _Serialized or type(value) is _WaitingLarge:
+            message: Event = value.message()
+            return message
         try:
             return message_from_json(value, self._accept)
         except ProtocolError as error:

@@ -1,0 +1,127 @@
+"""How costly a JSON text is to parse, found by scans in C that make no objects.
+
+A text is *light* if parsing it, and converting what it holds, takes a few milliseconds at most. What is not
+light is parsed elsewhere than in an event loop. The measures count bytes, also those inside strings: a light
+text is light, a heavy one may turn out not to be.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import NamedTuple
+
+from rce.protocol.exceptions import MessageError
+
+_SHORT = 8 << 10
+"""Bytes up to which a text is light whatever it holds."""
+_SLICE = 64 << 10
+"""Bytes that are counted at a time."""
+_MAX_OPENERS = 2048
+_MAX_COMMAS = 16384
+_MAX_ESCAPES = 16384
+_ANY_CHARACTERS = 1 << 20
+"""Bytes up to which a light text may hold characters beyond ASCII and any number of escapes."""
+_MAX_LIGHT = 12 << 20
+
+_EDGE = 4096
+"""Where the small values of a large message are: before its one large value, or after it."""
+_TAG = re.compile(rb'"iTag"\s*:\s*"([^"\\]{1,256})"')
+_CLASS = re.compile(rb'"type"\s*:\s*"([^"\\]{1,256}/[^"\\]{1,256})"')
+_MSG = re.compile(rb'"msg\*?"\s*:')
+_STRING = re.compile(rb'"[^"\\]*+(?:\\.[^"\\]*+)*+"', re.DOTALL)
+
+
+class Address(NamedTuple):
+    """Where a data message goes, as its text seems to tell."""
+
+    i_tag: str
+    type: str
+    """Empty if it was not found."""
+
+
+def is_light(text: bytes) -> bool:
+    """Tell whether a text can be parsed and converted within a few milliseconds."""
+    size = len(text)
+    if size <= _SHORT:
+        return True
+    return (
+        size <= _MAX_LIGHT
+        and _has_at_most(text, b",", _MAX_COMMAS)
+        and _has_at_most(text, b"[", _MAX_OPENERS)
+        and _has_at_most(text, b"{", _MAX_OPENERS)
+        and (size <= _ANY_CHARACTERS or (text.isascii() and _has_at_most(text, b"\\", _MAX_ESCAPES)))
+    )
+
+
+def check_elements(text: bytes, *, max_elements: int, max_values: int) -> None:
+    """Check how much a text holds, before anything is made of it.
+
+    Args:
+        text: JSON in UTF-8.
+        max_elements: How many objects, lists and members of objects it may hold together.
+        max_values: How many values in all.
+
+    Raises:
+        MessageError: It holds more.
+    """
+    elements, values = _count(text)
+    if elements > max_elements or values > max_values:
+        elements, values = _count(_STRING.sub(b'""', text))  # what stands in strings is text
+    if elements > max_elements:
+        raise MessageError(
+            "",
+            f"a message of {elements} objects, lists and members is over the limit of {max_elements}; "
+            "send large data as binary values or through a Forwarder",
+        )
+    if values > max_values:
+        raise MessageError(
+            "",
+            f"a message of {values} values is over the limit of {max_values}; "
+            "send large data as binary values or through a Forwarder",
+        )
+
+
+def find_address(text: bytes) -> Address | None:
+    """Find where a large data message goes without parsing it.
+
+    All values of a data message but ``msg`` are short, so they stand near the beginning or near the end of
+    the text, whatever the order of its keys.
+
+    Returns:
+        What seems to be the address; whoever parses the text must compare. ``None``: it has none there.
+    """
+    head, tail = text[:_EDGE], text[-_EDGE:]
+    msg = _MSG.search(head)
+    head = head[: msg.start()] if msg is not None else head
+    tag = _TAG.search(head) or _last(_TAG, tail)
+    if tag is None:
+        return None
+    type_ = _CLASS.search(head) or _last(_CLASS, tail)
+    return Address(
+        tag[1].decode(errors="replace"), type_[1].decode(errors="replace") if type_ is not None else ""
+    )
+
+
+def _last(pattern: re.Pattern[bytes], text: bytes) -> re.Match[bytes] | None:
+    last = None
+    for last in pattern.finditer(text):  # noqa: B007 - the last one is wanted
+        pass
+    return last
+
+
+def _has_at_most(text: bytes, character: bytes, most: int) -> bool:
+    """Count a character, but not further than needed; where there is none, ``find`` is faster than ``count``."""
+    count, place = 0, text.find(character)
+    while place >= 0:
+        end = place + _SLICE
+        count += text.count(character, place, end)
+        if count > most:
+            return False
+        place = text.find(character, end)
+    return True
+
+
+def _count(text: bytes) -> tuple[int, int]:
+    """Return the objects, lists and members of a text, and its values, if nothing stands in strings."""
+    openers = text.count(b"[") + text.count(b"{")
+    return openers + text.count(b":"), openers + text.count(b",") + 1

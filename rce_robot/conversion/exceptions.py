@@ -1,0 +1,15 @@
+"""What can go wrong when a conversion is left to another process.
+
+::
+
+    RobotError
+    +-- ConversionFailed    it took too long, needed too much memory, or too many wait
+"""
+
+from __future__ import annotations
+
+from rce_robot.exceptions import RobotError
+
+
+class ConversionFailed(RobotError):  # noqa: N818 - reads as what happened
+    """A conversion was given up; the text is fit for an ``ER``."""

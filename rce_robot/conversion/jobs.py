@@ -1,0 +1,82 @@
+"""What a worker process is asked and what it answers, as bytes.
+
+A packet is a header, the lengths of its parts, a part of MessagePack that describes it, and parts that are
+passed on as they are: texts, payloads, binary values.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, TypeAlias
+
+import msgspec
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rce_robot.outbox import Buffer
+
+HEAD = struct.Struct("!I")
+"""How many parts follow."""
+MAX_PARTS = 8192
+
+
+class ReadText(msgspec.Struct, frozen=True, kw_only=True, tag="text"):
+    """Parse a data message and serialize what it carries. Parts: the text, then its binary values."""
+
+    i_tag: str
+    type: str
+    """As they were found in the text; ``type`` may be empty."""
+    cls: str
+    interface_type: str
+    ids: tuple[str, ...] = ()
+    """Of the binary values."""
+
+
+class ReadValue(msgspec.Struct, frozen=True, kw_only=True, tag="value"):
+    """Serialize a message that was parsed already. Part: the value in MessagePack."""
+
+    cls: str
+    interface_type: str
+
+
+class Show(msgspec.Struct, frozen=True, kw_only=True, tag="show"):
+    """Make the data message that carries a payload to the robot. Part: the payload."""
+
+    i_tag: str
+    cls: str
+    interface_type: str
+    msg_id: str
+
+
+Job: TypeAlias = ReadText | ReadValue | Show
+
+
+class Result(msgspec.Struct, frozen=True, kw_only=True):
+    """What became of a job.
+
+    Parts: of a read, the serialized message; of :class:`Show`, the text and its binary frames, ids included;
+    none if there is a fault.
+    """
+
+    fault: str = ""
+    """Why there is no result, for the robot."""
+    warnings: tuple[str, ...] = ()
+    ids: tuple[str, ...] = ()
+    """Binary values that the text refers to and that must come first."""
+    msg_id: str = ""
+    text: str | None = None
+    """The message was a string: a service's word for why it failed."""
+
+
+encode_meta = msgspec.msgpack.Encoder().encode
+decode_job = msgspec.msgpack.Decoder(Job).decode
+decode_result = msgspec.msgpack.Decoder(Result).decode
+
+
+def pack(meta: Job | Result, parts: Sequence[Buffer]) -> list[Buffer]:
+    """Return the buffers of a packet, to be written one after the other."""
+    described = encode_meta(meta)
+    sizes = [len(described), *map(len, parts)]
+    head = HEAD.pack(len(sizes)) + struct.pack(f"!{len(sizes)}Q", *sizes)
+    return [head + described, *parts]

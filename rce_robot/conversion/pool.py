@@ -1,0 +1,199 @@
+"""Shares a few worker processes among users: in turn, one job of a user at a time while others wait.
+
+There is no process before the first job, and none is left when there was no job for a while. A process that
+takes too long for a job is killed, and so ends what a message made it do.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+from collections import Counter, OrderedDict, deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rce_robot.conversion.exceptions import ConversionFailed
+from rce_robot.conversion.process import WorkerProcess
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from rce_robot.conversion.jobs import Job, Result
+    from rce_robot.outbox import Buffer
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConversionSettings:
+    """How large messages are converted."""
+
+    workers: int = max(2, min(4, (os.cpu_count() or 1) - 1))
+    """Processes at most. A user has one fewer, so that there is one for others."""
+    memory: int = 768 << 20
+    """What one process may use, in bytes."""
+    timeout: float = 10.0
+    """Seconds that one conversion may take."""
+    idle: float = 10.0
+    """Seconds without a conversion after which a process ends."""
+    waiting: int = 64
+    """Conversions of one user that may wait."""
+
+
+@dataclass(eq=False, slots=True)
+class _Order:
+    user: str
+    job: Job
+    parts: Sequence[Buffer]
+    answer: asyncio.Future[tuple[Result, list[memoryview]]]
+
+
+class ConversionPool:
+    """The worker processes of an endpoint.
+
+    Invariant: a user is in ``_waiting`` exactly while orders of theirs wait.
+
+    Args:
+        packages: Folders with packages that define messages.
+        settings: How many processes, and what each may use.
+
+    Attributes:
+        killed: How many conversions were given up because they took too long.
+    """
+
+    def __init__(
+        self, packages: Sequence[Path] = (), settings: ConversionSettings = ConversionSettings()
+    ) -> None:
+        self._packages = packages
+        self._settings = settings
+        self._waiting: OrderedDict[str, deque[_Order]] = OrderedDict()
+        self._running: Counter[str] = Counter()
+        self._idle: dict[WorkerProcess, asyncio.TimerHandle] = {}
+        self._count = 0
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._closed = False
+        self.killed = 0
+
+    async def convert(
+        self, user: str, job: Job, parts: Sequence[Buffer]
+    ) -> tuple[Result, list[memoryview]]:
+        """Do a job when it is the user's turn. A job that nobody waits for any more is not begun.
+
+        Args:
+            user: Whose message it is.
+            job: What to do.
+            parts: The bytes that belong to it.
+
+        Raises:
+            ConversionFailed: Too many of the user's wait, it took too long, or too much memory.
+        """
+        if self._closed:
+            raise ConversionFailed("the robot endpoint is shutting down")
+        orders = self._waiting.setdefault(user, deque())
+        if len(orders) >= self._settings.waiting:
+            raise ConversionFailed(f"{len(orders)} large messages wait to be converted already")
+        order = _Order(user, job, parts, asyncio.get_running_loop().create_future())
+        orders.append(order)
+        self._go_on()
+        try:
+            return await order.answer
+        finally:
+            self._withdraw(order)
+
+    async def close(self) -> None:
+        """End all processes; what waits fails."""
+        self._closed = True
+        for orders in self._waiting.values():
+            for order in orders:
+                if not order.answer.done():
+                    order.answer.set_exception(ConversionFailed("the robot endpoint is shutting down"))
+        self._waiting.clear()
+        for task in self._tasks:
+            task.cancel()
+        if self._tasks:
+            await asyncio.wait(self._tasks)
+        for worker, timer in list(self._idle.items()):
+            timer.cancel()
+            await worker.end()
+        self._idle.clear()
+
+    def _withdraw(self, order: _Order) -> None:
+        orders = self._waiting.get(order.user)
+        if orders is not None and order in orders:
+            orders.remove(order)
+        if orders is not None and not orders:
+            del self._waiting[order.user]
+
+    def _go_on(self) -> None:
+        """Begin what can be begun."""
+        while not self._closed and (order := self._next()) is not None:
+            if self._idle:
+                worker, timer = self._idle.popitem()
+                timer.cancel()
+            else:
+                worker = WorkerProcess(self._packages, self._settings.memory)
+                self._count += 1
+            self._running[order.user] += 1
+            task = asyncio.get_running_loop().create_task(self._serve(worker, order))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+
+    def _next(self) -> _Order | None:
+        """Take the next order, user by user in turn."""
+        if not self._idle and self._count >= self._settings.workers:
+            return None
+        for user in list(self._waiting):
+            if self._running[user] < max(1, self._settings.workers - 1):
+                orders = self._waiting[user]
+                order = orders.popleft()
+                self._waiting.move_to_end(user)
+                if not orders:
+                    del self._waiting[user]
+                return order
+        return None
+
+    async def _serve(self, worker: WorkerProcess, order: _Order) -> None:
+        """Have an order done; afterwards the worker is idle, or gone."""
+        sound = False
+        try:
+            result = await self._do(worker, order)
+            sound = True
+            if not order.answer.done():
+                order.answer.set_result(result)
+        except (ConversionFailed, OSError) as error:
+            if not order.answer.done():
+                order.answer.set_exception(ConversionFailed(str(error)))
+        finally:
+            if not order.answer.done():
+                order.answer.set_exception(ConversionFailed("the robot endpoint is shutting down"))
+            self._running -= Counter([order.user])
+            if sound and not self._closed:
+                loop = asyncio.get_running_loop()
+                self._idle[worker] = loop.call_later(self._settings.idle, self._retire, worker)
+            else:
+                self._count -= 1
+                await worker.end()
+            self._go_on()
+
+    async def _do(self, worker: WorkerProcess, order: _Order) -> tuple[Result, list[memoryview]]:
+        if not worker.pid:
+            await worker.start()
+        try:
+            async with asyncio.timeout(self._settings.timeout):
+                return await worker.do(order.job, order.parts)
+        except TimeoutError as error:
+            self.killed += 1
+            _log.warning("user %s: a conversion was given up after %g s", order.user, self._settings.timeout)
+            raise ConversionFailed(
+                f"converting the message takes more than {self._settings.timeout:g} s"
+            ) from error
+
+    def _retire(self, worker: WorkerProcess) -> None:
+        """End a process that had nothing to do for a while."""
+        if self._idle.pop(worker, None) is not None:
+            self._count -= 1
+            task = asyncio.get_running_loop().create_task(worker.end())
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)

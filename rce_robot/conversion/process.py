@@ -1,0 +1,174 @@
+"""A worker process as the event loop sees it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import socket
+import struct
+import sys
+from typing import TYPE_CHECKING, cast
+
+from rce_robot.conversion.exceptions import ConversionFailed
+from rce_robot.conversion.jobs import HEAD, MAX_PARTS, decode_result, pack
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from rce_robot.conversion.jobs import Job, Result
+    from rce_robot.outbox import Buffer
+
+_START_TIMEOUT_S = 60.0
+_MAX_PACKET = 1 << 30
+
+
+class WorkerProcess:
+    """A process that does one job at a time.
+
+    Args:
+        packages: Folders with packages that define messages.
+        memory: What it may use, in bytes.
+    """
+
+    def __init__(self, packages: Sequence[Path], memory: int) -> None:
+        self._packages = packages
+        self._memory = memory
+        self._process: asyncio.subprocess.Process | None = None
+        self._transport: asyncio.Transport | None = None
+        self._reader = _PacketReader()
+
+    @property
+    def pid(self) -> int:
+        """Of the process; 0 before it is there."""
+        return 0 if self._process is None else self._process.pid
+
+    async def start(self) -> None:
+        """Start the process and wait until it is ready.
+
+        Raises:
+            ConversionFailed: It does not become ready.
+        """
+        ours, theirs = socket.socketpair()
+        loop = asyncio.get_running_loop()
+        with theirs:
+            try:
+                self._process = await asyncio.create_subprocess_exec(
+                    sys.executable,
+                    "-m",
+                    "rce_robot.conversion.worker",
+                    str(theirs.fileno()),
+                    str(self._memory >> 20),
+                    *map(str, self._packages),
+                    pass_fds=[theirs.fileno()],
+                    stdin=asyncio.subprocess.DEVNULL,
+                    stdout=asyncio.subprocess.DEVNULL,
+                    start_new_session=True,
+                    env={key: value for key, value in os.environ.items() if not key.startswith("RCE_SECRET")},
+                )
+            except BaseException:
+                ours.close()
+                raise
+        ours.setblocking(False)
+        transport, _ = await loop.create_connection(lambda: self._reader, sock=ours)
+        self._transport = cast("asyncio.Transport", transport)
+        try:
+            async with asyncio.timeout(_START_TIMEOUT_S):
+                await self._reader.ready
+        except TimeoutError as error:
+            raise ConversionFailed("the process that converts large messages does not start") from error
+
+    async def do(self, job: Job, parts: Sequence[Buffer]) -> tuple[Result, list[memoryview]]:
+        """Do a job.
+
+        Raises:
+            ConversionFailed: The process ended.
+        """
+        assert self._transport is not None
+        answer = self._reader.expect()
+        self._transport.writelines(pack(job, parts))
+        meta, *received = await answer
+        return decode_result(meta), received
+
+    async def end(self) -> None:
+        """Kill the process and wait until it is gone."""
+        if self._transport is not None:
+            self._transport.abort()
+        if self._process is not None:
+            with contextlib.suppress(ProcessLookupError):
+                self._process.kill()
+            await self._process.wait()
+
+
+class _PacketReader(asyncio.BufferedProtocol):
+    """Reads packets straight into memory of their size."""
+
+    def __init__(self) -> None:
+        loop = asyncio.get_running_loop()
+        self.ready: asyncio.Future[None] = loop.create_future()
+        self._answer: asyncio.Future[list[memoryview]] | None = None
+        self._parts: list[memoryview] = []
+        self._sizes: list[int] | None = None
+        self._begin(1)
+
+    def expect(self) -> asyncio.Future[list[memoryview]]:
+        """Return the parts of the next packet, when they are there."""
+        self._answer = asyncio.get_running_loop().create_future()
+        if self._lost:
+            self._fail()
+        return self._answer
+
+    _lost = False
+
+    def get_buffer(self, sizehint: int) -> memoryview:  # noqa: ARG002 - the size is known
+        """Return where the next bytes go."""
+        return self._view[self._filled :]
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """Go on with the next part when one is full."""
+        self._filled += nbytes
+        while self._filled == len(self._view):
+            self._part_received(self._view)
+
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - that it ended is enough
+        """Fail what waits."""
+        self._lost = True
+        if not self.ready.done():
+            self.ready.set_exception(ConversionFailed("the process that converts large messages does not start"))
+        self._fail()
+
+    def _fail(self) -> None:
+        if self._answer is not None and not self._answer.done():
+            self._answer.set_exception(
+                ConversionFailed("the process that converted the message ended; it may need too much memory")
+            )
+
+    def _begin(self, size: int) -> None:
+        self._view = memoryview(bytearray(size))
+        self._filled = 0
+
+    def _part_received(self, part: memoryview) -> None:
+        if not self.ready.done():
+            self.ready.set_result(None)
+            self._begin(HEAD.size)
+        elif self._sizes is None:
+            (count,) = HEAD.unpack(part)
+            if count > MAX_PARTS:
+                raise ConversionFailed(f"a worker answered with {count} parts")
+            self._sizes = []
+            self._begin(8 * count)
+        elif not self._sizes:
+            self._sizes = list(struct.unpack(f"!{len(part) // 8}Q", part))
+            if sum(self._sizes) > _MAX_PACKET:
+                raise ConversionFailed(f"a worker answered with {sum(self._sizes)} bytes")
+            self._begin(self._sizes[0])
+        else:
+            self._parts.append(part)
+            if len(self._parts) < len(self._sizes):
+                self._begin(self._sizes[len(self._parts)])
+                return
+            parts, self._parts, self._sizes = self._parts, [], None
+            self._begin(HEAD.size)
+            if self._answer is not None and not self._answer.done():
+                self._answer.set_result(parts)
