@@ -27,6 +27,7 @@ from rce.link.listening import listen_on
 from rce.link.unix import remove_stale_sockets
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
+from rce_robot.conversion import ConversionPool
 from rce_robot.factory import FormFactory
 from rce_robot.gate import Gate
 from rce_robot.server import serve_robots
@@ -76,7 +77,9 @@ class App:
         if is_any(reach):
             reach = own_address(self.master, self.control_port)
         name = f"robot_{secrets.token_hex(4)}"
-        types = TypeRegistry(_package_index(self.packages))
+        packages = _package_index(self.packages)
+        types = TypeRegistry(packages)
+        pool = ConversionPool(packages.path, settings.conversion)
         hub = LinkHub(machine)
         try:
             address = await _listen(hub, machine, name, reach, settings)
@@ -94,6 +97,7 @@ class App:
                 url=url,
                 address=address,
                 lobby=lobby,
+                pool=pool,
             )
             control = f"ws://{in_url(self.master)}:{self.control_port}"
             channel = TaskSetChannel(control, self.secret, task_set.hello, task_set.handle)
@@ -110,6 +114,7 @@ class App:
                 for task in reversed(running):
                     task.cancel()
         finally:
+            await pool.close()
             await hub.close()
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import msgspec
 
 from rce.protocol.codec import encode_data
+from rce.ros.types.message import element_min_size
 from rce_robot.exceptions import UnreadableError
 from rce_robot.outbox import Outgoing
 
@@ -34,7 +35,12 @@ class Form(Protocol):
     """Reads what the robot sends at an interface and writes what it gets there."""
 
     costly: bool
-    """Whether :meth:`read` and :meth:`show` may take so long that they belong in a thread."""
+    """Whether :meth:`read` and :meth:`show` may take so long that they belong in another process."""
+    readable: bool
+    """Whether there is a message that :meth:`read` takes and that is JSON as a whole."""
+
+    def is_heavy(self, payload: Buffer) -> bool:
+        """Tell whether :meth:`show` takes so long for this payload that it belongs in another process."""
 
     def read(self, msg: Any, warn: Callable[[str], None]) -> Buffer:
         """Return the serialized message.
@@ -62,6 +68,11 @@ class ForwarderForm:
     """Serialized messages travel as binary values and are never looked into."""
 
     costly = False
+    readable = False
+
+    def is_heavy(self, payload: Buffer) -> bool:  # noqa: ARG002 - it is not looked into
+        """Return False."""
+        return False
 
     def read(self, msg: Any, warn: Callable[[str], None]) -> Buffer:  # noqa: ARG002 - nothing is ignored here
         """Return the bytes as they came."""
@@ -88,10 +99,24 @@ class ForwarderForm:
 class ConverterForm:
     """Messages travel as JSON objects; their binary values as binary frames."""
 
+    readable = True
+
     def __init__(self, converter: Converter) -> None:
         self._converter = converter
         self.costly = converter.is_costly
-        self._is_plain = not (self.costly or _holds_bytes(converter.kind))
+        self._holds_bytes = _holds_bytes(converter.kind)
+        self._is_plain = not (self.costly or self._holds_bytes)
+        self._element_size = _element_size(converter.kind)
+
+    def is_heavy(self, payload: Buffer) -> bool:
+        """Tell by the type and the payload's size how many values it may hold, and how long its texts are."""
+        size = len(payload)
+        if self.costly or size > _MAX_LIGHT:
+            return True
+        if self._element_size:
+            return size > _MAX_LIGHT_ELEMENTS * self._element_size
+        # A text beyond ASCII takes ten times as long; what leaves as binary values takes no time.
+        return size > _ANY_CHARACTERS and not self._holds_bytes and not bytes(payload[_FIXED:]).isascii()
 
     def read(self, msg: Any, warn: Callable[[str], None]) -> Buffer:
         """Serialize the object; fields that the message does not have are ignored with a warning."""
@@ -113,6 +138,20 @@ class ConverterForm:
         text, *binaries = encode_data(tag, cls, msg, msg_id)
         assert isinstance(text, str)
         return Outgoing(text.encode(), tuple((b"", frame) for frame in binaries if isinstance(frame, bytes)))
+
+
+_MAX_LIGHT_ELEMENTS = 16384
+_MAX_LIGHT = 12 << 20
+_ANY_CHARACTERS = 1 << 20
+_FIXED = 64
+"""Bytes at the beginning that may be numbers, such as a text's length."""
+
+
+def _element_size(kind: MessageType) -> int:
+    """Return the fewest bytes that an element of its lists takes; 0 if it has no lists."""
+    parts = (kind, *kind.dependencies)
+    lists = (field for part in parts for field in part.fields if field.is_array and not field.is_bytes)
+    return min((max(1, element_min_size(field)) for field in lists), default=0)
 
 
 def _holds_bytes(kind: MessageType) -> bool:

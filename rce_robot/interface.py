@@ -7,14 +7,19 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from rce.link import Interface
 from rce.protocol.messages import NO_ID
-from rce_robot.exceptions import UnreadableError
+from rce_robot.exceptions import MisdirectedError, UnreadableError
+from rce_robot.offload import Offload, Read
 from rce_robot.outbox import Overflow
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine
+    from collections.abc import Callable, Coroutine, Sequence
 
+    from rce.guard.holdings import Holding
     from rce.link import Port
     from rce.protocol.messages import DataMessage
+    from rce.protocol.stream import LargeData
+    from rce_robot.conversion import Result
+    from rce_robot.conversion.jobs import Job
     from rce_robot.forms import Form
     from rce_robot.outbox import Buffer, Outgoing, Queued
 
@@ -43,6 +48,27 @@ class RobotSide(Protocol):
 
     def show_active(self, tag: str, active: bool) -> None:
         """Send an ``ST``."""
+
+    def send_latched(self, tag: str, message: Queued, *, shared: bool) -> None:
+        """Send the latched message of an interface in the data lane: it is not dropped, but replaced.
+
+        Args:
+            tag: Of the interface.
+            message: Takes the place of an earlier one that was not sent yet.
+            shared: Its bytes are kept elsewhere too, and counted there.
+        """
+
+    def drop_latched(self, tag: str) -> None:
+        """Take :meth:`send_latched` back, if the message was not sent yet."""
+
+    def hold(self, size: int, give_up: Callable[[], object] | None = None) -> Holding:
+        """Count bytes that are held outside all queues; see :class:`rce.guard.holdings.Holdings`."""
+
+    async def convert(self, job: Job, parts: Sequence[Buffer]) -> tuple[Result, list[memoryview]]:
+        """Have a conversion done in another process; raises :class:`ConversionFailed`."""
+
+    def await_binaries(self, large: LargeData, ids: Sequence[str]) -> None:
+        """Have a large message come again when the binary values that it refers to are there."""
 
     def run(self, work: Coroutine[Any, Any, None]) -> bool:
         """Run something until the robot leaves; False (and nothing done) if too much runs already."""
@@ -92,6 +118,7 @@ class RobotInterface(Interface):
         self.form_out = form_out
         self.tag = port.spec.tag
         self.cls = port.spec.cls
+        self.offload = Offload(robot, port.spec)
         self.active = False
         self._warned: set[str] = set()
 
@@ -102,6 +129,16 @@ class RobotInterface(Interface):
         Raises:
             RobotError: It is refused.
         """
+
+    def take_large(self, large: LargeData) -> None:
+        """Handle a data message that was not parsed yet, because that takes long.
+
+        Raises:
+            RobotError: It is refused.
+        """
+        raise MisdirectedError(
+            f"{self._name(large.address.msg_id)}: the interface takes nothing from the robot"
+        )
 
     def refused(self, msg_id: str, problem: str) -> None:
         """Take note that a message of the robot with this id was refused, which the robot knows."""
@@ -141,6 +178,13 @@ class RobotInterface(Interface):
         except UnreadableError as error:
             raise UnreadableError(f"{self._name(message.msg_id)}: {error}") from error
 
+    async def read_large(self, large: LargeData) -> Read:
+        """Convert a message that was not parsed yet; one that needs binary values comes again with them."""
+        read = await self.offload.read_text(large)
+        if read.ids:
+            self.robot.await_binaries(large, read.ids)
+        return read
+
     def _warn(self, text: str) -> None:
         """Report something that was ignored, once."""
         if text not in self._warned and len(self._warned) < MAX_WARNINGS:
@@ -150,7 +194,15 @@ class RobotInterface(Interface):
     def _name(self, msg_id: str) -> str:
         return self.tag if msg_id == NO_ID else f"{self.tag}, msgID {msg_id}"
 
-    def _send_service(self, payload: Buffer, msg_id: str) -> bool:
+    async def _send_service(self, payload: Buffer, msg_id: str) -> bool:
+        """Send a request or an answer to the robot; False if too much waits.
+
+        Raises:
+            UnreadableError: It is large, and no message of the type.
+        """
+        if self.form_out.is_heavy(payload):
+            outgoing = await self.offload.show(payload, msg_id)
+            return self.robot.send_data(self.tag, outgoing, Overflow.REFUSE)
         delivery = Delivery(self, payload, msg_id)
         if len(payload) < URGENT_BELOW:
             return self.robot.send_urgent(delivery)

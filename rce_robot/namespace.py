@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import msgspec
 
 from rce.control.model import EndpointState, EndpointStatus, EndpointUsage
+from rce.guard.holdings import Holdings
 from rce.link import Endpoint, InterfaceError
 from rce.protocol.calls import call_at
 from rce.protocol.names import EndpointId, InterfaceType
@@ -20,16 +21,20 @@ from rce_robot.exceptions import MisdirectedError
 from rce_robot.interfaces import make_interface
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
+    from collections.abc import Callable, Coroutine, Sequence
 
     from rce.control.model import EndpointSpec, InterfaceSpec, LinkAddress
     from rce.guard.budget import Ledger
+    from rce.guard.holdings import Holding
     from rce.link import Interface, LinkHub, Port
     from rce.protocol.calls import CallId
     from rce.protocol.messages import DataMessage, Request
+    from rce.protocol.stream import LargeData
+    from rce_robot.conversion import ConversionPool, Result
+    from rce_robot.conversion.jobs import Job
     from rce_robot.forms import Form
     from rce_robot.interface import RobotInterface
-    from rce_robot.outbox import Overflow, Queued
+    from rce_robot.outbox import Buffer, Overflow, Queued
     from rce_robot.session import Session
 
 
@@ -75,6 +80,7 @@ class Namespace:
         *,
         call_timeout: float,
         ledger: Ledger,
+        pool: ConversionPool,
     ) -> None:
         self.id = id
         self.revision = 0
@@ -88,6 +94,8 @@ class Namespace:
         self._call_timeout = call_timeout
         self._interfaces: dict[str, RobotInterface] = {}
         self._applying = asyncio.Lock()
+        self._pool = pool
+        self._holdings = Holdings(self._note)
         self._account = ledger.open(id.user, self)
         self._endpoint = Endpoint(
             id, self._make, hub, on_change=self._changed, on_fault=self._failed, on_growth=self._account.note
@@ -138,8 +146,9 @@ class Namespace:
 
     @property
     def held(self) -> int:
-        """Bytes that wait on the way from the robot and to it."""
-        return self._endpoint.waiting_bytes + (self.session.held if self.session is not None else 0)
+        """Bytes of all messages that are kept: on the way from the robot and to it, latched, being served."""
+        waiting = self._endpoint.waiting_bytes + self._holdings.bytes
+        return waiting + (self.session.held if self.session is not None else 0)
 
     def shed(self, size: int) -> None:
         """Drop the oldest of what waits, on the robot's side first."""
@@ -148,6 +157,8 @@ class Namespace:
             self.session.shed(size)
         if self.held > goal:
             self._endpoint.shed(self.held - goal)
+        if self.held > goal:
+            self._holdings.shed(self.held - goal)
 
     def fail(self, reason: str) -> None:
         """Drop the robot's connection."""
@@ -176,6 +187,27 @@ class Namespace:
             interface.refused(message.msg_id, problem)
             raise MisdirectedError(problem)
         interface.take(message)
+
+    def take_large(self, large: LargeData) -> None:
+        """Give a data message that was not parsed yet to its interface.
+
+        Raises:
+            RobotError: It is refused; the interface knows.
+        """
+        address = large.address
+        name = large.call or address.i_tag
+        interface = self._interfaces.get(address.i_tag)
+        if interface is None:
+            raise MisdirectedError(f"{name}: robot {self.id.tag} has no such interface")
+        if address.type and address.type != interface.cls:
+            problem = f"carries {interface.cls}, not {address.type}"
+        elif not interface.form_in.readable:
+            problem = "a Forwarder takes a serialized message as binary value 'msg*'"
+        else:
+            interface.take_large(large)
+            return
+        interface.refused(address.msg_id, f"{name}: {problem}")
+        raise MisdirectedError(f"{name}: {problem}")
 
     def refused(self, call: CallId, problem: str) -> None:
         """End the service call of a message that was refused."""
@@ -232,6 +264,29 @@ class Namespace:
         if self._live is not None:
             self._live.show_active(tag, active)
 
+    def send_latched(self, tag: str, message: Queued, *, shared: bool) -> None:
+        """Send the latched message of an interface, if the robot is there."""
+        if self._live is not None:
+            self._live.send_latched(tag, message, shared=shared)
+
+    def drop_latched(self, tag: str) -> None:
+        """Take it back, if it was not sent yet."""
+        if self._live is not None:
+            self._live.drop_latched(tag)
+
+    def hold(self, size: int, give_up: Callable[[], object] | None = None) -> Holding:
+        """Count bytes that are held outside all queues."""
+        return self._holdings.hold(size, give_up)
+
+    async def convert(self, job: Job, parts: Sequence[Buffer]) -> tuple[Result, list[memoryview]]:
+        """Have a conversion done in another process."""
+        return await self._pool.convert(self.id.user, job, parts)
+
+    def await_binaries(self, large: LargeData, ids: Sequence[str]) -> None:
+        """Have a large message come again with its binary values."""
+        if self._live is not None:
+            self._live.await_binaries(large, ids)
+
     def run(self, work: Coroutine[Any, Any, None]) -> bool:
         """Run something until the robot leaves."""
         if self._live is None:
@@ -262,6 +317,9 @@ class Namespace:
         interface = make_interface(type_.role, port, self, form_in, form_out, call_timeout=self._call_timeout)
         self._interfaces[interface.tag] = interface
         return interface
+
+    def _note(self) -> None:
+        self._account.note()
 
     def _changed(self) -> None:
         self._headquarters.changed(self)

@@ -46,7 +46,7 @@ class Queued(Protocol):
 class Outgoing:
     """One message as it goes over the WebSocket: a JSON text and the binary frames it names."""
 
-    text: bytes
+    text: Buffer
     """UTF-8."""
     binaries: tuple[tuple[bytes, Buffer], ...] = ()
     """Payloads of binary frames, each in two parts, so that an id can go before bytes that nobody copies."""
@@ -80,23 +80,57 @@ class OutboxLimits:
 class _Flow:
     """The queue of one interface in the data lane. ``credit`` is what it may send now, in bytes."""
 
-    __slots__ = ("bytes", "credit", "messages", "overflow", "tag")
+    __slots__ = ("bytes", "credit", "latched", "messages", "overflow", "tag")
 
     def __init__(self, tag: str, overflow: Overflow) -> None:
         self.tag = tag
         self.overflow = overflow
         self.messages: deque[tuple[Queued, int]] = deque()
         self.bytes = 0
+        """Of all but the latched message."""
         self.credit = 0
+        self.latched: tuple[tuple[Queued, int], int] | None = None
+        """The latched message as it is in the queue, and the bytes that it counts."""
+
+    @property
+    def droppable(self) -> int:
+        """How many messages may be dropped: all but the latched one."""
+        return len(self.messages) - (self.latched is not None)
 
     def push(self, message: Queued, size: int) -> None:
         self.messages.append((message, size))
         self.bytes += size
 
-    def pop(self) -> tuple[Queued, int]:
-        message, size = self.messages.popleft()
+    def pop(self) -> tuple[Queued, int, int]:
+        """Return the oldest message, its size, and the bytes that it counts as latched one."""
+        entry = self.messages.popleft()
+        if self.latched is not None and self.latched[0] is entry:
+            counted = self.latched[1]
+            self.latched = None
+            return (*entry, counted)
+        self.bytes -= entry[1]
+        return (*entry, -1)
+
+    def drop_oldest(self) -> int:
+        """Drop the oldest that is not latched; return its size."""
+        latched = None if self.latched is None else self.latched[0]
+        index = 1 if self.messages[0] is latched else 0
+        size = self.messages[index][1]
+        del self.messages[index]
         self.bytes -= size
-        return message, size
+        return size
+
+    def drop_latched(self) -> int:
+        """Drop the latched message; return the bytes that it counted."""
+        if self.latched is None:
+            return 0
+        entry, counted = self.latched
+        self.latched = None
+        for index, other in enumerate(self.messages):
+            if other is entry:
+                del self.messages[index]
+                break
+        return counted
 
 
 class Outbox:
@@ -114,6 +148,7 @@ class Outbox:
         self._flows: dict[str, _Flow] = {}
         self._ring: deque[_Flow] = deque()
         self._data_bytes = 0
+        self._latched_bytes = 0
         self.dropped: Counter[str] = Counter() if dropped is None else dropped
         """Interface tag to the number of its messages that were thrown away; may outlive the outbox."""
 
@@ -123,7 +158,7 @@ class Outbox:
     @property
     def bytes(self) -> int:
         """Bytes that wait in both lanes."""
-        return self._control_bytes + self._data_bytes
+        return self._control_bytes + self._data_bytes + self._latched_bytes
 
     def put_state(self, key: str, message: Queued) -> None:
         """Queue a statement that makes an earlier, unsent one of the same ``key`` obsolete (``ST``)."""
@@ -167,6 +202,36 @@ class Outbox:
         self._data_bytes += size
         return True
 
+    def put_latched(self, tag: str, message: Queued, *, shared: bool) -> None:
+        """Queue the latched message of the topic ``tag``, in place of an earlier one.
+
+        It is no part of what the limits hold and what makes room for others: a burst of many topics' latched
+        messages waits until the robot has read it.
+
+        Args:
+            tag: Of the interface.
+            message: The message.
+            shared: Its bytes are kept elsewhere too and counted there.
+        """
+        self.drop_latched(tag)
+        flow = self._flows.get(tag)
+        if flow is None:
+            flow = self._flows[tag] = _Flow(tag, Overflow.DROP_OLDEST)
+        if not flow.messages:
+            self._ring.append(flow)
+        entry = (message, message.size)
+        flow.messages.append(entry)
+        flow.latched = (entry, 0 if shared else entry[1])
+        self._latched_bytes += flow.latched[1]
+
+    def drop_latched(self, tag: str) -> None:
+        """Forget the latched message of a topic that was not sent yet."""
+        flow = self._flows.get(tag)
+        if flow is not None and flow.latched is not None:
+            self._latched_bytes -= flow.drop_latched()
+            self.dropped[tag] += 1
+            self._leave_if_empty(flow)
+
     def pop(self) -> Queued | None:
         """Take the message to send next, None if nothing waits."""
         if self._states:
@@ -186,12 +251,19 @@ class Outbox:
         if flow is not None and flow.messages:
             self._ring.remove(flow)
             self._data_bytes -= flow.bytes
+            self._latched_bytes -= flow.drop_latched()
 
     def shed(self, size: int) -> None:
-        """Forget the oldest messages of the topics that hold most, until ``size`` bytes are free."""
-        goal = self._data_bytes - size
-        while self._data_bytes > goal and self._drop_of_largest_topic():
+        """Forget the oldest messages of the topics that hold most, until ``size`` bytes are free.
+
+        Latched messages go last.
+        """
+        goal = self.bytes - size
+        while self.bytes > goal and self._drop_of_largest_topic():
             pass
+        for flow in list(self._ring):
+            if self.bytes > goal and flow.latched is not None and flow.latched[1]:
+                self.drop_latched(flow.tag)
 
     def clear(self) -> None:
         """Forget everything."""
@@ -201,12 +273,12 @@ class Outbox:
         self._ring.clear()
         self._control.clear()
         self._states.clear()
-        self._data_bytes = self._control_bytes = 0
+        self._data_bytes = self._control_bytes = self._latched_bytes = 0
 
     def _over(self, flow: _Flow, size: int) -> bool:
         limits = self._limits
-        return bool(flow.messages) and (
-            len(flow.messages) >= limits.queue_messages or flow.bytes + size > limits.queue_bytes
+        return bool(flow.droppable) and (
+            flow.droppable >= limits.queue_messages or flow.bytes + size > limits.queue_bytes
         )
 
     def _make_room(self, size: int) -> None:
@@ -215,15 +287,17 @@ class Outbox:
             pass
 
     def _drop_of_largest_topic(self) -> bool:
-        topics = [flow for flow in self._ring if flow.overflow is Overflow.DROP_OLDEST]
+        topics = [flow for flow in self._ring if flow.overflow is Overflow.DROP_OLDEST and flow.droppable]
         if topics:
             self._drop(max(topics, key=lambda flow: flow.bytes))
         return bool(topics)
 
     def _drop(self, flow: _Flow) -> None:
-        _, size = flow.pop()
-        self._data_bytes -= size
+        self._data_bytes -= flow.drop_oldest()
         self.dropped[flow.tag] += 1
+        self._leave_if_empty(flow)
+
+    def _leave_if_empty(self, flow: _Flow) -> None:
         if not flow.messages:
             self._ring.remove(flow)
             flow.credit = 0
@@ -236,8 +310,11 @@ class Outbox:
                 break
             flow.credit += self._limits.quantum
             ring.rotate(-1)
-        message, size = flow.pop()
-        self._data_bytes -= size
+        message, size, latched = flow.pop()
+        if latched < 0:
+            self._data_bytes -= size
+        else:
+            self._latched_bytes -= latched
         flow.credit = max(0, flow.credit - size)
         if not flow.messages:
             ring.popleft()

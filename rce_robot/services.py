@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rce.link import CallError, CallTimeout, Overloaded, PeerFault, PeerLost
 from rce_robot.exceptions import BusyError, MisdirectedError, UnreadableError
 from rce_robot.forms import fresh_id
 from rce_robot.interface import RobotInterface
+from rce_robot.offload import Read, pack_value
 
 if TYPE_CHECKING:
+    from collections.abc import Coroutine, Iterator
+
     from rce.link import Port
     from rce.protocol.messages import DataMessage
+    from rce.protocol.stream import LargeData
     from rce_robot.forms import Form
     from rce_robot.interface import RobotSide
     from rce_robot.outbox import Buffer
@@ -27,13 +32,59 @@ class AskedByRobot(RobotInterface):
 
     def take(self, message: DataMessage) -> None:
         """Start a call."""
-        payload = self._read(message, self._warn)
-        if not self.robot.run(self._call(payload, message.msg_id)):
-            raise BusyError(f"{self._name(message.msg_id)}: too many calls wait for an answer")
+        if self.form_in.costly:
+            packed = pack_value(message.msg)
+            work = self._convert_and_call(self.offload.read_value(packed), message.msg_id, len(packed))
+            self._run(work, message.msg_id)
+        else:
+            self._run(self._call(self._read(message, self._warn), message.msg_id), message.msg_id)
+
+    def take_large(self, large: LargeData) -> None:
+        """Start a call."""
+        work = self._convert_and_call(self.read_large(large), large.address.msg_id, large.size)
+        self._run(work, large.address.msg_id)
+
+    def _run(self, work: Coroutine[Any, Any, None], msg_id: str) -> None:
+        if not self.robot.run(work):
+            raise BusyError(f"{self._name(msg_id)}: too many calls wait for an answer")
+
+    async def _convert_and_call(self, reading: Coroutine[Any, Any, Read], msg_id: str, size: int) -> None:
+        """Call with a request that another process converts."""
+        with self._held(size, msg_id):
+            read = await reading
+        msg_id = read.msg_id or msg_id
+        for warning in read.warnings:
+            self._warn(warning)
+        if read.payload is not None:
+            await self._call(read.payload, msg_id)
+        elif not read.ids:
+            problem = read.fault or "a string is not an object of the fields of the request"
+            self.robot.report(f"{self._name(msg_id)}: {problem}")
+
+    @contextlib.contextmanager
+    def _held(self, size: int, msg_id: str) -> Iterator[None]:
+        """Count what a call holds; when memory is short, the call ends."""
+        task = asyncio.current_task()
+        assert task is not None
+        given_up = False
+
+        def give_up() -> None:
+            nonlocal given_up
+            given_up = True
+            task.cancel()
+
+        holding = self.robot.hold(size, give_up)
+        try:
+            yield
+        finally:
+            holding.release()
+            if given_up:
+                self.robot.report(f"{self._name(msg_id)}: memory is short; the call was given up")
 
     async def _call(self, payload: Buffer, msg_id: str) -> None:
         try:
-            answer = await self.port.call(payload)
+            with self._held(len(payload), msg_id):
+                answer = await self.port.call(payload)
         except CallError as error:
             self.robot.report(f"{self._name(msg_id)}: {error}")
             return
@@ -41,7 +92,12 @@ class AskedByRobot(RobotInterface):
             _log.exception("service call at %s", self.tag)
             self.robot.report(f"{self._name(msg_id)}: internal error; the engine's log tells more")
             return
-        if not self._send_service(answer, msg_id):
+        try:
+            sent = await self._send_service(answer, msg_id)
+        except UnreadableError as error:
+            self.robot.report(f"{self._name(msg_id)}: {error}")
+            return
+        if not sent:
             self.robot.report(f"{self._name(msg_id)}: the answer was dropped, too much waits to be sent")
 
 
@@ -67,10 +123,12 @@ class AnsweredByRobot(RobotInterface):
         answer: asyncio.Future[Buffer] = asyncio.get_running_loop().create_future()
         self._calls[msg_id] = answer
         try:
-            if not self._send_service(payload, msg_id):
-                raise Overloaded("too much waits to be sent to the robot")
             async with asyncio.timeout(self._timeout):
+                if not await self._send_service(payload, msg_id):
+                    raise Overloaded("too much waits to be sent to the robot")
                 return await answer
+        except UnreadableError as error:
+            raise PeerFault(str(error)) from error
         except TimeoutError as error:
             raise CallTimeout(f"the robot did not answer within {self._timeout:g} s") from error
         finally:
@@ -84,11 +142,46 @@ class AnsweredByRobot(RobotInterface):
         if isinstance(message.msg, str):
             answer.set_exception(PeerFault(message.msg))
             return
+        if self.form_in.costly:
+            packed = pack_value(message.msg)
+            self._convert(self.offload.read_value(packed), message.msg_id, len(packed))
+            return
         try:
             answer.set_result(self._read(message, self._warn))
         except UnreadableError as error:
             answer.set_exception(PeerFault(f"the robot's answer cannot be read: {error}"))
             raise
+
+    def take_large(self, large: LargeData) -> None:
+        """Complete a call when its answer has been converted."""
+        if large.address.msg_id not in self._calls:
+            raise MisdirectedError(f"{self._name(large.address.msg_id)}: no call waits for this answer")
+        self._convert(self.read_large(large), large.address.msg_id, large.size)
+
+    def _convert(self, reading: Coroutine[Any, Any, Read], msg_id: str, size: int) -> None:
+        if not self.robot.run(self._complete(reading, msg_id, size)):
+            reading.close()
+            raise BusyError(f"{self._name(msg_id)}: too much is converted already")
+
+    async def _complete(self, reading: Coroutine[Any, Any, Read], msg_id: str, size: int) -> None:
+        """Complete a call with an answer that another process converts."""
+        holding = self.robot.hold(size)
+        try:
+            read = await reading
+        finally:
+            holding.release()
+        answer = self._calls.get(read.msg_id or msg_id)
+        if answer is None or answer.done() or read.ids:
+            return
+        for warning in read.warnings:
+            self._warn(warning)
+        if read.payload is not None:
+            answer.set_result(read.payload)
+        elif read.text is not None:
+            answer.set_exception(PeerFault(read.text))
+        else:
+            answer.set_exception(PeerFault(f"the robot's answer cannot be read: {read.fault}"))
+            self.robot.report(f"{self._name(msg_id)}: {read.fault}")
 
     def refused(self, msg_id: str, problem: str) -> None:
         """Fail the call: its answer is lost."""

@@ -26,13 +26,14 @@ from rce.protocol.messages import (
     InterfaceStatus,
     type_of,
 )
-from rce.protocol.stream import Fault, ProtocolStream
+from rce.protocol.stream import Fault, LargeData, ProtocolStream
 from rce_robot.exceptions import RobotError
 from rce_robot.outbox import Outbox, Outgoing, Overflow
+from rce_robot.websocket import LARGE_PART
 
 if TYPE_CHECKING:
     from collections import Counter
-    from collections.abc import Coroutine
+    from collections.abc import Coroutine, Sequence
 
     from rce.protocol.calls import CallId
     from rce.protocol.messages import Request
@@ -52,6 +53,9 @@ class Owner(Protocol):
 
     def take(self, message: DataMessage) -> None:
         """Handle a data message; raises :class:`RobotError` if it is refused."""
+
+    def take_large(self, large: LargeData) -> None:
+        """Handle a data message that was not parsed yet; raises :class:`RobotError` if it is refused."""
 
     def refused(self, call: CallId, problem: str) -> None:
         """A message of a service call was refused before it could be handled."""
@@ -86,7 +90,7 @@ class Session:
         self._owner = owner
         self._settings = settings
         self._drain_timeout = settings.drain_timeout
-        limits = Limits(max_text=settings.max_message, max_binary=settings.max_message)
+        limits = Limits(max_text=settings.max_text, max_binary=settings.max_message)
         self._stream = ProtocolStream.for_engine(limits)
         self._outbox = Outbox(settings.outbox, dropped)
         self._requests: asyncio.Queue[tuple[Request, int] | None] = asyncio.Queue()
@@ -178,6 +182,24 @@ class Session:
         taken = not self.lost and self._outbox.put_data(tag, message, overflow)
         self._owner.grew()
         return taken
+
+    def send_latched(self, tag: str, message: Queued, *, shared: bool) -> None:
+        """Send the latched message of an interface in the data lane, where nothing pushes it out."""
+        if self._socket.writable and not self._outbox:
+            self._write(message)
+        elif not self.lost:
+            self._outbox.put_latched(tag, message, shared=shared)
+            self._owner.grew()
+
+    def drop_latched(self, tag: str) -> None:
+        """Take it back, if it was not sent yet."""
+        self._outbox.drop_latched(tag)
+
+    def await_binaries(self, large: LargeData, ids: Sequence[str]) -> None:
+        """Have a large message come again when its binary values are there."""
+        for event in self._stream.await_binaries(large, ids, self._now()):
+            self._handle(event)
+        self._look_at_pending()
 
     def send_urgent(self, message: Queued) -> bool:
         """Send in the control lane; False if that is full or the connection ended."""
@@ -272,6 +294,8 @@ class Session:
         rendered = message.render()
         if rendered is not None:
             self._socket.write(rendered)
+            if rendered.size > LARGE_PART:
+                self._owner.grew()
 
     def _handle(self, event: Event, size: int = 0) -> None:
         match event:
@@ -284,6 +308,8 @@ class Session:
                     _log.exception("data message at %s", event.i_tag)
                     name = call_at(event.i_tag, event.msg_id) or event.i_tag
                     self.report(f"{name}: internal error; the engine's log tells more")
+            case LargeData():
+                self._handle_large(event)
             case Fault():
                 self.report(event.text)
                 if event.call is not None:
@@ -292,6 +318,12 @@ class Session:
                 self.report(f"type: {type_of(event)} is not for clients to send")
             case _:
                 self._request(event, size)
+
+    def _handle_large(self, large: LargeData) -> None:
+        try:
+            self._owner.take_large(large)
+        except RobotError as error:
+            self.report(str(error))
 
     def _request(self, request: Request, size: int) -> None:
         if isinstance(request, (ConfigureComponents, ConfigureConnections)):

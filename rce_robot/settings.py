@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from rce_robot.conversion.pool import ConversionSettings
 from rce_robot.outbox import OutboxLimits
 
 
@@ -18,6 +19,8 @@ class SessionSettings:
     probe_timeout: float = 2.0
     """The same when the robot is asked because it seems to come in a second time."""
     close_timeout: float = 2.0
+    max_text: int = 16 << 20
+    """Longest text frame that a robot may send."""
     max_message: int = 64 << 20
     """Largest WebSocket message that a robot may send."""
     write_buffer: tuple[int, int] = (128 << 10, 32 << 10)
@@ -62,6 +65,7 @@ class RobotSettings:
     """Connections whose robot has not logged in yet."""
     strangers_per_address: int = 256
     """The same from one address."""
+    conversion: ConversionSettings = field(default_factory=ConversionSettings)
     call_timeout: float = 30.0
     """How long a robot may take to answer a service call."""
     usage_interval: float = 2.0

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from rce.link import LinkHub
     from rce.protocol.http import Credentials
     from rce.protocol.messages import Request
+    from rce_robot.conversion import ConversionPool
     from rce_robot.namespace import Forms
     from rce_robot.settings import RobotSettings
 
@@ -78,6 +79,7 @@ class RobotTaskSet:
         url: Where clients are sent.
         address: Where links to any of the robots are accepted.
         lobby: Where robots wait until they have logged in.
+        pool: Converts large messages.
     """
 
     def __init__(
@@ -91,6 +93,7 @@ class RobotTaskSet:
         url: str,
         address: LinkAddress,
         lobby: Lobby,
+        pool: ConversionPool,
     ) -> None:
         self._hub = hub
         self._forms = forms
@@ -104,6 +107,7 @@ class RobotTaskSet:
         self._closing: dict[EndpointId, asyncio.Event] = {}
         self._changed: set[Namespace] = set()
         self._lobby = lobby
+        self._pool = pool
         self._ledger = Ledger(
             per_user=settings.user_memory,
             in_all=settings.memory or psutil.virtual_memory().total // 2,
@@ -205,6 +209,7 @@ class RobotTaskSet:
                 self._address,
                 call_timeout=self._settings.call_timeout,
                 ledger=self._ledger,
+                pool=self._pool,
             )
         await namespace.apply(spec)
         return namespace
@@ -250,6 +255,7 @@ class RobotTaskSet:
         times = self._process.cpu_times()
         for namespace in self._namespaces.values():
             namespace.tick()
+        self._ledger.refresh()
         self._channel.send(
             Usage(
                 cpu_s=times.user + times.system,

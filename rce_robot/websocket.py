@@ -77,8 +77,8 @@ class RobotSocket(GuardedConnection):
 
     @property
     def held(self) -> int:
-        """Bytes of a message that is not complete, about."""
-        return self._part_bytes + self._fragment_bytes
+        """Bytes of a message that is not complete, and of those that the network has not taken yet, about."""
+        return self._part_bytes + self._fragment_bytes + self.transport.get_write_buffer_size()
 
     @property
     def writable(self) -> bool:

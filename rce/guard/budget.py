@@ -81,6 +81,11 @@ class Ledger:
         self._sums.setdefault(user, 0)
         return account
 
+    def refresh(self) -> None:
+        """Ask all holders anew what they hold, so that the sums tell the truth, also where it became less."""
+        for user in self._accounts:
+            self._refresh(user)
+
     def held_by(self, user: str) -> int:
         """Return the bytes that a user's holders hold."""
         return self._sums.get(user, 0)

@@ -122,7 +122,7 @@ class Assembler:
 
     def add_references(
         self, value: Any, ids: Collection[str], holder: dict[str, Any], size: int, now: float
-    ) -> tuple[bool, list[str]]:
+    ) -> tuple[bool, list[Dropped]]:
         """Take a message of which it is known already which binary values it refers to.
 
         Args:

@@ -55,16 +55,22 @@ class Fault(Struct, frozen=True):
 
 
 class LargeData(Struct, frozen=True):
-    """A data message that costs too much to be parsed where it came in: :func:`rce.protocol.large.read_large`.
+    """A data message that takes too long to be parsed where it came in.
 
-    It is given out as it came. If it turns out to refer to binary values, give their ids to
-    :meth:`ProtocolStream.await_binaries`; it comes out again when they are there.
+    :func:`rce.protocol.large.read_large` parses it. It is given out as it came. If it turns out to refer to
+    binary values, give their ids to :meth:`ProtocolStream.await_binaries`; it comes out again when they are
+    there.
     """
 
     address: Address
     text: bytes
     binaries: dict[str, memoryview] = {}
     """By id."""
+
+    @property
+    def call(self) -> CallId | None:
+        """The service call that it belongs to."""
+        return call_at(self.address.i_tag, self.address.msg_id)
 
     @property
     def size(self) -> int:
@@ -104,6 +110,11 @@ class _WaitingLarge:
     def __init__(self, large: LargeData) -> None:
         self._large = large
         self.binaries: dict[str, Any] = {}
+
+    @property
+    def call(self) -> CallId | None:
+        """The service call that it belongs to."""
+        return self._large.call
 
     def message(self) -> LargeData:
         """Return the message with its binary values."""
@@ -161,11 +172,14 @@ class ProtocolStream:
             text: Its text, or its UTF-8.
             now: Seconds on the caller's clock.
         """
-        limits = self._limits
-        if len(text) > limits.max_text:
-            return [Fault(f"a text frame of {len(text)} is longer than the limit of {limits.max_text}")]
+        if len(text) > self._limits.max_text:
+            return [self._too_long(text)]
         if self._defer_large and isinstance(text, bytes) and not is_light(text):
             return [self._defer(text)]
+        return self._feed_light(text, now)
+
+    def _feed_light(self, text: str | bytes, now: float) -> list[Event]:
+        limits = self._limits
         shallow = is_shallow(text, limits.max_depth)
         starred = _may_be_starred(text)
         value: Any = None
@@ -206,7 +220,7 @@ class ProtocolStream:
                 waiting, ids, waiting.binaries, len(large.text), now
             )
         except ProtocolError as error:
-            return [Fault(str(error))]
+            return [Fault.of(str(error), waiting.call)]
         return self._events(waiting if complete else None, dropped)
 
     def feed_binary(self, frame: Binary, now: float) -> list[Event]:
@@ -240,6 +254,14 @@ class ProtocolStream:
             events.append(self._message(value))
         return events
 
+    def _too_long(self, text: str | bytes) -> Fault:
+        limit = self._limits.max_text
+        address = find_address(text) if isinstance(text, bytes) else None
+        return Fault.of(
+            f"a text frame of {len(text)} is longer than the limit of {limit}",
+            None if address is None else call_at(address.i_tag, address.msg_id),
+        )
+
     def _defer(self, text: bytes) -> Event:
         address = find_address(text)
         if address is None:
@@ -262,7 +284,9 @@ class ProtocolStream:
 def _fault(dropped: Dropped) -> Fault:
     """Tell of what will not become a message."""
     value = dropped.value
-    return Fault.of(dropped.text, value.call if type(value) is _Serialized else call_of(value))
+    return Fault.of(
+        dropped.text, value.call if isinstance(value, (_Serialized, _WaitingLarge)) else call_of(value)
+    )
 
 
 def _may_be_starred(text: str | bytes) -> bool:

@@ -11,6 +11,7 @@ import re
 from typing import NamedTuple
 
 from rce.protocol.exceptions import MessageError
+from rce.protocol.messages import NO_ID
 
 _SHORT = 8 << 10
 """Bytes up to which a text is light whatever it holds."""
@@ -27,6 +28,7 @@ _EDGE = 4096
 """Where the small values of a large message are: before its one large value, or after it."""
 _TAG = re.compile(rb'"iTag"\s*:\s*"([^"\\]{1,256})"')
 _CLASS = re.compile(rb'"type"\s*:\s*"([^"\\]{1,256}/[^"\\]{1,256})"')
+_MSG_ID = re.compile(rb'"msgID"\s*:\s*"?([^"\\,}]{1,255})')
 _MSG = re.compile(rb'"msg\*?"\s*:')
 _STRING = re.compile(rb'"[^"\\]*+(?:\\.[^"\\]*+)*+"', re.DOTALL)
 
@@ -35,8 +37,9 @@ class Address(NamedTuple):
     """Where a data message goes, as its text seems to tell."""
 
     i_tag: str
-    type: str
+    type: str = ""
     """Empty if it was not found."""
+    msg_id: str = NO_ID
 
 
 def is_light(text: bytes) -> bool:
@@ -93,24 +96,18 @@ def find_address(text: bytes) -> Address | None:
     head, tail = text[:_EDGE], text[-_EDGE:]
     msg = _MSG.search(head)
     head = head[: msg.start()] if msg is not None else head
-    tag = _TAG.search(head) or _last(_TAG, tail)
-    if tag is None:
-        return None
-    type_ = _CLASS.search(head) or _last(_CLASS, tail)
-    return Address(
-        tag[1].decode(errors="replace"), type_[1].decode(errors="replace") if type_ is not None else ""
-    )
+    tag, type_, msg_id = (_find(pattern, head, tail) for pattern in (_TAG, _CLASS, _MSG_ID))
+    return Address(tag, type_, msg_id or NO_ID) if tag else None
 
 
-def _last(pattern: re.Pattern[bytes], text: bytes) -> re.Match[bytes] | None:
-    last = None
-    for last in pattern.finditer(text):  # noqa: B007 - the last one is wanted
-        pass
-    return last
+def _find(pattern: re.Pattern[bytes], head: bytes, tail: bytes) -> str:
+    """Return the first value in ``head``, else the last in ``tail``, else nothing."""
+    found = pattern.search(head) or next(reversed(list(pattern.finditer(tail))), None)
+    return "" if found is None else found[1].decode(errors="replace")
 
 
 def _has_at_most(text: bytes, character: bytes, most: int) -> bool:
-    """Count a character, but not further than needed; where there is none, ``find`` is faster than ``count``."""
+    """Count a character, but not further than needed; ``find`` skips faster than ``count``."""
     count, place = 0, text.find(character)
     while place >= 0:
         end = place + _SLICE

@@ -21,7 +21,7 @@ HEAD = struct.Struct("!I")
 MAX_PARTS = 8192
 
 
-class ReadText(msgspec.Struct, frozen=True, kw_only=True, tag="text"):
+class ReadText(msgspec.Struct, frozen=True, kw_only=True, tag_field="job", tag="text"):
     """Parse a data message and serialize what it carries. Parts: the text, then its binary values."""
 
     i_tag: str
@@ -33,14 +33,14 @@ class ReadText(msgspec.Struct, frozen=True, kw_only=True, tag="text"):
     """Of the binary values."""
 
 
-class ReadValue(msgspec.Struct, frozen=True, kw_only=True, tag="value"):
+class ReadValue(msgspec.Struct, frozen=True, kw_only=True, tag_field="job", tag="value"):
     """Serialize a message that was parsed already. Part: the value in MessagePack."""
 
     cls: str
     interface_type: str
 
 
-class Show(msgspec.Struct, frozen=True, kw_only=True, tag="show"):
+class Show(msgspec.Struct, frozen=True, kw_only=True, tag_field="job", tag="show"):
     """Make the data message that carries a payload to the robot. Part: the payload."""
 
     i_tag: str

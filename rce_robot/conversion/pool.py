@@ -76,9 +76,7 @@ class ConversionPool:
         self._closed = False
         self.killed = 0
 
-    async def convert(
-        self, user: str, job: Job, parts: Sequence[Buffer]
-    ) -> tuple[Result, list[memoryview]]:
+    async def convert(self, user: str, job: Job, parts: Sequence[Buffer]) -> tuple[Result, list[memoryview]]:
         """Do a job when it is the user's turn. A job that nobody waits for any more is not begun.
 
         Args:

@@ -8,7 +8,7 @@ import os
 import socket
 import struct
 import sys
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from rce_robot.conversion.exceptions import ConversionFailed
 from rce_robot.conversion.jobs import HEAD, MAX_PARTS, decode_result, pack
@@ -72,7 +72,7 @@ class WorkerProcess:
                 raise
         ours.setblocking(False)
         transport, _ = await loop.create_connection(lambda: self._reader, sock=ours)
-        self._transport = cast("asyncio.Transport", transport)
+        self._transport = transport
         try:
             async with asyncio.timeout(_START_TIMEOUT_S):
                 await self._reader.ready
@@ -135,7 +135,9 @@ class _PacketReader(asyncio.BufferedProtocol):
         """Fail what waits."""
         self._lost = True
         if not self.ready.done():
-            self.ready.set_exception(ConversionFailed("the process that converts large messages does not start"))
+            self.ready.set_exception(
+                ConversionFailed("the process that converts large messages does not start")
+            )
         self._fail()
 
     def _fail(self) -> None:

@@ -1,62 +1,119 @@
-"""Conversions that take long (pictures), in a thread, one after the other, so that nobody else waits."""
+"""The conversions of one interface that are left to other processes: in order, and not many."""
 
 from __future__ import annotations
 
-import asyncio
 from collections import deque
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine
+    from collections.abc import Awaitable, Callable, Coroutine
 
-In = TypeVar("In")
+    from rce.guard.holdings import Holding
+
 Out = TypeVar("Out")
 
 MAX_WAITING = 4
 """Messages that wait for their conversion; more would only grow old."""
 
 
-class Conveyor(Generic[In, Out]):
-    """The costly conversions of one interface, in order. The oldest that waits gives way to a new one.
+class QueueOwner(Protocol):
+    """What a queue needs of the robot it belongs to."""
+
+    def run(self, work: Coroutine[Any, Any, None]) -> bool:
+        """Run something until the robot leaves; False (and nothing done) if too much runs already."""
+
+    def hold(self, size: int, give_up: Callable[[], object] | None = None) -> Holding:
+        """Count bytes that are held; see :class:`rce.guard.holdings.Holdings`."""
+
+
+class _Entry(Generic[Out]):
+    """A conversion that waits or runs."""
+
+    __slots__ = ("holding", "work")
+
+    def __init__(self, work: Callable[[], Awaitable[Out]]) -> None:
+        self.work = work
+        self.holding: Holding | None = None
+
+    def release(self) -> None:
+        if self.holding is not None:
+            self.holding.release()
+
+
+class ConversionQueue(Generic[Out]):
+    """The conversions of one interface in one direction. The oldest that waits gives way to a new one.
 
     Args:
-        run: Runs a coroutine for as long as the robot is there; False if it does not.
-        work: The conversion, called in a thread. Must not raise.
-        deliver: Called in the event loop with what ``work`` returned.
+        owner: The robot.
+        deliver: Called with what each conversion returned, in order.
+        dropped: Called for each message that is thrown away because memory is short.
     """
 
     def __init__(
-        self,
-        run: Callable[[Coroutine[Any, Any, None]], bool],
-        work: Callable[[In], Out],
-        deliver: Callable[[Out], None],
+        self, owner: QueueOwner, deliver: Callable[[Out], None], dropped: Callable[[], None]
     ) -> None:
-        self._run = run
-        self._work = work
+        self._owner = owner
         self._deliver = deliver
-        self._waiting: deque[In] = deque(maxlen=MAX_WAITING)
-        self._running = False
+        self._dropped = dropped
+        self._waiting: deque[_Entry[Out]] = deque()
+        self._run = 0
+        """Counts the runs; 0 while nothing runs."""
+        self._runs = 0
 
-    def put(self, item: In) -> bool:
-        """Add a message; False if one had to be thrown away."""
+    @property
+    def busy(self) -> bool:
+        """Whether something is being converted: what comes now must wait, so that it stays in order."""
+        return self._run != 0
+
+    def put(self, size: int, work: Callable[[], Awaitable[Out]]) -> bool:
+        """Add a conversion.
+
+        Args:
+            size: Bytes that it holds.
+            work: Does it; must not raise.
+
+        Returns:
+            False if a message had to be thrown away for it, or if it was itself.
+        """
         room = len(self._waiting) < MAX_WAITING
-        self._waiting.append(item)
-        if not self._running:
-            self._running = self._run(self._convey())
-            if not self._running:
+        if not room:
+            self._waiting.popleft().release()
+        entry = _Entry(work)
+        self._waiting.append(entry)
+        if not self.busy:
+            self._runs += 1
+            self._run = self._runs
+            if not self._owner.run(self._convey(self._run)):
+                self._run = 0
                 self._waiting.clear()
                 return False
+        entry.holding = self._owner.hold(size, lambda: self._give_up(entry))
+        if entry not in self._waiting:
+            entry.release()
         return room
 
     def clear(self) -> None:
         """Forget what waits, because what ran has ended with the robot's connection."""
+        for entry in self._waiting:
+            entry.release()
         self._waiting.clear()
-        self._running = False
+        self._run = 0
 
-    async def _convey(self) -> None:
+    def _give_up(self, entry: _Entry[Out]) -> None:
+        if entry in self._waiting:
+            self._waiting.remove(entry)
+            self._dropped()
+
+    async def _convey(self, run: int) -> None:
         try:
-            while self._waiting:
-                self._deliver(await asyncio.to_thread(self._work, self._waiting.popleft()))
+            while self._run == run and self._waiting:
+                entry = self._waiting.popleft()
+                try:
+                    converted = await entry.work()
+                finally:
+                    entry.release()
+                if self._run == run:
+                    self._deliver(converted)
         finally:
-            self._running = False
-            self._waiting.clear()
+            if self._run == run:
+                self.clear()

@@ -1,4 +1,4 @@
-"""A process that converts large messages: ``python -m rce_robot.conversion.worker FD MEGABYTES [PACKAGES ...]``.
+"""A process that converts large messages: ``python -m rce_robot.conversion.worker FD MEGABYTES PACKAGES``.
 
 It reads jobs from a socket and answers them one after the other, until the socket ends. It gives way to the
 process that started it: the kernel lets it run when there is nothing more urgent, and ends it first when

@@ -285,7 +285,7 @@ def test_any_items_are_read_or_reported(data: Any) -> None:
             if isinstance(read, m.ConfigureConnections)
             else len(read.add_nodes) + len(read.add_interfaces) + len(read.set_param)
         )
-        assert kept + len(read.faults) >= given_items
+        assert kept + len(read.faults) >= given_items or len(read.faults) > 32
 
 
 @given(st.text() | st.binary())

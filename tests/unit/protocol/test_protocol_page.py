@@ -49,9 +49,10 @@ def test_requests_of_the_page_are_accepted() -> None:
 
 def test_numbers_of_the_page_are_those_of_the_code() -> None:
     limits = DEFAULT_LIMITS
-    assert limits.max_text == limits.max_binary == 64 * 2**20
     for row in (
-        f"{limits.max_text // 2**20} MiB each",
+        f"| text frame | {limits.max_text // 2**20} MiB |",
+        f"| binary frame | {limits.max_binary // 2**20} MiB |",
+        f"| {limits.max_elements:,} objects, lists and members of objects; {limits.max_values:,} values |",
         f"{limits.max_depth} levels",
         f"| {limits.max_references} |",
         f"{limits.max_pending}, with {limits.max_pending_bytes // 2**20} MiB together",

@@ -156,3 +156,46 @@ def test_nothing_is_lost_uncounted_and_memory_is_bounded(
         assert len(put[tag]) == len(got[tag]) + outbox.dropped[tag]
     assert outbox.bytes == 0
     assert refused == 0 or overflow is Overflow.REFUSE
+
+
+def test_latched_messages_are_neither_dropped_nor_in_the_way() -> None:
+    """More than all queues hold comes at once: all of it waits, and ordinary messages have their room."""
+    outbox = Outbox(OutboxLimits(queue_bytes=100, total_bytes=200))
+    for number in range(10):
+        outbox.put_latched(f"map{number}", Outgoing(b"m" * 90), shared=False)
+        outbox.put_data(f"map{number}", Outgoing(b"d" * 20))
+    assert outbox.bytes == 10 * 90 + 10 * 20
+    outbox.put_data("other", Outgoing(b"o" * 50))
+    sent = [message.text[:1] for message in iter(outbox.pop, None)]
+    assert sent.count(b"m") == 10
+    assert sent.count(b"o") == 1
+    assert outbox.bytes == 0
+
+
+def test_a_latched_message_takes_the_place_of_the_one_before() -> None:
+    outbox = Outbox()
+    outbox.put_latched("map", Outgoing(b"old"), shared=False)
+    outbox.put_data("map", Outgoing(b"between"))
+    outbox.put_latched("map", Outgoing(b"newer"), shared=False)
+    assert [message.text for message in iter(outbox.pop, None)] == [b"between", b"newer"]
+    assert outbox.bytes == 0
+    assert outbox.dropped["map"] == 1
+
+
+def test_a_latched_message_that_is_kept_elsewhere_is_not_counted_twice() -> None:
+    outbox = Outbox()
+    outbox.put_latched("map", Outgoing(b"m" * 90), shared=True)
+    assert outbox.bytes == 0
+    outbox.drop_latched("map")
+    assert not outbox
+
+
+def test_latched_messages_go_last_when_memory_is_short() -> None:
+    outbox = Outbox()
+    outbox.put_latched("map", Outgoing(b"m" * 90), shared=False)
+    outbox.put_data("map", Outgoing(b"d" * 20))
+    outbox.shed(10)
+    assert outbox.bytes == 90
+    outbox.shed(10)
+    assert outbox.bytes == 0
+    assert not outbox

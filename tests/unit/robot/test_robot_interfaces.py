@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from typing import Any
 
 import pytest
 
 from rce.control.model import InterfaceSpec
+from rce.guard.holdings import Holding, Holdings
 from rce.link import CallTimeout, InterfaceError, NotConnected, Overloaded, PeerFault, PeerLost
 from rce.protocol.messages import DataMessage
 from rce.protocol.names import InterfaceType
+from rce.protocol.stream import LargeData
+from rce.protocol.weight import Address
 from rce.ros.types import TypeRegistry
+from rce_robot.conversion import Result
+from rce_robot.conversion.jobs import HEAD, Job, decode_job, pack
+from rce_robot.conversion.worker import Worker
 from rce_robot.exceptions import BusyError, MisdirectedError, UnreadableError
 from rce_robot.factory import FormFactory
 from rce_robot.interface import RobotInterface
@@ -25,11 +31,14 @@ STRING = "std_msgs/String"
 SERVICE = "std_srvs/SetBool"
 
 
+WORKER = Worker(FormFactory(TypeRegistry()), 1 << 30)
+
+
 class FakePort:
     def __init__(self, type_: str, cls: str) -> None:
         self.spec = InterfaceSpec(tag="tag", type=type_, cls=cls)
         self.sent: list[bytes] = []
-        self.answer: bytes | Exception = b""
+        self.answer: bytes | Exception | asyncio.Future[bytes] = b""
 
     def send(self, payload: Any, *, latched: bool = False) -> None:
         self.sent.append(bytes(payload))
@@ -38,7 +47,7 @@ class FakePort:
         self.sent.append(bytes(payload))
         if isinstance(self.answer, Exception):
             raise self.answer
-        return self.answer
+        return self.answer if isinstance(self.answer, bytes) else await self.answer
 
 
 class FakeRobot:
@@ -52,6 +61,9 @@ class FakeRobot:
         self.dropped = 0
         self.work: list[asyncio.Task[None]] = []
         self.gone: list[RobotInterface] = []
+        self.holdings = Holdings()
+        self.latched_dropped = 0
+        self.awaited: list[tuple[LargeData, list[str]]] = []
 
     def send_data(self, tag: str, message: Queued, overflow: Overflow) -> bool:
         rendered = message.render()
@@ -70,6 +82,27 @@ class FakeRobot:
 
     def show_active(self, tag: str, active: bool) -> None:
         self.states.append(active)
+
+    def send_latched(self, tag: str, message: Queued, *, shared: bool) -> None:
+        self.send_data(tag, message, Overflow.DROP_OLDEST)
+
+    def drop_latched(self, tag: str) -> None:
+        self.latched_dropped += 1
+
+    def hold(self, size: int, give_up: Callable[[], object] | None = None) -> Holding:
+        return self.holdings.hold(size, give_up)
+
+    async def convert(self, job: Job, parts: Sequence[Any]) -> tuple[Result, list[memoryview]]:
+        """Do in this process what a worker process does."""
+        await asyncio.sleep(0)
+        described, *rest = pack(job, parts)
+        result, made = WORKER.do(
+            decode_job(described[HEAD.size + 8 * (len(parts) + 1) :]), list(map(bytes, rest))
+        )
+        return result, [memoryview(part) for part in made]
+
+    def await_binaries(self, large: LargeData, ids: Sequence[str]) -> None:
+        self.awaited.append((large, list(ids)))
 
     def run(self, work: Coroutine[Any, Any, None]) -> bool:
         if self.room:
@@ -200,7 +233,7 @@ def test_the_last_latched_message_waits_for_a_robot_that_comes_back() -> None:
     assert setup.robot.states == [True, True]
 
 
-async def test_pictures_are_converted_in_a_thread_and_in_order() -> None:
+async def test_pictures_are_converted_elsewhere_and_in_order() -> None:
     setup = Setup("PublisherConverter", "sensor_msgs/Image")
     image = TypeRegistry().message("sensor_msgs/Image")
     for number in range(3):
@@ -223,6 +256,88 @@ async def test_pictures_that_come_too_fast_are_dropped_and_counted() -> None:
     await asyncio.gather(*setup.robot.work)
     assert len(setup.robot.data) + setup.robot.dropped == 10
     assert setup.robot.dropped > 0
+
+
+# Large messages
+
+
+def large(msg: str, tag: str = "tag", cls: str = STRING, msg_id: str = "nil") -> LargeData:
+    text = f'{{"type":"DM","data":{{"iTag":"{tag}","type":"{cls}","msgID":"{msg_id}","msg":{msg}}}}}'
+    return LargeData(Address(tag, cls, msg_id), text.encode())
+
+
+async def test_a_large_message_is_converted_elsewhere_and_in_order() -> None:
+    setup = Setup("SubscriberConverter")
+    setup.interface.take_large(large('{"data":"first"}'))
+    setup.take({"data": "second"})
+    assert setup.port.sent == []
+    assert setup.robot.holdings.bytes > 0
+    await asyncio.gather(*setup.robot.work)
+    assert setup.port.sent == [ros_string("first"), ros_string("second")]
+    assert setup.robot.holdings.bytes == 0
+    setup.take({"data": "third"})
+    assert setup.port.sent[2:] == [ros_string("third")]
+
+
+async def test_a_large_message_that_is_wrong_is_told_and_harms_no_other() -> None:
+    setup = Setup("SubscriberConverter")
+    setup.interface.take_large(large('{"data":5}'))
+    setup.interface.take_large(large("[" * 100 + "]" * 100))
+    setup.interface.take_large(large("[" + "[]," * 200_000 + "[]]"))
+    setup.take({"data": "good"})
+    await asyncio.gather(*setup.robot.work)
+    assert setup.port.sent == [ros_string("good")]
+    wrong, deep, many = setup.robot.reports
+    assert wrong == "tag: data: 5 is not a string"
+    assert deep == "tag: nested deeper than 64 levels"
+    assert many.startswith("tag: a message of 200010 objects, lists and members is over the limit of 200000")
+
+
+async def test_a_large_message_that_refers_to_binary_values_waits_for_them() -> None:
+    setup = Setup("SubscriberConverter", "sensor_msgs/CompressedImage")
+    id_ = "ab" * 16
+    message = large(f'{{"format":"jpeg","data*":"{id_}"}}', cls="sensor_msgs/CompressedImage")
+    setup.interface.take_large(message)
+    await asyncio.gather(*setup.robot.work)
+    assert setup.robot.awaited == [(message, [id_])]
+    setup.interface.take_large(LargeData(message.address, message.text, {id_: memoryview(b"pixels")}))
+    await asyncio.gather(*setup.robot.work)
+    assert setup.port.sent[0].endswith(b"\x06\0\0\0pixels")
+
+
+async def test_a_large_answer_of_the_robot_completes_its_call() -> None:
+    setup = Setup("ServiceClientConverter", SERVICE)
+    call = asyncio.ensure_future(setup.interface.serve(b"\x01"))
+    await asyncio.sleep(0)
+    msg_id = shown(setup.robot.urgent[0])["msgID"]
+    setup.interface.take_large(large('{"success":true,"message":"big"}', cls=SERVICE, msg_id=msg_id))
+    assert bytes(await call) == b"\x01" + ros_string("big")
+
+
+async def test_a_call_is_given_up_when_memory_is_short() -> None:
+    setup = Setup("ServiceProviderConverter", SERVICE)
+    setup.port.answer = asyncio.get_running_loop().create_future()
+    setup.take({"data": True}, "id1")
+    await asyncio.sleep(0)
+    assert setup.robot.holdings.bytes == 1
+    setup.robot.holdings.shed(1)
+    await asyncio.gather(*setup.robot.work, return_exceptions=True)
+    assert setup.robot.holdings.bytes == 0
+    assert setup.robot.reports == ["tag, msgID id1: memory is short; the call was given up"]
+
+
+def test_a_latched_message_is_held_until_another_takes_its_place() -> None:
+    setup = Setup("PublisherConverter")
+    setup.interface.receive(ros_string("x" * 100), latched=True)
+    assert setup.robot.holdings.bytes == 104
+    setup.interface.receive(ros_string("x" * 50), latched=True)
+    assert setup.robot.holdings.bytes == 54
+    setup.robot.holdings.shed(1)
+    assert setup.robot.holdings.bytes == 0
+    assert setup.robot.latched_dropped == 1
+    setup.robot.data.clear()
+    setup.interface.robot_joined()
+    assert setup.robot.data == []
 
 
 # Services

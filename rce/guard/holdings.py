@@ -1,0 +1,75 @@
+"""What one holder of an account holds outside its queues, and how each thing can be given up (sans-I/O).
+
+Queues know what they hold. Everything else that keeps a message alive, such as a call that waits for its
+answer, a latched message or a conversion under way, is entered here for as long as it does.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+class Holding:
+    """A thing that is held. Use :meth:`release` when it is not held any more, any number of times."""
+
+    __slots__ = ("_give_up", "_holdings", "size")
+
+    def __init__(self, holdings: Holdings, size: int, give_up: Callable[[], object] | None) -> None:
+        self._holdings = holdings
+        self._give_up = give_up
+        self.size = size
+
+    def release(self) -> None:
+        """Take note that it is not held any more."""
+        self._holdings._release(self)  # noqa: SLF001 - two halves of one thing
+
+
+class Holdings:
+    """All such things of one holder, oldest first.
+
+    Args:
+        on_growth: Called after something was added; may call :meth:`shed`.
+
+    Attributes:
+        bytes: Held.
+    """
+
+    def __init__(self, on_growth: Callable[[], None] = lambda: None) -> None:
+        self._on_growth = on_growth
+        self._held: dict[Holding, None] = {}
+        self.bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._held)
+
+    def hold(self, size: int, give_up: Callable[[], object] | None = None) -> Holding:
+        """Enter something.
+
+        Args:
+            size: Bytes.
+            give_up: Called when memory is short, after the thing was taken from the books: throws it away.
+                May be called before this returns. None if it cannot be thrown away.
+        """
+        holding = Holding(self, size, give_up)
+        self._held[holding] = None
+        self.bytes += size
+        self._on_growth()
+        return holding
+
+    def shed(self, size: int) -> None:
+        """Have the oldest thrown away that can be, until ``size`` bytes are free."""
+        goal = self.bytes - size
+        for holding in list(self._held):
+            if self.bytes <= goal:
+                return
+            if holding in self._held and holding._give_up is not None:  # noqa: SLF001 - two halves of one thing
+                self._release(holding)
+                holding._give_up()  # noqa: SLF001 - two halves of one thing
+
+    def _release(self, holding: Holding) -> None:
+        if holding in self._held:
+            del self._held[holding]
+            self.bytes -= holding.size
