@@ -50,6 +50,8 @@ class Record(Struct, frozen=True, kw_only=True):
     """The group whose private network it is in; empty if it is in none."""
     address: str = ""
     """Its address there, with the prefix."""
+    revision: int = 0
+    """The newest revision that its environment was given."""
 
 
 class ContainerFolder:
@@ -121,6 +123,16 @@ class ContainerFolder:
             return msgspec.json.decode((self.path / "record.json").read_bytes(), type=Record)
         except (OSError, msgspec.DecodeError):
             return None
+
+    def note_revision(self, revision: int) -> None:
+        """Note the newest revision that the environment was given; a later manager believes no other.
+
+        Raises:
+            StateError: It cannot be written.
+        """
+        record = self.read_record()
+        if record is not None and record.revision < revision:
+            self.write_record(msgspec.structs.replace(record, revision=revision))
 
     def remove(self) -> None:
         """Remove everything, also what a node made unreadable. Blocks; may be repeated."""

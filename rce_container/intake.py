@@ -62,13 +62,13 @@ def sound_text(text: str) -> str:
     return text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]} ..."
 
 
-def sound_status(id_: str, status: EndpointStatus, newest: int = _MAX_NUMBER) -> EndpointStatus:
+def sound_status(id_: str, status: EndpointStatus, newest: int) -> EndpointStatus:
     """Take of a report what can be true of a container.
 
     Args:
         id_: The container, whatever it calls itself.
         status: What its environment says.
-        newest: The newest revision that it was told of, if that is known.
+        newest: The newest revision that it was given.
     """
     nodes = {node.tag: node for node in islice(status.nodes, MAX_ITEMS) if is_name(node.tag)}
     return replace(

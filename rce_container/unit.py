@@ -118,6 +118,10 @@ class Unit:
     def apply(self, spec: EndpointSpec) -> None:
         """Give the environment what is desired."""
         self._spec = spec
+        try:
+            self.folder.note_revision(spec.revision)
+        except StateError as error:
+            log.warning("container %s: %s", self.id, error)
         self._supply.want(spec.bundles)
         if self._channel is not None:
             self._channel.send(m.encode(m.Apply(spec=spec)))
@@ -253,9 +257,11 @@ class Unit:
                 await asyncio.sleep(pause)
 
     def _sound(self, status: EndpointStatus) -> EndpointStatus:
-        if self._spec is None:
-            return intake.sound_status(self.id, status)
-        return intake.sound_status(self.id, status, self._spec.revision)
+        """Believe no revision that the environment was not given, by this manager or by one before."""
+        if self._spec is not None:
+            return intake.sound_status(self.id, status, self._spec.revision)
+        record = self.folder.read_record()
+        return intake.sound_status(self.id, status, record.revision if record is not None else 0)
 
     def _report(self, status: EndpointStatus, pace: intake.Pace) -> None:
         if not self._stopping:

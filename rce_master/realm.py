@@ -67,13 +67,23 @@ class Realm:
         store: Store,
         settings: StateSettings | None = None,
         clock: Callable[[], float] = time.monotonic,
+        revision: int | None = None,
     ) -> Realm:
         """Go on from what a store holds.
+
+        Args:
+            store: The store.
+            settings: Limits and times.
+            clock: Seconds; never goes back.
+            revision: As :meth:`State.load` takes it; None is the time of day.
 
         Raises:
             StoreError: It cannot be read.
         """
-        return cls(State.load(await store.load(), clock(), settings), store, clock)
+        if revision is None:
+            revision = time.time_ns() // 1_000_000
+        state = State.load(await store.load(), clock(), settings, revision=revision)
+        return cls(state, store, clock)
 
     @property
     def tables(self) -> Tables:

@@ -73,9 +73,11 @@ class EngineCollector(Collector):
         nodes = Counter(node.state for c in tables.containers() for node in self._views.nodes(c))
         yield _gauge("rce_nodes", "Nodes by state.", "state", nodes)
         yield GaugeMetricFamily("rce_users", "Users.", value=len(tables.users))
-        revision = tables.counters.get("revision")
+        counted = {counter.name: counter.value for counter in tables.counters}
         yield CounterMetricFamily(
-            "rce_revisions", "Changes of desired state.", value=revision.value if revision else 0
+            "rce_revisions",
+            "Changes of desired state since the start.",
+            value=counted.get("revision", 0) - counted.get("revisions_before", 0),
         )
 
     def _connections(self) -> Iterator[Metric]:

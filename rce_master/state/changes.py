@@ -179,6 +179,11 @@ class Transaction:
         self._assign(self.tables.counters, Counter(name=counter, value=value))
         return value
 
+    def newest(self, counter: str) -> int:
+        """Tell the number of a counter that was taken last."""
+        found = self.tables.counters.get(counter)
+        return found.value if found else 0
+
     def raise_counter(self, counter: str, value: int) -> None:
         """Make a counter go on above a value."""
         found = self.tables.counters.get(counter)

@@ -100,8 +100,18 @@ class State:
         self._make_token = make_token
 
     @classmethod
-    def load(cls, snapshot: Snapshot, now: float, settings: StateSettings | None = None) -> State:
+    def load(
+        cls, snapshot: Snapshot, now: float, settings: StateSettings | None = None, *, revision: int = 0
+    ) -> State:
         """Go on from what the store holds.
+
+        Args:
+            snapshot: What the store holds.
+            now: Seconds of a clock that never goes back.
+            settings: Limits and times.
+            revision: Revisions go on above this, also if the store is an old copy. It must grow from one
+                start of the master to the next more than there were changes between them: the time of day
+                in milliseconds does.
 
         Raises:
             StoreError: A record cannot be read.
@@ -112,7 +122,7 @@ class State:
                 table.load(snapshot.get(table.name, {}))
         except msgspec.MsgspecError as error:
             raise StoreError(f"a record in the store cannot be read: {error}") from error
-        task_sets.restart(state._begin(now))
+        task_sets.restart(state._begin(now), revision)
         return state
 
     def apply(self, command: commands.Command, now: float) -> Changes:

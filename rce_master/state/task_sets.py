@@ -41,8 +41,6 @@ def arrived(tx: Transaction, command: TaskSetArrived) -> None:
     _check_name(tx, hello)
     _register(tx, hello)
     running = {status.id: status for status in hello.endpoints}
-    # Revisions go on above all that was ever applied, even if the store was restored from an old copy.
-    tx.raise_counter("revision", max((s.revision for s in hello.endpoints), default=0))
     for status in hello.endpoints:
         _adopt(tx, hello.process, status)
     for endpoint in tx.tables.endpoints.by("task_set", hello.process):
@@ -52,6 +50,9 @@ def arrived(tx: Transaction, command: TaskSetArrived) -> None:
         # A task set ignores a spec that is older than what it has.
         if endpoint.id in running and running[endpoint.id].revision > endpoint.revision:
             tx.touch(endpoint.id)
+    for status in hello.endpoints:
+        if not _is_given(tx, status):
+            _complain(tx, hello.process, status)
     tx.changes.arrived = hello.process
     placing.place_waiting(tx)
 
@@ -104,10 +105,25 @@ def _find_again(tx: Transaction, process: str, container: Container, status: End
     task_set = tx.tables.task_sets[process]
     if task_set.kind is not TaskSetKind.CONTAINER or status.state is EndpointState.STOPPING:
         return
-    if status.revision < container.born:
+    if status.revision < container.born or not _is_given(tx, status):
         tx.put(Tombstone(process=process, id=container.id))
     elif not capacity.room_at(tx.tables, task_set).shortages(container.resources):
         placing.bind(tx, container, process)
+
+
+def _is_given(tx: Transaction, status: EndpointStatus) -> bool:
+    """Tell whether this master, or one before it, can have given the revision that a task set reports."""
+    return status.revision <= tx.newest("revision")
+
+
+def _complain(tx: Transaction, process: str, status: EndpointStatus) -> None:
+    """Tell the operator of a revision that no master gave, which counts for nothing."""
+    text = (
+        f"{process} reports revision {status.revision}, and the newest that was given is "
+        f"{tx.newest('revision')}: not believed; if the clock of the master's machine was set back, "
+        "make it right and restart the master"
+    )
+    tx.happen("revision_unknown", status.id, text, user="")
 
 
 def _miss(tx: Transaction, endpoint: Container | Robot) -> None:
@@ -212,8 +228,14 @@ def _expire(tx: Transaction, presence: Presence) -> None:
         tx.happen("task_set_gone", presence.process, f"away for {grace:.0f} s", user="")
 
 
-def restart(tx: Transaction) -> None:
-    """Begin with what the store held: nobody is connected, and every grace time starts now."""
+def restart(tx: Transaction, revision: int) -> None:
+    """Begin with what the store held: nobody is connected, and every grace time starts now.
+
+    Revisions go on above ``revision``. What task sets report has no say in it: a revision that nobody gave
+    would be in force as long as the store is.
+    """
+    tx.raise_counter("revision", revision)
+    tx.raise_counter("revisions_before", tx.newest("revision"))
     for task_set in tx.tables.task_sets:
         tx.put(Presence(process=task_set.process, connected=False, since=tx.now))
     for endpoint in tx.tables.endpoints:

@@ -26,8 +26,8 @@ def machine(folder: Path) -> Iterator[Machine]:
     machine.tidy()
 
 
-def report(id_: str, *nodes: NodeStatus) -> bytes:
-    status = EndpointStatus(id=id_, revision=1, state=EndpointState.RUNNING, nodes=nodes)
+def report(id_: str, *nodes: NodeStatus, revision: int = 1) -> bytes:
+    status = EndpointStatus(id=id_, revision=revision, state=EndpointState.RUNNING, nodes=nodes)
     return m.encode(m.Report(status=status)) + b"\n"
 
 
@@ -92,6 +92,17 @@ async def test_who_claims_to_be_another_container_is_adopted_as_itself(machine: 
         assert statuses[VICTIM].incarnation == victim, "it is the one that it was"
         assert statuses[VICTIM].nodes == ()
         assert [node.tag for node in statuses[BOX].nodes] == ["evil"]
+
+
+async def test_a_revision_that_the_master_did_not_give_is_not_believed(machine: Machine) -> None:
+    """A manager that adopts a container has no spec of it yet, and asks its environment for none."""
+    async with taken_over(machine, report(BOX, revision=2**52)) as (rogue, _):
+        given = 1
+        (status,) = [one for one in machine.manager.statuses if one.id == BOX]
+        assert status.revision <= given
+        await rogue.say(report(BOX, NodeStatus(tag="seen", state=NodeState.RUNNING), revision=2**52))
+        await until(lambda: machine.status(BOX).nodes, what="the second report")
+        assert machine.status(BOX).revision <= given
 
 
 async def test_who_never_stops_talking_keeps_nobody_waiting(machine: Machine) -> None:

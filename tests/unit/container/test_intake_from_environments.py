@@ -19,7 +19,7 @@ from rce_container.environment import messages as m
 
 def status(**fields: object) -> EndpointStatus:
     told = {"id": "anna/c", "revision": 3, "state": EndpointState.RUNNING, **fields}
-    return intake.sound_status("anna/c", msgspec.convert(told, EndpointStatus))
+    return intake.sound_status("anna/c", msgspec.convert(told, EndpointStatus), 2**53)
 
 
 def test_a_sound_report_stays_as_it_is() -> None:
@@ -31,7 +31,7 @@ def test_a_sound_report_stays_as_it_is() -> None:
         interfaces={"i": True},
         connections=(4, 5),
     )
-    assert intake.sound_status("anna/c", said) == said
+    assert intake.sound_status("anna/c", said, said.revision) == said
 
 
 def test_a_container_speaks_of_itself_only() -> None:

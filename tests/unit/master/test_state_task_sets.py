@@ -307,7 +307,7 @@ def test_a_machine_that_lost_its_containers_makes_them_again(world: World) -> No
 # A restarted master
 
 
-def restarted(world: World) -> World:
+def restarted(world: World, revision: int = 0) -> World:
     snapshot: dict[str, dict[str, bytes]] = {
         table.name: {table.key(r): table.encode(r) for r in table}
         for table in world.state.tables.all
@@ -315,7 +315,7 @@ def restarted(world: World) -> World:
     }
     new = World.__new__(World)
     new.now = world.now + 1
-    new.state = State.load(snapshot, new.now)
+    new.state = State.load(snapshot, new.now, revision=revision)
     new.state.validate()
     return new
 
@@ -335,13 +335,33 @@ def test_a_restarted_master_desires_the_same(world: World) -> None:
     assert (new.session(), new.phase()) == ("connected", "running")
 
 
-def test_revisions_go_on_above_what_was_applied(world: World) -> None:
+def test_a_store_from_an_old_copy_goes_on_above_what_was_applied(world: World) -> None:
+    """Between the copy and the restart, the former master gave revisions up to 400."""
     world.wired()
+    new = restarted(world, revision=500)
+    new.container_set(endpoints=(status("c", revision=400),))
+    assert new.spec("c").revision > 500
+
+
+@pytest.mark.parametrize("revision", [5000, 2**53, 2**63 - 1])
+def test_revisions_that_nobody_gave_are_not_believed(world: World, revision: int) -> None:
+    """Neither when a task set comes, nor in a report, whether the container is placed there or nowhere."""
+    world.wired()
+    world.run()
+    newest = world.spec("c").revision
     world.leave("c1")
-    world.container_set(endpoints=(status("c", revision=5000),))
-    assert world.spec("c").revision > 5000
+    changes = world.container_set(endpoints=(status("c", revision=revision),))
+    assert "revision_unknown" in kinds(changes)
+    world.report("c1", status("c", revision=revision))
+    world.robot_set(endpoints=(status("rob", revision=revision),))
     world.node("c", "n")
-    assert world.spec("c").revision > 5001
+    assert newest < world.spec("c").revision < newest + 20
+    world.leave("c1")
+    world.tick(30)
+    assert world.phase() == "lost"
+    world.container_set(endpoints=(status("c", revision=revision),))
+    assert world.phase() == "lost", "what claims such a revision is not taken for a life of the container"
+    world.state.validate()
 
 
 def test_robots_that_do_not_come_back_after_a_restart_expire(world: World) -> None:
