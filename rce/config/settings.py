@@ -1,23 +1,22 @@
 """The engine's settings: one YAML file for ``rce up`` and for each program.
 
-The shipped ``configs/engine.yaml`` holds every setting with its default and a comment. Times are in seconds,
-sizes in bytes. An empty file, or none, means all defaults.
+Every setting stands here once: its type, its default, its sentence and its option. ``configs/engine.yaml``
+and the reference pages are made from these sections (``make reference``). Times are in seconds, sizes in
+bytes.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationError
+from msgspec import Meta, field
 
-from rce.config.documents import parse, read_file
-from rce.config.exceptions import ConfigError, Fault
+from rce.config.fields import Cores, Finite, Host, Memory, Networks, Port, Seconds, Section, Setting, choice
 from rce.config.folders import default_state_dir
-from rce.config.validation import Strict, faults_of
-from rce.protocol.quantities import read_cores, read_memory
 
 LOOPBACK = "127.0.0.1"
 ANYWHERE = "0.0.0.0"  # noqa: S104 - an engine serves other machines unless in development mode
@@ -34,198 +33,267 @@ class Runtime(Enum):
     PROCESS = "process"
 
 
-def _check_host(text: str) -> str:
-    try:
-        ipaddress.ip_address(text)
-    except ValueError:
-        if not text or not text.replace("-", "").replace(".", "").replace("_", "").isalnum():
-            raise ValueError("must be a host name or an IP address") from None
-    return text
+class LogLevel(Enum):
+    """What a program tells in its log."""
+
+    DEBUG = "debug"
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
 
 
-def _as_path(value: Any) -> Any:
-    if isinstance(value, str) and value:
-        return Path(value).expanduser()
-    if value is None or isinstance(value, Path):
-        return value
-    raise ValueError("must be the path of a file or folder")
+class MasterSettings(Section, frozen=True, kw_only=True):
+    """The Master Task Set, `rce-master`."""
+
+    bind: Annotated[Host, Setting("Address to listen on.")] = ANYWHERE
+    http_port: Annotated[Port, Setting("Port of clients, REST API and metrics.", up="http-port")] = 9000
+    control_port: Annotated[Port, Setting("Port of task sets.", up="control-port")] = 8080
+    state_dir: Annotated[
+        Path | None,
+        Setting("Folder of users and desired state.", unset="folder `master` in the engine's state folder"),
+    ] = None
+    tls_cert: Annotated[Path | None, Setting("Serve HTTPS with this certificate.", unset="HTTP")] = None
+    tls_key: Annotated[Path | None, Setting("The certificate's key.", unset="in the certificate's file")] = (
+        None
+    )
+    origins: Annotated[
+        tuple[str, ...],
+        Setting("Origins whose web pages may use the server.", option="allow-origin"),
+    ] = ()
+    robot_grace: Annotated[
+        Seconds, Setting("How long a robot that is away keeps its interfaces and connections.")
+    ] = 60.0
+    container_grace: Annotated[
+        Seconds,
+        Setting("How long a container task set may be away until its containers are placed elsewhere."),
+    ] = 30.0
+    token_lifetime: Annotated[Seconds, Setting("How long an API token is valid.")] = 30 * 86400.0
+    trusted_proxies: Annotated[
+        Networks,
+        Setting(
+            "Addresses or networks of proxies whose `X-Forwarded-For` is believed.", option="trusted-proxy"
+        ),
+    ] = ()
+    max_slots: Annotated[
+        int,
+        Meta(ge=0),
+        Setting("Slots that the containers of one user may take together; 0: no limit."),
+    ] = 0
+    max_cpu: Annotated[
+        Cores, Setting("Cores that the containers of one user may ask for together; 0: no limit.")
+    ] = 0.0
+    max_memory: Annotated[
+        Memory, Setting("Memory that the containers of one user may ask for together; 0: no limit.")
+    ] = 0
 
 
-def _as_runtime(value: Any) -> Any:
-    try:
-        return Runtime(value)
-    except ValueError:
-        raise ValueError(f"must be one of {', '.join(item.value for item in Runtime)}") from None
+class RobotSettings(Section, frozen=True, kw_only=True):
+    """The Robot Task Set, `rce-robot`."""
+
+    count: Annotated[
+        int,
+        Meta(ge=1, le=64),
+        Setting(
+            "Robot processes of `rce up`; each further one takes the next ports.", option="", up="robots"
+        ),
+    ] = 1
+    bind: Annotated[Host, Setting("Address to listen on.")] = ANYWHERE
+    ws_port: Annotated[Port, Setting("Port of robots' WebSockets.", up="ws-port")] = 9010
+    link_port: Annotated[
+        Port | None,
+        Setting(
+            "Port of links from other machines.",
+            up="robot-link-port",
+            unset="10030, or a free one where that is taken",
+        ),
+    ] = None
+    public_host: Annotated[
+        Host,
+        Setting(
+            "Name or address by which clients and other machines reach this one.",
+            up="public-host",
+            unset="its address towards the master",
+            example="cloud.example.org",
+        ),
+    ] = ""
+    public_url: Annotated[
+        str,
+        Meta(pattern=r"^(wss?://.+)?$"),
+        Setting(
+            "URL that clients are sent to, where a proxy stands in front.",
+            up="public-url",
+            unset="made of `public_host` and `ws_port`",
+            example="wss://cloud.example.org/",
+        ),
+    ] = ""
+    origins: Annotated[
+        tuple[str, ...], Setting("Origins whose web pages may connect; `*` is any.", option="origin")
+    ] = ()
+    trusted_proxies: Annotated[
+        Networks,
+        Setting(
+            "Addresses or networks of proxies whose `X-Forwarded-For` is believed.", option="trusted-proxy"
+        ),
+    ] = ()
+    user_memory: Annotated[
+        Memory,
+        Meta(ge=1 << 20),
+        Setting("Messages that may wait for all robots of a user; beyond it the oldest are dropped."),
+    ] = 512 << 20
+    memory: Annotated[Memory, Setting("The same for all users; 0: half of the machine's memory.")] = 0
+    strangers: Annotated[
+        int, Meta(ge=1), Setting("Connections from one address that have not logged in yet.")
+    ] = 256
 
 
-def _as_cores(value: Any) -> Any:
-    return read_cores(value)
+class ContainerSettings(Section, frozen=True, kw_only=True):
+    """The Container Task Set, `rce-container`."""
+
+    bind: Annotated[Host, Setting("Address to accept links on.", unset="all")] = ""
+    link_port: Annotated[
+        Port | None,
+        Setting(
+            "Port of links from other machines.",
+            up="container-link-port",
+            unset="10030, or a free one where that is taken; 10031 with `rce up`",
+        ),
+    ] = None
+    name: Annotated[str, Setting("Name of this task set.", unset="made up once, then kept")] = ""
+    state_dir: Annotated[
+        Path | None,
+        Setting(
+            "Folder of containers' logs and homes, and of packages.",
+            unset="folder `container` in the engine's state folder",
+        ),
+    ] = None
+    runtime: Annotated[
+        Runtime,
+        choice(Runtime),
+        Setting("How containers are isolated; `process` does not isolate them.", up="runtime"),
+    ] = Runtime.AUTO
+    package_path: Annotated[
+        tuple[Path, ...],
+        Setting(
+            "Folders with ROS packages, the first match wins; the shipped examples come last.",
+            up="package-path",
+        ),
+    ] = ()
+    grace: Annotated[
+        Finite,
+        Meta(ge=0.1),
+        Setting("How long containers wait for a manager that was killed until they end themselves."),
+    ] = 30.0
+    labels: Annotated[
+        tuple[str, ...],
+        Setting("What this machine has; containers ask for it as `specialFeatures`.", option="label"),
+    ] = ()
+    images: Annotated[
+        tuple[str, ...],
+        Setting(
+            "Root file systems that containers may have, beside podman's images; the first one, image or"
+            " folder, is that of all containers of `runtime: podman`.",
+            option="image",
+        ),
+    ] = ()
+    slots: Annotated[
+        int,
+        Meta(ge=0),
+        Setting("Slots that this machine offers in all; 0: one for each 64 MB of its memory."),
+    ] = 0
+    slot_memory: Annotated[
+        Memory, Meta(ge=32 << 20), Setting("Memory of a container for each of its slots.")
+    ] = 512 << 20
+    slot_processes: Annotated[
+        int, Meta(ge=16), Setting("Processes and threads of a container for each of its slots.")
+    ] = 256
+    home_size: Annotated[
+        Memory, Meta(ge=1 << 20), Setting("Size of a container's home, which is in memory.")
+    ] = 256 << 20
+    first_uid: Annotated[
+        int,
+        Meta(ge=1),
+        Setting("As root: the first of the user IDs that containers run as; nobody else may have them."),
+    ] = 700_000
+    uids: Annotated[int, Meta(ge=1), Setting("How many such user IDs there are.")] = 10_000
+    log_days: Annotated[
+        Finite, Meta(ge=0), Setting("Days for which the logs of containers that ended are kept.")
+    ] = 3.0
+    log_space: Annotated[Memory, Setting("What those logs may take on the disk; the oldest go first.")] = (
+        1 << 30
+    )
+    bundle_space: Annotated[Memory, Setting("What users' packages may take on the disk.")] = 4 << 30
+    allow_requirements: Annotated[
+        bool, Setting("Install what users' packages ask for in a `requirements.txt`.")
+    ] = False
+    pip_args: Annotated[
+        str, Setting("More arguments for pip, such as `--index-url URL`; split as a shell does.")
+    ] = ""
 
 
-def _as_bytes(value: Any) -> Any:
-    return read_memory(value)
+class EngineSettings(Section, frozen=True, kw_only=True):
+    """What all programs share."""
 
-
-def _check_network(text: str) -> str:
-    try:
-        ipaddress.ip_network(text, strict=False)
-    except ValueError:
-        raise ValueError("must be an IP address or a network such as 10.0.0.0/8") from None
-    return text
-
-
-Address = Annotated[str, AfterValidator(_check_network)]
-"""An IP address or network."""
-Host = Annotated[str, AfterValidator(_check_host)]
-Port = Annotated[int, Field(ge=0, le=65535)]
-"""A TCP port; 0 takes a free one."""
-Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Folder = Annotated[Path, BeforeValidator(_as_path)]
-
-
-class MasterSettings(Strict):
-    """The Master Task Set."""
-
-    bind: Host = ANYWHERE
-    http_port: Port = 9000
-    """Clients, REST API."""
-    control_port: Port = 8080
-    """Task sets."""
-    robot_grace: Seconds = 60.0
-    """How long a robot that is away keeps its interfaces and connections."""
-    container_grace: Seconds = 30.0
-    """How long a container task set may be away until its containers are placed elsewhere."""
-    token_lifetime: Seconds = 30 * 86400.0
-    """How long an API token is valid."""
-    trusted_proxies: tuple[Address, ...] = Field(default=(), strict=False)
-    """Addresses or networks of proxies whose ``X-Forwarded-For`` is believed."""
-    max_slots: int = Field(default=0, ge=0)
-    """Slots that the containers of one user may take together; 0 for no limit. Administrators have none."""
-    max_cpu: Annotated[float, BeforeValidator(_as_cores)] = 0.0
-    """Cores that the containers of one user may ask for together."""
-    max_memory: Annotated[int, BeforeValidator(_as_bytes)] = 0
-    """Bytes that the containers of one user may ask for together; written in MB or as a text (``8G``)."""
-
-
-class RobotSettings(Strict):
-    """The Robot Task Set."""
-
-    count: int = Field(default=1, ge=1, le=64)
-    """How many processes ``rce up`` starts; each further one takes the next ports."""
-    bind: Host = ANYWHERE
-    ws_port: Port = 9010
-    """Robots' WebSockets."""
-    link_port: Port = 10030
-    """Links from other machines."""
-    public_host: Host | None = None
-    """The name by which clients reach this machine; its address towards the master if none."""
-    public_url: str = Field(default="", pattern=r"^(wss?://.+)?$")
-    """The whole URL that clients are sent to, where a proxy stands in front."""
-    origins: tuple[str, ...] = Field(default=(), strict=False)
-    """Origins whose web pages may connect; ``*`` is any."""
-    trusted_proxies: tuple[Address, ...] = Field(default=(), strict=False)
-    """Addresses or networks of proxies whose ``X-Forwarded-For`` is believed."""
-    user_memory: Annotated[int, BeforeValidator(_as_bytes), Field(ge=1 << 20)] = 512 << 20
-    """Bytes of messages that may wait for all robots of a user; written as other memory."""
-    memory: Annotated[int, BeforeValidator(_as_bytes)] = 0
-    """The same for all users; 0 is half of the machine's memory."""
-    strangers: int = Field(default=256, ge=1)
-    """Connections from one address that have not logged in yet."""
-
-
-class ContainerSettings(Strict):
-    """The Container Task Set."""
-
-    bind: Host = ANYWHERE
-    link_port: Port = 10031
-    """Links from other machines."""
-    runtime: Annotated[Runtime, BeforeValidator(_as_runtime)] = Runtime.AUTO
-    package_path: tuple[Folder, ...] = Field(default=(), strict=False)
-    """Folders with ROS packages, first match wins; the shipped examples come last."""
-    grace: Seconds = 30.0
-    """How long containers wait for a manager that was killed until they end themselves."""
-    labels: tuple[str, ...] = Field(default=(), strict=False)
-    """What this machine has; containers ask for it as special features."""
-    images: tuple[str, ...] = Field(default=(), strict=False)
-    """Folders with root file systems that containers may have; the first is that of ``runtime: podman``."""
-    slots: int = Field(default=0, ge=0)
-    """What this machine offers in all; 0: one for each 64 MB of its memory."""
-    slot_memory: Annotated[int, BeforeValidator(_as_bytes), Field(ge=32 << 20)] = 512 << 20
-    """Bytes of a container for each of its slots; written as other memory."""
-    slot_processes: int = Field(default=256, ge=16)
-    """Processes and threads of a container for each of its slots."""
-    home_size: Annotated[int, BeforeValidator(_as_bytes), Field(ge=1 << 20)] = 256 << 20
-    """Bytes of a container's home, which is in memory."""
-    first_uid: int = Field(default=700_000, ge=1)
-    """As root: the first of the users that containers run as; they must belong to nobody else."""
-    uids: int = Field(default=10_000, ge=1)
-    """How many such users there are."""
-    log_days: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 3.0
-    """How long the logs of containers that ended are kept."""
-    log_space: Annotated[int, BeforeValidator(_as_bytes)] = 1 << 30
-    """Bytes that they may take in all."""
-    bundle_space: Annotated[int, BeforeValidator(_as_bytes)] = 4 << 30
-    """Bytes that packages of users may take on the machine."""
-    allow_requirements: bool = False
-    """Whether what users' packages ask for in a ``requirements.txt`` is installed."""
-    pip_args: str = ""
-    """More arguments for pip, such as another index."""
-
-
-class EngineSettings(Strict):
-    """Everything."""
-
-    dev: bool = False
-    """Development mode: loopback only, user testUser with password testUser, a shared secret of its own."""
-    state_dir: Folder = Field(default_factory=default_state_dir)
-    secret_file: Folder | None = None
-    master_host: Host = LOOPBACK
-    """Where robot and container task sets find the master."""
+    dev: Annotated[
+        bool,
+        Setting("Development mode: loopback only, user testUser with password testUser.", up="dev"),
+    ] = False
+    state_dir: Annotated[
+        Path,
+        Setting(
+            "Folder in which everything is kept.",
+            option="",
+            up="state-dir",
+            unset="the user's state folder, such as ~/.local/state/rce",
+            example="/var/lib/rce",
+        ),
+    ] = field(default_factory=default_state_dir)
+    secret_file: Annotated[
+        Path | None,
+        Setting(
+            "File with the secret that the engine's programs share (`rce secret new`).",
+            up="secret-file",
+            unset="`RCE_SECRET`, or the file that `RCE_SECRET_FILE` names",
+            example="/etc/rce/secret",
+        ),
+    ] = None
+    master_host: Annotated[
+        Host,
+        Setting(
+            "Where robot and container task sets find the master.",
+            option="",
+            unset="the argument MASTER_IP; 127.0.0.1 with `rce up`",
+            example="10.0.0.1",
+        ),
+    ] = ""
+    machine: Annotated[str, Setting("Name of this machine.", unset="its host name")] = ""
+    log_level: Annotated[
+        LogLevel, choice(LogLevel), Setting("What the programs tell in their logs.", up="log-level")
+    ] = LogLevel.INFO
     master: MasterSettings = MasterSettings()
     robot: RobotSettings = RobotSettings()
     container: ContainerSettings = ContainerSettings()
 
-    def for_development(self) -> EngineSettings:
-        """Return the same in development mode: every program binds loopback only."""
-        return self.model_copy(
-            update={
-                "dev": True,
-                "master_host": LOOPBACK,
-                "master": self.master.model_copy(update={"bind": LOOPBACK}),
-                "robot": self.robot.model_copy(update={"bind": LOOPBACK, "public_host": LOOPBACK}),
-                "container": self.container.model_copy(update={"bind": LOOPBACK}),
-            }
-        )
+    @property
+    def master_state(self) -> Path:
+        """Where the master keeps its state."""
+        return self.master.state_dir or self.state_dir / "master"
+
+    @property
+    def container_state(self) -> Path:
+        """Where a container task set keeps its state."""
+        return self.container.state_dir or self.state_dir / "container"
 
     @property
     def control_url(self) -> str:
         """Where task sets dial the master."""
-        host = f"[{self.master_host}]" if ":" in self.master_host else self.master_host
-        return f"ws://{host}:{self.master.control_port}"
+        host = self.master_host or LOOPBACK
+        return f"ws://{f'[{host}]' if ':' in host else host}:{self.master.control_port}"
 
-
-def load_settings(path: Path | None = None) -> EngineSettings:
-    """Read the engine's settings.
-
-    Args:
-        path: A YAML (or JSON) file; all defaults if None.
-
-    Raises:
-        ConfigError: It cannot be read, or something is wrong in it; every fault is listed.
-    """
-    if path is None:
-        return EngineSettings()
-    data = parse(read_file(path), str(path))
-    if data is None:
-        data = {}
-    if not isinstance(data, dict):
-        raise ConfigError(
-            str(path), [Fault("", "must be a mapping with the keys master, robot, container, ...")]
-        )
-    # A section whose settings are all commented out reads as null.
-    sections = {key: {} if value is None else value for key, value in data.items()}
-    try:
-        settings = EngineSettings.model_validate(sections)
-    except ValidationError as error:
-        raise ConfigError(str(path), faults_of(error, EngineSettings)) from error
-    return settings.for_development() if settings.dev else settings
+    @property
+    def http_url(self) -> str:
+        """Where clients on this machine find the master."""
+        host = self.master.bind or LOOPBACK
+        with contextlib.suppress(ValueError):
+            if ipaddress.ip_address(host).is_unspecified:
+                host = LOOPBACK
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.master.http_port}/"

@@ -1,89 +1,116 @@
-"""Everything that can be set for ``rce up`` is understood by the programs that it starts."""
+"""``rce up`` hands each program its settings as one document; nothing is lost on the way."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import pytest
 import typer.main
+from msgspec.structs import replace
 from typer import Typer
 
-from rce.cli.up import programs
+from rce.cli.up import bound_to, programs
+from rce.config.fields import fields_of, sections_of
 from rce.config.settings import (
     ContainerSettings,
     EngineSettings,
+    LogLevel,
     MasterSettings,
     RobotSettings,
     Runtime,
 )
+from rce_container.__main__ import OPTIONS as CONTAINER
 from rce_container.__main__ import app as container
+from rce_master.__main__ import OPTIONS as MASTER
 from rce_master.__main__ import app as master
+from rce_robot.__main__ import OPTIONS as ROBOT
 from rce_robot.__main__ import app as robot
 
-APPS: dict[str, Typer] = {"rce_master": master, "rce_robot": robot, "rce_container": container}
+if TYPE_CHECKING:
+    from rce.cli.settings import SettingsOptions
+
+APPS: dict[str, tuple[SettingsOptions, Typer]] = {
+    "rce_master": (MASTER, master),
+    "rce_robot": (ROBOT, robot),
+    "rce_container": (CONTAINER, container),
+}
 SETTINGS = EngineSettings(
     dev=True,
     state_dir=Path("/state"),
     secret_file=Path("/secret"),
+    master_host="127.0.0.2",
+    log_level=LogLevel.DEBUG,
     master=MasterSettings(
         bind="127.0.0.2",
         http_port=1,
-        control_port=2,
-        token_lifetime=3.0,
-        trusted_proxies=("10.0.0.0/8",),
-        max_slots=4,
+        token_lifetime=3.5,
         max_cpu=1.5,
-        max_memory=8 << 10,
+        max_memory=5,
+        trusted_proxies=("10.0.0.0/8",),
     ),
-    robot=RobotSettings(
-        count=2,
-        public_host="robots.example.org",
-        origins=("https://a.example",),
-        trusted_proxies=("10.1.1.1",),
-    ),
+    robot=RobotSettings(count=2, public_host="robots.example.org", origins=("https://a.example",)),
     container=ContainerSettings(
         runtime=Runtime.PROCESS,
-        labels=("gpu", "lidar"),
-        package_path=(Path("/p"),),
+        package_path=(Path("/p"), Path("/q")),
         images=("debian:12", "/srv/rootfs"),
-        slots=12,
-        slot_memory=128,
-        home_size="1G",
-        log_days=0.5,
+        home_size=1 << 30,
         allow_requirements=True,
         pip_args="--no-index --pre",
+        link_port=0,
     ),
 )
 
 
-def parsed(settings: EngineSettings) -> dict[str, Any]:
+def received(settings: EngineSettings) -> dict[str, EngineSettings]:
+    """What each program reads from the command line that ``rce up`` gives it."""
     found = {}
     for program in programs(settings):
         _, _, module, *arguments = program.argv
-        command = typer.main.get_command(APPS[module])
-        found[program.name] = command.make_context(module, arguments)
+        options, app = APPS[module]
+        context = typer.main.get_command(app).make_context(module, arguments)
+        found[program.name] = options.read(module, context.params)
     return found
 
 
-@pytest.mark.parametrize("settings", [SETTINGS, EngineSettings()])
-def test_every_option_is_known(settings: EngineSettings) -> None:
-    assert {"master", "container"} < set(parsed(settings))
-
-
 def test_what_is_set_arrives() -> None:
-    contexts = parsed(SETTINGS)
-    assert contexts["master"].params["token_lifetime"] == 3.0
-    assert contexts["master"].params["max_slots"] == 4
-    assert list(contexts["master"].params["trusted_proxy"]) == ["10.0.0.0/8"]
-    assert list(contexts["robot1"].params["trusted_proxy"]) == ["10.1.1.1"]
-    assert contexts["container"].params["allow_requirements"]
-    assert contexts["container"].params["pip_args"] == "--no-index --pre"
-    params = contexts["container"].params
-    assert list(params["image"]) == ["debian:12", "/srv/rootfs"]
-    sizes = ("slots", "slot_memory", "slot_processes", "home_size", "log_days", "log_space", "bundle_space")
-    assert [params[name] for name in sizes] == [12, 128, 256, 1024, 0.5, 1024, 4096]
-    assert contexts["master"].params["max_cpu"] == 1.5
-    assert contexts["master"].params["max_memory"] == f"{8 << 30}B"
-    assert contexts["robot2"].params["public_host"] == "robots.example.org"
-    assert list(contexts["container"].params["label"]) == ["gpu", "lidar"]
+    found = received(SETTINGS)
+    assert found["master"] == SETTINGS
+    assert found["container"] == SETTINGS
+    assert found["robot1"].robot == replace(SETTINGS.robot, link_port=10030)
+    assert found["robot2"].robot == replace(SETTINGS.robot, ws_port=9011, link_port=10032)
+
+
+def test_defaults_arrive() -> None:
+    found = received(EngineSettings())
+    assert set(found) == {"master", "robot", "container"}
+    assert {each.master_host for each in found.values()} == {"127.0.0.1"}
+    assert (found["robot"].robot.link_port, found["container"].container.link_port) == (10030, 10031)
+
+
+@pytest.mark.parametrize("host", ["10.0.0.7", "0.0.0.0"])
+def test_one_address_for_all_programs(host: str) -> None:
+    found = received(bound_to(host, SETTINGS))
+    assert {one.master.bind for one in found.values()} == {host}, "the command line counts, even here"
+    assert {one.robot.bind for one in found.values()} == {host}
+    assert {one.container.bind for one in found.values()} == {host}
+
+
+def test_bad_address_is_refused() -> None:
+    with pytest.raises(typer.BadParameter, match="--bind must be a host name"):
+        bound_to("a b", SETTINGS)
+
+
+def test_every_setting_is_an_option_of_its_program() -> None:
+    given = {option.place for options, _ in APPS.values() for option in options.options}
+    elsewhere = {("", "state_dir"), ("", "master_host"), ("robot", "count")}
+    for section, kind in {"": EngineSettings, **sections_of(EngineSettings)}.items():
+        for name in fields_of(kind):
+            assert (section, name) in given | elsewhere
+
+
+@pytest.mark.parametrize(("options", "app"), APPS.values(), ids=APPS)
+def test_no_option_comes_twice(options: SettingsOptions, app: Typer) -> None:
+    names = [name for param in typer.main.get_command(app).params for name in param.opts]
+    assert len(names) == len(set(names))
+    assert {f"--{option.name}" for option in options.options} < set(names)

@@ -1,0 +1,320 @@
+"""How settings are declared: types with their checks, and what is said of each for options and pages.
+
+A section is a :class:`Section` whose fields carry a :class:`Setting`::
+
+    class MasterSettings(Section):
+        http_port: Annotated[Port, Setting("Clients, REST and metrics.", up="http-port")] = 9000
+
+From it come the key of the settings file, the option of the program, the option of ``rce up`` and the entry
+on the reference page. It is msgspec, not pydantic: the models of the latter cost each program 15 MB.
+"""
+
+from __future__ import annotations
+
+import difflib
+import ipaddress
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, get_args
+
+import msgspec
+from msgspec import NODEFAULT, Meta, Struct
+from msgspec.structs import fields as struct_fields
+
+from rce.config.documents import join
+from rce.config.exceptions import Fault
+from rce.protocol.quantities import read_cores, read_memory, write_memory
+
+_WORDS = {
+    "int": "an integer",
+    "float": "a number",
+    "bool": "true or false",
+    "str": "a text",
+    "array": "a list",
+}
+"""What msgspec calls the kinds of values, and people do."""
+
+
+class Section(Struct, frozen=True, kw_only=True):
+    """Settings that belong together. Instances do not change."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What is said of a setting beside its type and its default."""
+
+    help: str
+    """One sentence; it stands in the program's help, on the page and in the shipped file."""
+    option: str | None = None
+    """Name of the program's option without dashes; None: the field's name; empty: no option."""
+    up: str = ""
+    """Name of the option of ``rce up``; empty: none."""
+    unset: str = ""
+    """What holds while it is not set, where the default does not tell."""
+    example: str = ""
+    """A value for the shipped file, where the default is none or depends on the machine."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reader:
+    """Reads a value that people may write in several ways; of a list, each of its values."""
+
+    read: Callable[[Any], Any]
+    """Raises ValueError: it is none; the text says what would be one."""
+    write: Callable[[Any], Any]
+    """Writes a value so that :attr:`read` reads the same."""
+    metavar: str
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A setting, looked up in its section."""
+
+    name: str
+    type: Any
+    default: Any
+    setting: Setting
+    reader: Reader | None
+
+    @property
+    def is_flag(self) -> bool:
+        """Whether it is on or off."""
+        return self.bare is bool
+
+    @property
+    def is_list(self) -> bool:
+        """Whether it has several values."""
+        return getattr(self.bare, "__origin__", None) is tuple
+
+    @property
+    def bare(self) -> Any:
+        """The type without what is said of it."""
+        return self.type.__origin__ if hasattr(self.type, "__metadata__") else self.type
+
+    @property
+    def metavar(self) -> str:
+        """What kind of value it takes, as help texts show it."""
+        if self.reader is not None:
+            return self.reader.metavar
+        inner = str(get_args(self.bare)[0] if get_args(self.bare) else self.bare)
+        words = {"int": "NUMBER", "float": "NUMBER", "Path": "PATH", "bool": "yes|no"}
+        return next((word for name, word in words.items() if name in inner), "TEXT")
+
+    @property
+    def shown_default(self) -> str:
+        """What holds while it is not set, for people; empty: nothing."""
+        if self.setting.unset:
+            return self.setting.unset
+        if isinstance(self.default, int | float) and not isinstance(self.default, bool):
+            return f"{self.default:.10g}" if self.reader is None or not self.default else str(self._plain())
+        return ", ".join(self.default) if self.is_list else str(self._plain()).lower()
+
+    def _plain(self) -> Any:
+        value = self.write(self.default)
+        return int(value) if isinstance(value, float) and value.is_integer() else value
+
+    def read(self, value: Any, *, text: bool = False) -> Any:
+        """Read a value of a document, or a text of the command line.
+
+        Raises:
+            SettingError: It does not fit.
+        """
+        try:
+            if self.reader is not None:
+                value = self._read_each(value) if self.is_list else self.reader.read(value)
+            return msgspec.convert(value, self.type, strict=not text, dec_hook=_decode)
+        except msgspec.ValidationError as error:
+            problem, _, place = str(error).partition(" - at ")
+            expected = problem.removeprefix("Expected ").split(", got", 1)[0].replace("`", "")
+            word, _, rest = expected.partition(" ")
+            problem = f"must be {_WORDS.get(word, word)} {rest}".rstrip()
+            found = f", found {value!r:.60}" if isinstance(value, int | float | str) else ""
+            raise SettingError(problem + found, place.strip("`").removeprefix("$")) from None
+        except SettingError:
+            raise
+        except ValueError as error:
+            raise SettingError(str(error)) from None
+
+    def _read_each(self, values: Any) -> Any:
+        assert self.reader is not None
+        if not isinstance(values, list | tuple):
+            return values
+        found = []
+        for index, value in enumerate(values):
+            try:
+                found.append(self.reader.read(value))
+            except ValueError as error:
+                raise SettingError(str(error), f"[{index}]") from None
+        return found
+
+    def write(self, value: Any) -> Any:
+        """Return the value as it stands in a document."""
+        if value is None:
+            return None
+        write = _plain if self.reader is None else self.reader.write
+        return [write(item) for item in value] if isinstance(value, tuple) else write(value)
+
+
+class SettingError(ValueError):
+    """A value does not fit its setting.
+
+    Attributes:
+        place: Where in the value, such as ``[0]``; empty for all of it.
+    """
+
+    def __init__(self, problem: str, place: str = "") -> None:
+        super().__init__(problem)
+        self.place = place
+
+
+@cache
+def fields_of(section: type[Section]) -> Mapping[str, Field]:
+    """Return the settings of a section, without sections in it, by name."""
+    return {field.name: field for field in _fields(section)}
+
+
+@cache
+def sections_of(section: type[Section]) -> Mapping[str, type[Section]]:
+    """Return the sections in a section, by name."""
+    return {field.name: field.type for field in struct_fields(section) if _is_section(field.type)}
+
+
+def read_section(section: type[Section], data: Any, place: str, faults: list[Fault]) -> dict[str, Any]:
+    """Read those values that a document holds.
+
+    Args:
+        section: What it should be.
+        data: The document, as plain values.
+        place: Where it stands, for faults.
+        faults: Gets every fault.
+
+    Returns:
+        The values that fit; those of sections as dictionaries.
+    """
+    if data is None:  # a section whose settings are all commented out
+        return {}
+    if not isinstance(data, dict):
+        faults.append(Fault(place, f"must be a mapping, found {data!r:.40}"))
+        return {}
+    fields, inner = fields_of(section), sections_of(section)
+    chosen: dict[str, Any] = {}
+    for key, value in data.items():
+        here = join(place, key)
+        if key in inner:
+            chosen[key] = read_section(inner[key], value, here, faults)
+        elif key in fields:
+            try:
+                chosen[key] = fields[key].read(value)
+            except SettingError as error:
+                faults.append(Fault(here + error.place, str(error)))
+        else:
+            close = difflib.get_close_matches(str(key), [*fields, *inner], 1, 0.5)
+            faults.append(Fault(here, "is no known key" + (f"; did you mean {close[0]!r}?" if close else "")))
+    return chosen
+
+
+def write_section(settings: Section, base: Section) -> dict[str, Any]:
+    """Return what differs from other settings of the same kind, as :func:`read_section` reads it."""
+    document: dict[str, Any] = {}
+    for name, field in fields_of(type(settings)).items():
+        value = getattr(settings, name)
+        if value != getattr(base, name):
+            document[name] = field.write(value)
+    for name in sections_of(type(settings)):
+        if inner := write_section(getattr(settings, name), getattr(base, name)):
+            document[name] = inner
+    return document
+
+
+def _fields(section: type[Section]) -> Iterator[Field]:
+    for field in struct_fields(section):
+        if _is_section(field.type):
+            continue
+        said = getattr(field.type, "__metadata__", ())
+        setting = next(each for each in said if isinstance(each, Setting))
+        reader = next((each for each in said if isinstance(each, Reader)), None)
+        made = field.default_factory is not NODEFAULT
+        yield Field(
+            field.name, field.type, field.default_factory() if made else field.default, setting, reader
+        )
+
+
+def _is_section(candidate: Any) -> bool:
+    return isinstance(candidate, type) and issubclass(candidate, Section)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Enum):
+        return value.value
+    return str(value) if isinstance(value, Path) else value
+
+
+def _decode(kind: type, value: Any) -> Any:
+    if kind is Path and isinstance(value, str) and value:
+        return Path(value).expanduser()
+    raise ValueError("must be the path of a file or folder")
+
+
+def _read_host(value: Any) -> Any:
+    try:
+        ipaddress.ip_address(value)
+    except ValueError:
+        bare = value.replace("-", "").replace(".", "").replace("_", "") if isinstance(value, str) else "?"
+        if value and not bare.isalnum():
+            raise ValueError(f"must be a host name or an IP address, found {value!r:.60}") from None
+    return value
+
+
+def _read_network(value: Any) -> Any:
+    try:
+        ipaddress.ip_network(value, strict=False)
+    except (ValueError, TypeError):
+        raise ValueError(
+            f"must be an IP address or a network such as 10.0.0.0/8, found {value!r:.60}"
+        ) from None
+    return value
+
+
+def _read_finite(value: Any) -> Any:
+    try:
+        number = float(value) if isinstance(value, int | float | str) else math.nan
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number) or isinstance(value, bool):
+        raise ValueError(f"must be a number, found {value!r:.60}")
+    return number
+
+
+def choice(kind: type[Enum]) -> Reader:
+    """Return the reader of one of several words."""
+
+    def read(value: Any) -> Any:
+        words = [str(item.value) for item in kind]
+        if value not in words:
+            raise ValueError(f"must be one of {', '.join(words)}, found {value!r:.60}")
+        return value
+
+    return Reader(read, _plain, "|".join(str(item.value) for item in kind))
+
+
+def _same(value: Any) -> Any:
+    return value
+
+
+Host = Annotated[str, Reader(_read_host, _same, "HOST")]
+"""A host name or an IP address; empty for none."""
+Networks = Annotated[tuple[str, ...], Reader(_read_network, _same, "ADDRESS")]
+"""IP addresses or networks."""
+Port = Annotated[int, Meta(ge=0, le=65535)]
+"""A TCP port; 0 takes a free one."""
+Finite = Annotated[float, Reader(_read_finite, _same, "NUMBER")]
+"""A number, neither endless nor NaN."""
+Seconds = Annotated[float, Meta(ge=0), Reader(_read_finite, _same, "SECONDS")]
+Cores = Annotated[float, Reader(read_cores, _same, "CORES")]
+"""A share of the processors: cores, or a text such as ``50%``."""
+Memory = Annotated[int, Reader(read_memory, write_memory, "MB|SIZE")]
+"""Bytes; written in MB, or as a text such as ``8G``."""

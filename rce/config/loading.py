@@ -1,0 +1,84 @@
+"""Puts the engine's settings together: defaults, the file, and over it what the command line says."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rce.config.documents import parse, read_file
+from rce.config.exceptions import ConfigError, Fault
+from rce.config.fields import read_section, sections_of, write_section
+from rce.config.settings import LOOPBACK, EngineSettings
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_LOOPBACK_ONLY: dict[str, Any] = {
+    "master_host": LOOPBACK,
+    "master": {"bind": LOOPBACK},
+    "robot": {"bind": LOOPBACK, "public_host": LOOPBACK},
+    "container": {"bind": LOOPBACK},
+}
+
+
+def load_settings(path: Path | None = None, *over: dict[str, Any]) -> EngineSettings:
+    """Read the engine's settings.
+
+    In development mode every program binds loopback only, whatever the file says; what the command line says
+    counts.
+
+    Args:
+        path: A YAML (or JSON) file; all defaults if None.
+        over: Values that were read already (:func:`read_document`), each layer over those before it.
+
+    Raises:
+        ConfigError: The file cannot be read, or something is wrong in it; every fault is listed.
+
+    Example::
+
+        settings = load_settings(Path("engine.yaml"), {"master": {"http_port": 0}})
+    """
+    found = {} if path is None else read_document(parse(read_file(path), str(path)), str(path))
+    if any(layer.get("dev") for layer in (found, *over)):
+        found = _merge(found, _LOOPBACK_ONLY)
+    for layer in over:
+        found = _merge(found, layer)
+    sections = {name: kind(**found.get(name, {})) for name, kind in sections_of(EngineSettings).items()}
+    return EngineSettings(**found | sections)
+
+
+def read_document(data: Any, source: str) -> dict[str, Any]:
+    """Check a document of settings.
+
+    Args:
+        data: Plain values, as JSON or YAML gives them.
+        source: Where they come from, for errors.
+
+    Returns:
+        The values that it sets, section by section.
+
+    Raises:
+        ConfigError: Something is wrong in it; every fault is listed.
+    """
+    if data is not None and not isinstance(data, dict):
+        raise ConfigError(
+            source, [Fault("", "must be a mapping with the keys master, robot, container, ...")]
+        )
+    faults: list[Fault] = []
+    found = read_section(EngineSettings, data, "", faults)
+    if faults:
+        raise ConfigError(source, list(dict.fromkeys(faults)))
+    return found
+
+
+def as_document(settings: EngineSettings) -> dict[str, Any]:
+    """Return the settings as plain values for another program: what differs from what it would take else."""
+    base = load_settings(None, {"dev": settings.dev})
+    return write_section(settings, base) | ({"dev": True} if settings.dev else {})
+
+
+def _merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in over.items():
+        inner = key in sections_of(EngineSettings)
+        merged[key] = merged.get(key, {}) | value if inner else value
+    return merged

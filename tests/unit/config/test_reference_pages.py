@@ -1,0 +1,29 @@
+"""The shipped settings file and the reference pages are what the code says."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[3]
+
+
+def test_reference_pages_are_current() -> None:
+    run = subprocess.run(
+        [sys.executable, "-m", "tools.reference", "--check"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stdout + run.stderr
+
+
+@pytest.mark.parametrize("page", ["settings.md", "options.md"])
+def test_pages_name_every_setting(page: str) -> None:
+    text = (ROOT / "docs/reference" / page).read_text()
+    assert "container.home_size" in text or "--home-size" in text
+    assert "| `--bind` |" in text

@@ -1,0 +1,208 @@
+"""Makes the reference pages of settings and options, and the shipped settings file, from the code.
+
+``python -m tools.reference`` writes them (``make reference``); with ``--check`` it names those that are not
+current, and ends with 1 if there are any.
+"""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+import tomllib
+from collections.abc import Iterator
+from enum import Enum
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import typer.main
+
+from rce.cli.main import GROUP, build_app
+from rce.config.fields import Field, Section, fields_of, sections_of
+from rce.config.settings import EngineSettings
+from rce_client.ros_bridge.__main__ import app as rce_ros
+from rce_container.__main__ import app as rce_container
+from rce_master.__main__ import app as rce_master
+from rce_robot.__main__ import app as rce_robot
+
+ROOT = Path(__file__).resolve().parent.parent
+WIDTH = 110
+
+YAML_HEAD = """\
+# Settings of the engine, for `rce up --config FILE` and for the single programs. Made by `make reference`.
+# Every setting is here with its default; leave out what you do not change.
+# Times are in seconds. Memory and disk are in MB, or texts such as 8G. A port of 0 takes a free one.
+"""
+
+SETTINGS_HEAD = """\
+# Settings
+
+For operators of a server. This page is made from the code (`make reference`).
+
+One YAML file sets everything: `rce up --config engine.yaml`, and the same file for `rce-master`, `rce-robot`
+and `rce-container` on machines of their own. Each program takes what it needs. `configs/engine.yaml` holds
+every setting with its default.
+
+What comes later in this list counts:
+
+1. the default,
+2. the file (`--config FILE`),
+3. development mode (`dev`, `--dev`): everything listens on loopback only,
+4. a JSON document of the same keys (`--settings JSON`; `rce up` starts its programs with one),
+5. single [options](options.md).
+
+Times are in seconds. Memory and disk are numbers of MB, or texts such as `8G`. A port of 0 takes a free one.
+A list's option is repeated. A file with unknown keys or values that do not fit is refused, and every fault is
+listed."""
+
+OPTIONS_HEAD = """\
+# Options
+
+For operators and users of the command line. This page is made from the code (`make reference`). The settings
+behind the options of the engine's programs are described in [settings](settings.md)."""
+
+
+def shipped_file() -> str:
+    """Return the settings file with every default."""
+    parts = [YAML_HEAD, "\n", *_yaml(EngineSettings, "")]
+    for name, section in sections_of(EngineSettings).items():
+        parts += [f"\n# {_title(section)}\n{name}:\n", *_yaml(section, "  ")]
+    return "".join(parts)
+
+
+def settings_page() -> str:
+    """Return the page of all settings."""
+    parts = [SETTINGS_HEAD, *_settings_table("", EngineSettings, "Shared by all programs")]
+    for name, section in sections_of(EngineSettings).items():
+        parts += _settings_table(name, section, f"`{name}`: {_title(section)}")
+    return "\n".join(parts).rstrip() + "\n"
+
+
+def options_page() -> str:
+    """Return the page of all programs, their commands and options."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    commands = project["entry-points"][GROUP]
+    rce = build_app([EntryPoint(name, commands[name], GROUP) for name in sorted(commands)])
+    programs = {
+        "rce": rce,
+        "rce-master": rce_master,
+        "rce-robot": rce_robot,
+        "rce-container": rce_container,
+        "rce-ros": rce_ros,
+    }
+    parts = [OPTIONS_HEAD]
+    for name, app in programs.items():
+        parts += _commands(name, typer.main.get_command(app))
+    return "\n".join(parts).rstrip() + "\n"
+
+
+PAGES = {
+    "configs/engine.yaml": shipped_file,
+    "docs/reference/settings.md": settings_page,
+    "docs/reference/options.md": options_page,
+}
+
+
+def _title(section: type[Section]) -> str:
+    return (section.__doc__ or "").partition("\n")[0]
+
+
+def _yaml(section: type[Section], indent: str) -> Iterator[str]:
+    for name, field in fields_of(section).items():
+        said = field.setting.help + (f" Default: {field.setting.unset}." if field.setting.unset else "")
+        start = f"{indent}# "
+        yield textwrap.fill(said, WIDTH, initial_indent=start, subsequent_indent=start) + "\n"
+        if field.setting.unset:
+            example = field.setting.example
+            yield f"{indent}# {name}:{f' {example}' if example else ''}\n"
+        else:
+            yield f"{indent}{name}: {_yaml_value(field)}\n"
+
+
+def _yaml_value(field: Field) -> str:
+    value = field.write(field.default)
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, list):
+        return f"[{', '.join(value)}]"
+    return field.shown_default or '""'
+
+
+def _settings_table(place: str, section: type[Section], title: str) -> Iterator[str]:
+    yield f"\n## {title}\n"
+    yield "| setting | value | default | option | of `rce up` | |"
+    yield "|---|---|---|---|---|---|"
+    for name, field in fields_of(section).items():
+        setting = field.setting
+        option = name.replace("_", "-") if setting.option is None else setting.option
+        default = setting.unset or (f"`{field.shown_default}`" if field.shown_default else "none")
+        metavar = field.metavar.replace("|", r"\|")
+        kind = f"list of {metavar}" if field.is_list else metavar
+        cells = (
+            f"`{place}{'.' if place else ''}{name}`",
+            kind,
+            default,
+            f"`--{option}`" if option else "",
+            f"`--{setting.up}`" if setting.up else "",
+            setting.help,
+        )
+        yield f"| {' | '.join(cells)} |"
+
+
+def _commands(name: str, command: Any) -> Iterator[str]:
+    """Describe a command and those in it."""
+    inner = getattr(command, "commands", {})
+    yield f"\n## `{name}`\n"
+    if command.help:
+        yield command.help.strip() + "\n"
+    options = [each for each in command.params if each.name != "help"]
+    if options:
+        yield "| option | value | |"
+        yield "|---|---|---|"
+        yield from map(_option, options)
+    for each in inner.values():
+        yield from _commands(f"{name} {each.name}", each)
+
+
+def _option(option: Any) -> str:
+    if option.param_type_name == "argument":
+        names = f"`{option.metavar or option.name.upper()}`"
+    else:
+        names = ", ".join(f"`{name}`" for name in (*option.opts, *option.secondary_opts))
+    kind = (
+        ""
+        if getattr(option, "is_flag", False)
+        else option.metavar or _kind(option.type_descriptor.annotation)
+    )
+    variable = f" Environment: `{option.envvar}`." if getattr(option, "envvar", None) else ""
+    default = getattr(option.default, "value", option.default)
+    shown = option.show_default and kind and default not in (None, "", ()) and not callable(default)
+    unset = f" (default: {default})" if shown else ""
+    text = " ".join((option.help or "").split()) + unset + variable
+    return "| " + " | ".join(cell.replace("|", r"\|") for cell in (names, kind, text)) + " |"
+
+
+def _kind(annotation: Any) -> str:
+    if isinstance(annotation, type) and issubclass(annotation, Enum):
+        return "|".join(str(each.value) for each in annotation)
+    names = {"int": "NUMBER", "float": "NUMBER", "Path": "PATH", "str": "TEXT"}
+    return names.get(getattr(annotation, "__name__", ""), "TEXT")
+
+
+def main(check: bool) -> int:
+    """Write the pages, or name those that are not current."""
+    stale = 0
+    for place, make in PAGES.items():
+        path, text = ROOT / place, make()
+        if path.exists() and path.read_text(encoding="utf-8") == text:
+            continue
+        stale += 1
+        if check:
+            print(f"{place} is not current: run `make reference`")  # noqa: T201 - its result
+        else:
+            path.write_text(text, encoding="utf-8")
+    return stale if check else 0
+
+
+if __name__ == "__main__":
+    sys.exit(1 if main("--check" in sys.argv[1:]) else 0)
