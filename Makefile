@@ -6,7 +6,7 @@ STAMP  := $(VENV)/.installed
 
 PARALLEL := -n auto --dist loadgroup --durations=25
 
-.PHONY: help install demo test test-all test-quick lint format bench lock clean
+.PHONY: help install demo test test-all test-quick lint format reference bench lock clean
 
 help:
 	@echo "make demo    engine, containers and a simulated fleet, with its web page"
@@ -14,6 +14,7 @@ help:
 	@echo "make test-all  make test without linters and types        make test-quick  the unit tests"
 	@echo "make lint    ruff and mypy        make format   rewrite the layout"
 	@echo "make bench   measure              make lock     pin the dependencies anew"
+	@echo "make reference  the pages of settings and options"
 	@echo "make install only the set-up      make clean    remove what make made"
 
 install: $(STAMP)
@@ -45,6 +46,9 @@ lint: install
 format: install
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+reference: install
+	$(BIN)/python -m tools.reference
 
 bench: install
 	$(BIN)/python -m benchmarks $(ARGS)
