@@ -17,22 +17,19 @@ URI_PARAMETER = "~masteruri"
 """The master's URI as other machines are told."""
 
 
-LAST_HEARTBEAT = "ts_last_heartbeat"
-"""Seconds since 1970; a field of ``LinkState`` in newer releases."""
+LAST_HEARTBEAT = "last_heartbeat"
+"""A time; a field of ``LinkState`` since release 1.1.0 of fkie's messages."""
 
 
 class Announcements:
-    """The topics and services of a discovery node.
-
-    Where fkie's messages are installed, theirs are used: newer ones tell of each link's last heartbeat.
-    """
+    """The topics and services of a discovery node."""
 
     def __init__(self, changes: Publisher, link_stats: Publisher) -> None:
         self._changes = changes
         self._link_stats = link_stats
         (links,) = (field.message for field in link_stats.type.fields if field.name == "links")
         self._tells_heartbeats = links is not None and any(
-            field.name == LAST_HEARTBEAT for field in links.fields
+            (field.name, field.type) == (LAST_HEARTBEAT, "time") for field in links.fields
         )
 
     @classmethod
@@ -86,12 +83,16 @@ class Announcements:
         """Publish the quality of all links, seen from the master ``name`` at ``now`` (seconds since 1970)."""
         if self._link_stats.connections == 0:
             return
-        secs, fraction = divmod(now, 1)
         self._link_stats.publish(
-            header={"stamp": Time(int(secs), int(fraction * 1e9)), "frame_id": name},
+            header={"stamp": _time(now), "frame_id": name},
             links=[self._link_state(link, now) for link in links],
         )
 
     def _link_state(self, link: Link, now: float) -> dict[str, Any]:
         state: dict[str, Any] = {"destination": link.name, "quality": link.quality}
-        return state | ({LAST_HEARTBEAT: now - link.silence} if self._tells_heartbeats else {})
+        return state | ({LAST_HEARTBEAT: _time(now - link.silence)} if self._tells_heartbeats else {})
+
+
+def _time(seconds: float) -> Time:
+    secs, fraction = divmod(max(0.0, seconds), 1)
+    return Time(int(secs), int(fraction * 1e9))

@@ -1,7 +1,11 @@
-"""The messages of discovery and synchronization (``fkie_multimaster_msgs``), to and from our values."""
+"""The messages of discovery and synchronization (``fkie_multimaster_msgs``), to and from our values.
+
+The definitions in ``share`` are those of fkie's releases 1.1.0 to 1.3.2.
+"""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -12,9 +16,13 @@ from rce.ros.multimaster.neighbourhood import Neighbour, PeerChange, PeerEvent
 from rce.ros.multimaster.plan import Registration, RegistrationKind
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
+from rce.ros.types.exceptions import TypesError
 from rce.ros.types.values import Time
 
+_log = logging.getLogger(__name__)
+
 PACKAGE = "fkie_multimaster_msgs"
+ROS_MASTER = f"{PACKAGE}/ROSMaster"
 MASTER_STATE = f"{PACKAGE}/MasterState"
 LINK_STATES = f"{PACKAGE}/LinkStatesStamped"
 DISCOVER_MASTERS = f"{PACKAGE}/DiscoverMasters"
@@ -23,18 +31,38 @@ EMPTY = "std_srvs/Empty"
 
 
 def registry() -> TypeRegistry:
-    """Make a registry that knows these types besides those of the environment."""
+    """Make a registry that knows these types besides those of the environment.
+
+    An installed ``fkie_multimaster_msgs`` is used if its ``ROSMaster`` is that of release 1.1.0 or later.
+    """
     path = PackageIndex.from_environ().path
-    return TypeRegistry(PackageIndex([*path, Path(__file__).with_name("share")]))
+    share = Path(__file__).with_name("share")
+    types, ours = TypeRegistry(PackageIndex([*path, share])), TypeRegistry(PackageIndex([share]))
+    expected = ours.message(ROS_MASTER).md5sum
+    try:
+        found = types.message(ROS_MASTER).md5sum
+    except TypesError as error:
+        found = str(error)
+    if found == expected:
+        return types
+    _log.warning(
+        "the installed %s is not that of release 1.1.0 or later and is not used: expected %s with md5 sum %s,"
+        " found %s",
+        PACKAGE,
+        ROS_MASTER,
+        expected,
+        found,
+    )
+    return TypeRegistry(PackageIndex([share, *path]))
 
 
 def master_state(event: PeerEvent) -> dict[str, Any]:
-    """Write a ``MasterState``. Its constants hold the quotes of the definition, as fkie's do."""
-    return {"state": f"'{event.change.value}'", "master": ros_master(event.master)}
+    """Write a ``MasterState``."""
+    return {"state": event.change.value, "master": ros_master(event.master)}
 
 
 def read_master_state(message: Any) -> PeerEvent:
-    """Read a ``MasterState``.
+    """Read a ``MasterState``, its state with the quotes that older definitions have or without.
 
     Raises:
         ValueError: Its state is none of the three.

@@ -27,8 +27,11 @@ from rce.ros.multimaster.remote import DirectRemote, Remote
 from rce.ros.multimaster.settings import local_master
 from rce.ros.node import Node
 from rce.ros.node.master import MasterClient
+from rce.ros.node.runtime import TypeName
 from rce.ros.tasks import TaskScope
-from rce.ros.types.exceptions import TypesError
+from rce.ros.tcpros.header import ANY
+from rce.ros.types import MessageType
+from rce.ros.types.exceptions import SerializationError, TypesError
 from rce.ros.xmlrpc import RpcClient
 
 _log = logging.getLogger(__name__)
@@ -92,6 +95,7 @@ class MasterSync:
         self._master: MasterClient
         self._tasks: TaskScope
         self._rpc: RpcClient
+        self._state_type: MessageType
         self.registrar: Registrar
 
     @property
@@ -104,12 +108,14 @@ class MasterSync:
     async def __aenter__(self) -> Self:
         async with AsyncExitStack() as stack:
             self._rpc = await stack.enter_async_context(RpcClient())
+            types = messages.registry()
+            self._state_type = types.message(messages.MASTER_STATE)
             self._node = await stack.enter_async_context(
                 Node(
                     self.settings.node_name,
                     argv=[],
                     master_uri=self._master_uri,
-                    types=messages.registry(),
+                    types=types,
                     master_timeout=None,
                 )
             )
@@ -172,10 +178,13 @@ class MasterSync:
         return uri
 
     async def _listen_for_changes(self) -> None:
+        """Hear every discovery: constants differ between releases, and the checksum with them."""
         types = await self._master.call("getTopicTypes")
         found = {topic for topic, kind in types if kind == messages.MASTER_STATE} - self._changes_topics
         for topic in found:
-            await self._node.subscribe(topic, messages.MASTER_STATE, self._take_change)
+            await self._node.subscribe_serialized(
+                topic, TypeName(messages.MASTER_STATE, ANY), self._take_serialized_change
+            )
             self._changes_topics.add(topic)
 
     def _take_list(self, masters: list[Neighbour]) -> None:
@@ -184,10 +193,11 @@ class MasterSync:
         for gone in self._remotes.keys() - {master.uri for master in masters}:
             self._remotes[gone].leave()
 
-    def _take_change(self, message: Any) -> None:
+    def _take_serialized_change(self, payload: bytes, latched: bool) -> None:
+        del latched
         try:
-            event = messages.read_master_state(message)
-        except ValueError as error:
+            event = messages.read_master_state(self._state_type.deserialize(payload))
+        except (SerializationError, ValueError) as error:
             _log.warning("a change that is not understood: %s", error)
             return
         if event.change is not PeerChange.REMOVED:
