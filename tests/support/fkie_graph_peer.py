@@ -3,7 +3,7 @@
 Run by the Python of a real ROS: ``fkie_graph_peer.py listen`` prints what a discovery says in the graph, as
 fkie's master_sync hears it: ``change STATE NAME`` and ``link NAME SECONDS_SINCE_ITS_HEARTBEAT``.
 ``fkie_graph_peer.py discover STATE NAME URI MONITOR_URI`` speaks as fkie's master_discovery: its list is
-empty, and each subscriber of ``changes`` is told of one master.
+empty and asked for only once, and each subscriber of ``changes`` is told of one master.
 
 The definitions are those of releases 1.1.0 to 1.3.2; ``quoted`` as a last argument takes the constants of
 releases before.
@@ -91,12 +91,9 @@ def discover(changes, state, name, uri, monitor_uri):
             now = genpy.Time.from_sec(rospy.get_time())
             peer_publish(changes(state, known(name, uri, now, now, True, NODE, monitor_uri)))
 
+    lists = [DiscoverMasters._response_class()]
     rospy.init_node(NODE[1:])
-    rospy.Service(
-        NODE + "/list_masters",
-        DiscoverMasters,
-        lambda _: DiscoverMasters._response_class(),
-    )
+    rospy.Service(NODE + "/list_masters", DiscoverMasters, lambda _: lists.pop() if lists else None)
     rospy.Publisher(NODE + "/changes", changes, subscriber_listener=Greeter(), queue_size=10)
     print("ready", flush=True)
     rospy.spin()

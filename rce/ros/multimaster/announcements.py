@@ -54,6 +54,7 @@ class Announcements:
         Raises:
             MasterError: The master cannot be told.
         """
+        await cls.set_parameters(node, name, uri)  # before a synchronization finds the rest
         changes = await node.advertise("~changes", messages.MASTER_STATE)
         link_stats = await node.advertise("~linkstats", messages.LINK_STATES)
 
@@ -65,9 +66,7 @@ class Announcements:
 
         await node.advertise_service("~list_masters", messages.DISCOVER_MASTERS, list_masters)
         await node.advertise_service("~refresh", messages.EMPTY, refresh_all)
-        announcements = cls(changes, link_stats)
-        await announcements.set_parameters(node, name, uri)
-        return announcements
+        return cls(changes, link_stats)
 
     @staticmethod
     async def set_parameters(node: Node, name: str, uri: str) -> None:

@@ -16,7 +16,7 @@ from rce.ros.multimaster.addresses import master_name
 from rce.ros.multimaster.errors import NoDiscovery
 from rce.ros.multimaster.filters import SyncLists
 from rce.ros.multimaster.listing import masters_known_at
-from rce.ros.multimaster.neighbourhood import Neighbour, PeerChange
+from rce.ros.multimaster.neighbourhood import Neighbour, PeerChange, PeerEvent
 from rce.ros.multimaster.registrar import Registrar
 from rce.ros.multimaster.relay.exporter import Exporter
 from rce.ros.multimaster.relay.frames import Frame
@@ -87,6 +87,8 @@ class MasterSync:
         self._own_uri = ""
         self._is_leaving = False
         self._changes_topics: set[str] = set()
+        self._waiting: dict[str, PeerEvent] | None = None
+        """The last change of each master since the list was asked for; None while it is not."""
         self._stack = AsyncExitStack()
         self._links = RelayLinks(LinkIdentity(""), self._make_ends)
         self.relay_port = 0
@@ -159,9 +161,10 @@ class MasterSync:
         """Keep the remotes as the discovery's list has them; its changes come in between."""
         has_discovery = True
         while True:
+            self._waiting = {}
             try:
-                masters = await masters_known_at(self._node, self._master)
                 await self._listen_for_changes()
+                masters = await masters_known_at(self._node, self._master)
                 self._own_uri = await self._ask_own_uri()
             except (NoDiscovery, ServiceError, MasterError, TypesError) as error:
                 if has_discovery:
@@ -170,6 +173,7 @@ class MasterSync:
             else:
                 has_discovery = True
                 self._take_list(masters)
+            self._take_waiting()
             await asyncio.sleep(REFRESH if has_discovery else LOOK_FOR_DISCOVERY)
 
     async def _ask_own_uri(self) -> str:
@@ -200,6 +204,18 @@ class MasterSync:
         except (SerializationError, ValueError) as error:
             _log.warning("a change that is not understood: %s", error)
             return
+        if self._waiting is None:
+            self._take_change(event)
+        else:
+            self._waiting[event.master.uri] = event
+
+    def _take_waiting(self) -> None:
+        """Take the changes that came while the list was asked for: they may be newer than it."""
+        waiting, self._waiting = self._waiting or {}, None
+        for event in waiting.values():
+            self._take_change(event)
+
+    def _take_change(self, event: PeerEvent) -> None:
         if event.change is not PeerChange.REMOVED:
             self._take(event.master)
         elif event.master.uri in self._remotes:

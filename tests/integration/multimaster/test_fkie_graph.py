@@ -80,7 +80,7 @@ async def test_fkie_hears_our_discovery(neighbourhood: Neighbourhood, tmp_path: 
 async def test_our_sync_hears_fkie_without_its_messages(
     neighbourhood: Neighbourhood, tmp_path: Path, state: str, quoted: tuple[str, ...]
 ) -> None:
-    """Its list is empty: what ``rce sync`` registers, it knows from ``changes`` alone."""
+    """Its list is empty and told once: what ``rce sync`` registers, it knows from ``changes`` alone."""
     async with Core(port=0) as here, Core(port=0) as there, node("n", there.uri) as talker:
         await talker.advertise("said", STRING)
         async with Discovery(
