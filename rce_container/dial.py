@@ -6,6 +6,7 @@ import asyncio
 import socket
 
 from rce.control.model import LinkAddress
+from rce.dialing import open_socket
 
 
 async def dial(address: LinkAddress, machine: str) -> socket.socket:
@@ -16,24 +17,20 @@ async def dial(address: LinkAddress, machine: str) -> socket.socket:
     """
     if address.unix and address.machine == machine:
         try:
-            return await _connect(socket.AF_UNIX, address.unix)
+            return await _connect_unix(address.unix)
         except OSError:
             if not address.port:
                 raise
     if not address.port:
         raise ConnectionError("the peer has no address that can be reached from here")
-    infos = await asyncio.get_running_loop().getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)
-    family, _, _, _, target = infos[0]
-    return await _connect(family, target)
+    return await open_socket(address.host, address.port)
 
 
-async def _connect(family: int, target: object) -> socket.socket:
-    sock = socket.socket(family, socket.SOCK_STREAM)
+async def _connect_unix(path: str) -> socket.socket:
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         sock.setblocking(False)
-        if family != socket.AF_UNIX:
-            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        await asyncio.get_running_loop().sock_connect(sock, target)  # type: ignore[arg-type]
+        await asyncio.get_running_loop().sock_connect(sock, path)
     except BaseException:
         sock.close()
         raise

@@ -19,6 +19,7 @@ from websockets.http11 import Response
 
 from rce.control.exceptions import ContentError
 from rce.control.timeouts import DEFAULT_TIMEOUTS, ControlTimeouts
+from rce.dialing import open_socket
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -126,7 +127,7 @@ class ContentClient:
         return Piece(body, int(found[1]))
 
     async def _get(self, path: str, offset: int) -> tuple[int, dict[str, str], bytes]:
-        reader, writer = await asyncio.open_connection(self._host, self._port)
+        reader, writer = await asyncio.open_connection(sock=await open_socket(self._host, self._port))
         try:
             connection = h11.Connection(h11.CLIENT)
             request = h11.Request(

@@ -10,6 +10,7 @@ import socket
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rce.dialing import open_socket
 from rce.guard.lobby import Lobby, address_of
 from rce.link.carrier import Carrier, LocalCarrier
 from rce.link.exceptions import LinkError, LinkLost, LinkRefused
@@ -231,7 +232,8 @@ class LinkHub:
     async def _dial_tcp(self, spec: LinkSpec) -> Carrier:
         address = spec.address
         async with asyncio.timeout(self.timeouts.connect):
-            _, carrier = await self.loop.create_connection(self._new_carrier, address.host, address.port)
+            sock = await open_socket(address.host, address.port)
+            _, carrier = await self.loop.create_connection(self._new_carrier, sock=sock)
         return await self._introduce(carrier, spec)
 
     async def _carry(self, sock: socket.socket) -> SocketCarrier:

@@ -13,6 +13,7 @@ from rce.ros import names
 from rce.ros.core.events import Outcome
 from rce.ros.core.graph import ANY_TYPE, Graph
 from rce.ros.core.registrations import Kind
+from rce.ros.xmlrpc.arguments import graph_name
 from rce.ros.xmlrpc.dispatch import ERROR, FAILURE, SUCCESS, BadArgument, Method
 
 Answer = tuple[int, str, Any]
@@ -99,34 +100,34 @@ class MasterApi:
     # ------------------------------------------------------------------ registrations
 
     def _register_publisher(self, caller: str, topic: Any, topic_type: Any, uri: Any) -> Answer:
-        topic = _name("topic", topic, caller)
+        topic = graph_name("topic", topic, caller)
         kind, uri = _type(topic_type), _uri("caller_api", uri)
         self._perform(self._graph.register_publisher(topic, kind, caller, uri))
         subscribers = list(self._graph.subscribers(topic).values())
         return SUCCESS, f"Registered [{caller}] as publisher of [{topic}]", subscribers
 
     def _register_subscriber(self, caller: str, topic: Any, topic_type: Any, uri: Any) -> Answer:
-        topic = _name("topic", topic, caller)
+        topic = graph_name("topic", topic, caller)
         kind, uri = _type(topic_type), _uri("caller_api", uri)
         self._perform(self._graph.register_subscriber(topic, kind, caller, uri))
         return SUCCESS, f"Subscribed to [{topic}]", list(self._graph.publishers(topic).values())
 
     def _register_service(self, caller: str, service: Any, service_uri: Any, uri: Any) -> Answer:
-        service = _name("service", service, caller)
+        service = graph_name("service", service, caller)
         service_uri = _uri("service_api", service_uri)
         self._perform(self._graph.register_service(service, service_uri, caller, _uri("caller_api", uri)))
         return SUCCESS, f"Registered [{caller}] as provider of [{service}]", 1
 
     def _unregister_publisher(self, caller: str, topic: Any, uri: Any) -> Answer:
-        topic = _name("topic", topic, caller)
+        topic = graph_name("topic", topic, caller)
         return self._unregister(Kind.PUBLISHER, topic, caller, _uri("caller_api", uri))
 
     def _unregister_subscriber(self, caller: str, topic: Any, uri: Any) -> Answer:
-        topic = _name("topic", topic, caller)
+        topic = graph_name("topic", topic, caller)
         return self._unregister(Kind.SUBSCRIBER, topic, caller, _uri("caller_api", uri))
 
     def _unregister_service(self, caller: str, service: Any, service_uri: Any) -> Answer:
-        service = _name("service", service, caller)
+        service = graph_name("service", service, caller)
         return self._unregister(Kind.SERVICE, service, caller, _uri("service_api", service_uri))
 
     def _unregister(self, kind: Kind, name: str, caller: str, uri: str) -> Answer:
@@ -143,12 +144,12 @@ class MasterApi:
     # ------------------------------------------------------------------ questions
 
     def _lookup_node(self, caller: str, node: Any) -> Answer:
-        node = _name("node", node, caller)
+        node = graph_name("node", node, caller)
         uri = self._graph.nodes.get(node)
         return (SUCCESS, "node api", uri) if uri else (ERROR, f"unknown node [{node}]", "")
 
     def _lookup_service(self, caller: str, service: Any) -> Answer:
-        uri = self._graph.service(_name("service", service, caller))
+        uri = self._graph.service(graph_name("service", service, caller))
         return (SUCCESS, f"rosrpc URI: [{uri}]", uri) if uri else (ERROR, "no provider", "")
 
     def _get_published_topics(self, caller: str, namespace: Any) -> Answer:
@@ -216,21 +217,6 @@ class MasterApi:
 
     def _get_param_names(self, _caller: str) -> Answer:
         return SUCCESS, "Parameter names", self._graph.parameters.all_names()
-
-
-def _name(role: str, value: Any, caller: str) -> str:
-    """Check a topic, service or node name and make it global.
-
-    Only what cannot be a name is refused: real nodes use names that the written rules do not allow.
-    """
-    if not isinstance(value, str) or not value:
-        raise BadArgument(f"parameter [{role}] must be a non-empty string")
-    if ":" in value or any(character.isspace() for character in value):
-        raise BadArgument(f"parameter [{role}] contains illegal characters: {value!r}")
-    resolved = names.resolve(value, caller)
-    if resolved == names.SEPARATOR:
-        raise BadArgument(f"parameter [{role}] cannot be the global namespace")
-    return resolved
 
 
 def _key(value: Any, caller: str) -> str:

@@ -28,6 +28,7 @@ from rce.ros.multimaster.neighbourhood import (
     PeerKey,
     Step,
 )
+from rce.ros.multimaster.robot_hosts import RobotHosts
 from rce.ros.multimaster.rpc import DiscoveryApi, PlainDispatcher
 from rce.ros.multimaster.settings import DiscoverySettings, local_master
 from rce.ros.multimaster.source import open_source
@@ -67,6 +68,7 @@ class Discovery:
         self._neighbours = Neighbourhood(settings.patience)
         self._watches: set[EventQueue[PeerEvent]] = set()
         self._beat_now = asyncio.Event()
+        self._robots = RobotHosts(settings.robot_addresses, self._beat_now.set)
         self._is_master_up = True
         self._is_listening = False
         """Heartbeats that come before or after are left alone: they are repeated."""
@@ -149,6 +151,7 @@ class Discovery:
             stack.callback(self._say_goodbye)
             self._tasks = await stack.enter_async_context(TaskScope())
             self._tasks.start(self._watch_master(source.wait), name="watch the master")
+            self._tasks.start(self._robots.follow(), name="look up robot hosts")
             self._tasks.start(self._send_heartbeats(), name="send heartbeats")
             self._tasks.start(self._pass_time(), name="look for silent masters")
             self._is_listening = True
@@ -295,7 +298,7 @@ class Discovery:
 
     def _unicast_addresses(self) -> list[tuple[str, int]]:
         """Whom heartbeats are sent to one by one: everybody that is known, if not to the group."""
-        known = self.settings.robot_addresses
+        known = self._robots.addresses
         if not self.settings.send_mcast:
             named = {host for host, _ in known} | {self._own.host}
             known = known + [(host, self.settings.mcast_port) for host in self._neighbours.hosts - named]

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
+from rce.ros.dialing import open_peer_socket
 from rce.ros.errors import (
     HandshakeRefused,
     NodeClosed,
@@ -197,7 +198,9 @@ class _Call:
                 raise ServiceLost(
                     service, f"the provider's URI {uri!r} is not of the form rosrpc://host:port"
                 )
-            _, call.connection = await loop.create_connection(lambda: Connection(call, scratch), host, port)
+            _, call.connection = await loop.create_connection(
+                lambda: Connection(call, scratch), sock=await open_peer_socket(host, port)
+            )
         except (OSError, ValueError) as error:
             raise ServiceLost(service, f"the provider at {uri} cannot be reached: {error}") from error
         return call

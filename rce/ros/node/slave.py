@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rce.ros.node.topics import Topics
+from rce.ros.xmlrpc.arguments import graph_name, node_uris
 from rce.ros.xmlrpc.dispatch import ERROR, FAILURE, SUCCESS, BadArgument, Method
 
 Answer = tuple[int, str, Any]
@@ -65,22 +66,23 @@ class SlaveApi:
             "shutdown": self._shutdown,
         }
 
-    def _request_topic(self, _caller: str, topic: Any, protocols: Any) -> Answer:
-        if not isinstance(topic, str) or not isinstance(protocols, list):
-            raise BadArgument("a topic's name and a list of protocols are needed")
-        if topic not in self.topics.outputs:
-            return ERROR, f"Not a publisher of [{topic}]", []
-        if any(isinstance(protocol, list) and protocol[:1] == ["TCPROS"] for protocol in protocols):
+    def _request_topic(self, caller: str, topic: Any, protocols: Any) -> Answer:
+        name = graph_name("topic", topic, caller)
+        is_list = isinstance(protocols, list) and all(isinstance(protocol, list) for protocol in protocols)
+        if not protocols or not (is_list or isinstance(protocols, str)):
+            raise BadArgument('parameter [protocols] must be a list of lists such as ["TCPROS"]')
+        if name not in self.topics.outputs:
+            return ERROR, f"Not a publisher of [{name}]", []
+        if any(protocol[:1] == ["TCPROS"] for protocol in protocols):
             host, port = self.tcpros_address()
             return SUCCESS, f"ready on {host}:{port}", ["TCPROS", host, port]
         return FAILURE, "TCPROS is the only protocol here", []
 
-    def _publisher_update(self, _caller: str, topic: Any, publishers: Any) -> Answer:
-        if not isinstance(publishers, list) or not all(isinstance(uri, str) for uri in publishers):
-            raise BadArgument("the publishers must be a list of URIs")
-        source = self.topics.inputs.get(topic) if isinstance(topic, str) else None
+    def _publisher_update(self, caller: str, topic: Any, publishers: Any) -> Answer:
+        source = self.topics.inputs.get(graph_name("topic", topic, caller))
+        uris = node_uris("publishers", publishers)
         if source is not None:
-            source.set_publishers(publishers)
+            source.set_publishers(uris)
         return SUCCESS, "", 0
 
     def _param_update(self, _caller: str, key: Any, value: Any) -> Answer:

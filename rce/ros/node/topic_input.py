@@ -8,6 +8,7 @@ import random
 from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
+from rce.ros.dialing import open_peer_socket
 from rce.ros.errors import HandshakeRefused, RosError, TcprosError, TypeMismatch
 from rce.ros.node.local import LocalLink, Parcel, find_neighbour
 from rce.ros.node.runtime import Runtime
@@ -160,7 +161,7 @@ class TopicInput:
         host, port = await self._ask_for_address(link.uri)
         async with asyncio.timeout(CONNECT_TIMEOUT):
             _, connection = await loop.create_connection(
-                lambda: Connection(link, self._runtime.scratch), host, port
+                lambda: Connection(link, self._runtime.scratch), sock=await open_peer_socket(host, port)
             )
         self.links.append(link)
         try:

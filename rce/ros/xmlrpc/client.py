@@ -14,6 +14,7 @@ from urllib.parse import urlsplit
 
 import h11
 
+from rce.ros.dialing import open_peer_socket
 from rce.ros.errors import RpcUnreachable
 from rce.ros.xmlrpc.codec import decode_response, encode_call
 
@@ -102,7 +103,7 @@ class RpcClient:
             RpcUnreachable: It is away already.
         """
         try:
-            reader, writer = await asyncio.open_connection(*_address(uri))
+            reader, writer = await asyncio.open_connection(sock=await open_peer_socket(*_address(uri)))
         except (OSError, ValueError) as error:
             raise RpcUnreachable(uri, str(error)) from error
         _keep_alive(writer.get_extra_info("socket"))
@@ -161,7 +162,7 @@ class _Connection:
 
     @classmethod
     async def open(cls, host: str, port: int) -> _Connection:
-        reader, writer = await asyncio.open_connection(host, port)
+        reader, writer = await asyncio.open_connection(sock=await open_peer_socket(host, port))
         return cls((host, port), reader, writer)
 
     @property

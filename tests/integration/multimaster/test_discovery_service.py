@@ -119,6 +119,32 @@ async def test_robot_hosts_find_each_other_without_multicast(neighbourhood: Neig
                     await asyncio.sleep(0.02)
 
 
+async def test_a_robot_host_may_be_a_name(neighbourhood: Neighbourhood, tmp_path: Path) -> None:
+    """uvloop's sockets send to addresses only; a name that cannot be resolved is told of and does no harm."""
+    (port,) = free_ports(1)
+    async with Core(port=0) as a, Core(port=0) as b:
+        settings = neighbourhood.settings(
+            b.uri, name="b", mcast_port=port, send_mcast=False, listen_mcast=False
+        )
+        running = program(
+            "discovery",
+            *("--master-uri", a.uri, "--name", "a", "--heartbeat-hz", "10", "--no-listen-mcast"),
+            *("--no-send-mcast", "--mcast-group", "226.0.0.0@127.0.0.1"),
+            *("--mcast-port", str(neighbourhood.port), "--robot-host", f"localhost:{port}"),
+            *("--robot-host", "no-such-robot.invalid"),
+            folder=tmp_path,
+        )
+        async with Discovery(settings) as other:
+            await running.start(ready="no-such-robot.invalid")
+            try:
+                async with asyncio.timeout(30):
+                    while "a" not in {master.name for master in other.masters}:
+                        await asyncio.sleep(0.02)
+            finally:
+                assert await running.stop() == 0
+        assert "Traceback" not in running.output()
+
+
 async def test_the_relay_program(tmp_path: Path) -> None:
     async with Core(port=0) as core, node("n", core.uri) as talker:
         (await talker.advertise("from", STRING, latch=True)).publish(data="kept")

@@ -84,7 +84,7 @@ def comparable(method: str, answer: Any) -> Any:
     """Leave out what may differ: texts, values of failures, ids of processes, the cores' own parameters."""
     status, _, value = answer
     if status != 1:
-        return "refused"
+        return "refused", status
     if method in ("getPid", "getName", "getUri", "getMasterUri"):
         return status, type(value)
     if method == "getParamNames":
@@ -131,6 +131,36 @@ SLAVE_CALLS: list[tuple[str, tuple[Any, ...]]] = [
     ("requestTopic", ("/x", "/peer_out", "TCPROS")),
     ("publisherUpdate", ("/master", "/nothing", [])),
     ("publisherUpdate", ("/master", "/peer_in", "no list")),
+    *(
+        ("publisherUpdate", ("/master", "/peer_in", [entry]))
+        for entry in (
+            "",
+            "nothing",
+            "host:1234",
+            "/path",
+            "http://",
+            "http:/host",
+            "//host:1",
+            "://host",
+            7,
+            [],
+        )
+    ),
+    ("publisherUpdate", ("/master", "/peer_in", ["http://127.0.0.1:1/", "nothing"])),
+    ("publisherUpdate", ("/master", "/peer_in", ["any://127.0.0.1:1"])),
+    ("publisherUpdate", ("/master", "/peer_in", {})),
+    ("publisherUpdate", ("/master", "", [])),
+    ("publisherUpdate", ("/master", 7, [])),
+    ("publisherUpdate", ("/master", "a b", [])),
+    ("publisherUpdate", ("/master", "/peer_in")),
+    ("publisherUpdate", (7, "/peer_in", [])),
+    ("requestTopic", ("/x", "/peer_out", [])),
+    ("requestTopic", ("/x", "/peer_out", {})),
+    ("requestTopic", ("/x", "", [["TCPROS"]])),
+    ("requestTopic", ("/x", 7, [["TCPROS"]])),
+    ("requestTopic", ("/x", "/peer_out", [[]])),
+    ("requestTopic", ("/x", "/peer_out", [7])),
+    ("requestTopic", ("/x", "/peer_out", 7)),
     ("paramUpdate", ("/master", "/p", 1)),
     ("paramUpdate", ("/master", "", 1)),
     ("getBusStats", ()),

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, cast
 from urllib.parse import urlsplit
 
+from rce.ros.dialing import open_peer_socket
 from rce.ros.errors import TcprosError, XmlRpcError
 from rce.ros.multimaster.errors import NothingToRelay
 from rce.ros.tcpros.header import ANY, MAX_HEADER, decode_header, encode_header, raise_error_field
@@ -128,7 +129,7 @@ async def _topic_address(rpc: RpcClient, caller: str, topic: str, uri: str) -> t
 
 async def _greet(host: str, port: int, header: Mapping[str, str]) -> dict[str, str]:
     """Exchange connection headers and hang up."""
-    reader, writer = await asyncio.open_connection(host, port)
+    reader, writer = await asyncio.open_connection(sock=await open_peer_socket(host, port))
     try:
         writer.write(encode_header(header))
         length = int.from_bytes(await reader.readexactly(_LENGTH), "little")

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import cast
 
+from rce.dialing import open_socket
 from rce.ros.multimaster.errors import LinkBroken
 from rce.ros.multimaster.relay.exporter import Exporter
 from rce.ros.multimaster.relay.frames import PROTOCOL, Data, Decoder, Frame, Hello, Ping, encode
@@ -69,7 +70,7 @@ class RelayLinks:
             begin = loop.time()
             try:
                 async with asyncio.timeout(CONNECT_TIMEOUT):
-                    _, link = await loop.create_connection(_Link, host, port)
+                    _, link = await loop.create_connection(_Link, sock=await open_socket(host, port))
                 await self._serve(link)
             except (OSError, LinkBroken) as error:
                 _log.warning("relay to %s:%d: %s", host, port, str(error) or type(error).__name__)

@@ -1,0 +1,90 @@
+"""Connecting to a host by its name.
+
+An event loop's own ``create_connection`` is not used with names. uvloop's looks a name up in a future of its
+own; when the call is cancelled meanwhile (a timeout is enough), the lookup's failure is reported on stderr as
+an exception that was never retrieved.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from typing import Any
+
+Address = tuple[socket.AddressFamily, Any]
+"""Family and socket address."""
+
+
+async def resolve(host: str, port: int) -> list[Address]:
+    """Return the addresses of a host, the preferred first.
+
+    Args:
+        host: A name or an address.
+        port: A TCP port.
+
+    Raises:
+        OSError: The name cannot be resolved (``socket.gaierror``).
+    """
+    found = _numeric(host, port)
+    if found is not None:
+        return [found]
+    infos = await asyncio.get_running_loop().getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    return [(socket.AddressFamily(family), address) for family, _, _, _, address in infos]
+
+
+async def open_socket(host: str, port: int) -> socket.socket:
+    """Connect by TCP to the first address of a host that answers.
+
+    Give the result to ``create_connection(..., sock=...)`` or ``open_connection(sock=...)``.
+
+    Args:
+        host: A name or an address.
+        port: A TCP port.
+
+    Returns:
+        A connected socket that does not block and sends without delay.
+
+    Raises:
+        OSError: The name cannot be resolved (``socket.gaierror``), or nobody answers.
+    """
+    return await connect_first(await resolve(host, port))
+
+
+async def connect_first(addresses: list[Address]) -> socket.socket:
+    """Connect to the first of some addresses that answers, as :func:`open_socket` does.
+
+    Raises:
+        OSError: Nobody answers, with the reason of each address.
+    """
+    errors: list[OSError] = []
+    for family, address in addresses:
+        try:
+            return await _connect(family, address)
+        except OSError as error:
+            errors.append(error)
+    if len(errors) == 1:
+        raise errors[0]
+    raise OSError("; ".join(map(str, errors)) or "no address")
+
+
+async def _connect(family: socket.AddressFamily, address: Any) -> socket.socket:
+    sock = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        sock.setblocking(False)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        await asyncio.get_running_loop().sock_connect(sock, address)
+    except BaseException:
+        sock.close()
+        raise
+    return sock
+
+
+def _numeric(host: str, port: int) -> Address | None:
+    """Return the address that ``host`` is already; None if it is a name. Saves a thread."""
+    for family in (socket.AF_INET, socket.AF_INET6):
+        try:
+            socket.inet_pton(family, host)
+        except (OSError, ValueError):
+            continue
+        return family, (host, port)
+    return None
