@@ -11,6 +11,8 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import platformdirs
+
 from rce.config.exceptions import SecretError
 from rce.config.folders import run_dir
 
@@ -69,7 +71,8 @@ def load_secret(
     """Find the secret.
 
     The first of: ``file``; the variable ``RCE_SECRET``; the file that ``RCE_SECRET_FILE`` names; in
-    development mode the one of this user and machine, which is made when there is none.
+    development mode the one of this user and machine, which is made when there is none; else the one that
+    ``rce secret new`` made for this user.
 
     Raises:
         SecretError: There is none, or it is too short, or others can read its file.
@@ -83,10 +86,43 @@ def load_secret(
         return read_secret(Path(environ[SECRET_FILE_VARIABLE]))
     if dev:
         return shared_dev_secret(run_dir(environ))
+    default = default_secret_file()
+    if default.exists():
+        return read_secret(default)
     raise SecretError(
-        f"the engine's programs need a shared secret: set {SECRET_VARIABLE} or {SECRET_FILE_VARIABLE},"
-        " or give --secret-file"
+        "the engine's programs need a shared secret: run `rce secret new` on one machine and copy its file to"
+        f" the same place on the others ({default}); {SECRET_VARIABLE}, {SECRET_FILE_VARIABLE} and"
+        " --secret-file do as well; --dev needs none"
     )
+
+
+def default_secret_file() -> Path:
+    """Return where a user's secret is, if nothing else was said, such as ``~/.config/rce/secret``."""
+    return platformdirs.user_config_path("rce") / "secret"
+
+
+def new_secret(file: Path) -> Secret:
+    """Make a secret in a file that only its owner may read.
+
+    Raises:
+        SecretError: There is such a file already, or it cannot be made.
+    """
+    secret = Secret.generate()
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    except OSError as error:
+        raise SecretError(f"cannot make the folder {file.parent}: {error.strerror}") from error
+    try:
+        descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with os.fdopen(descriptor, "w", encoding="ascii") as output:
+            output.write(secret.reveal() + "\n")
+    except FileExistsError:
+        raise SecretError(
+            f"{file} is there already; programs that use it would not know another one. Remove it first"
+        ) from None
+    except OSError as error:
+        raise SecretError(f"cannot make the secret {file}: {error.strerror}") from error
+    return secret
 
 
 def read_secret(file: Path) -> Secret:

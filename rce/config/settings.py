@@ -252,7 +252,7 @@ class EngineSettings(Section, frozen=True, kw_only=True):
         Setting(
             "File with the secret that the engine's programs share (`rce secret new`).",
             up="secret-file",
-            unset="`RCE_SECRET`, or the file that `RCE_SECRET_FILE` names",
+            unset="`RCE_SECRET`, or the file that `RCE_SECRET_FILE` names, or ~/.config/rce/secret",
             example="/etc/rce/secret",
         ),
     ] = None

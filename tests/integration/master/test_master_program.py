@@ -67,6 +67,7 @@ async def test_users_in_the_state_folder_and_over_the_api(tmp_path: Path) -> Non
 async def test_a_master_that_cannot_start_says_why(tmp_path: Path) -> None:
     env = environment(tmp_path)
     del env["RCE_SECRET"]
+    env["XDG_CONFIG_HOME"] = str(tmp_path / "config")
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "rce_master", "--state-dir", str(tmp_path / "state")),
         stderr=asyncio.subprocess.PIPE,
@@ -74,7 +75,7 @@ async def test_a_master_that_cannot_start_says_why(tmp_path: Path) -> None:
     )
     _, errors = await process.communicate()
     assert process.returncode == 1
-    assert b"secret" in errors
+    assert b"rce secret new" in errors
     assert b"Traceback" not in errors
     async with master(tmp_path, "--dev"):
         process = await asyncio.create_subprocess_exec(

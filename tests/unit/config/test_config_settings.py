@@ -14,7 +14,14 @@ from rce.config.exceptions import ConfigError, RunDirError, SecretError
 from rce.config.folders import private_folder, run_dir
 from rce.config.loading import load_settings
 from rce.config.resources import configs_dir, examples_dir
-from rce.config.secret import Secret, load_secret, read_secret, shared_dev_secret
+from rce.config.secret import (
+    Secret,
+    default_secret_file,
+    load_secret,
+    new_secret,
+    read_secret,
+    shared_dev_secret,
+)
 from rce.config.settings import EngineSettings, Runtime
 
 
@@ -94,7 +101,7 @@ def test_unfit_secret_is_refused(text: str) -> None:
     assert not text or text not in str(caught.value)
 
 
-def test_secret_is_found_in_order(tmp_path: Path) -> None:
+def test_secret_is_found_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "secret"
     file.write_text("from the file\n")
     file.chmod(0o600)
@@ -103,8 +110,23 @@ def test_secret_is_found_in_order(tmp_path: Path) -> None:
     assert load_secret(environ=environ).reveal() == "from the variable"
     del environ["RCE_SECRET"]
     assert load_secret(environ=environ).reveal() == "from the file"
-    with pytest.raises(SecretError, match="RCE_SECRET"):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    with pytest.raises(SecretError, match="run `rce secret new`"):
         load_secret(environ={})
+    made = new_secret(default_secret_file())
+    assert load_secret(environ={}) == made
+
+
+def test_new_secret_is_private_and_never_replaces_another(tmp_path: Path) -> None:
+    file = tmp_path / "some" / "secret"
+    made = new_secret(file)
+    assert read_secret(file) == made
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    with pytest.raises(SecretError, match="is there already"):
+        new_secret(file)
+    with pytest.raises(SecretError, match="cannot make the folder"):
+        new_secret(file / "below")
+    assert read_secret(file) == made
 
 
 def test_secret_file_for_everybody_is_refused(tmp_path: Path) -> None:
