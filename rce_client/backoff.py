@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING
 
 from websockets.exceptions import InvalidHandshake, InvalidStatus, WebSocketException
 
-from rce_client.exceptions import ClientError, RefusedError, UnavailableError
+from rce_client.exceptions import ClientError, InUseError, RefusedError, UnavailableError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-RETRIED_STATUSES = frozenset((408, 409, 425, 429, 500, 502, 503, 504))
-"""HTTP statuses that another attempt may clear: 409 is a former connection that has not ended yet."""
+RETRIED_STATUSES = frozenset((408, 425, 429, 500, 502, 503, 504))
+"""HTTP statuses that another attempt may clear."""
+IN_USE = 409
+"""The status if another client has the robotID: perhaps a former connection that has not ended yet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +44,8 @@ class Backoff:
 
 def judge_status(status: int, reason: str) -> ClientError:
     """Return the error for an HTTP answer that is not the wanted one."""
+    if status == IN_USE:
+        return InUseError(reason, status)
     if status in RETRIED_STATUSES:
         return UnavailableError(reason, status)
     return RefusedError(status, reason)

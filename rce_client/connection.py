@@ -22,8 +22,9 @@ from rce.protocol.stream import Fault
 from rce_client.courier import Courier, Target, Timing
 from rce_client.desired import Desired
 from rce_client.ends import ServiceClient, read_call_fault
-from rce_client.exceptions import InterfaceError, LostError, NotConnectedError, RefusedError
+from rce_client.exceptions import InterfaceError, InUseError, LostError, NotConnectedError, RefusedError
 from rce_client.own_interfaces import OwnInterfaces
+from rce_client.reminder import Reminder
 from rce_client.requests import Requests
 from rce_client.sendqueue import QueueLimits
 
@@ -117,6 +118,7 @@ class Connection(Requests, OwnInterfaces):
         self._backlog: list[Request] = []
         self._was_connected = False
         self._refusal: RefusedError | None = None
+        self._reminder = Reminder()
 
     async def __aenter__(self) -> Self:
         """Connect.
@@ -253,7 +255,9 @@ class Connection(Requests, OwnInterfaces):
         self._set_state(State.CONNECTING, CONNECTING)
 
     def on_failure(self, error: ClientError) -> None:
-        """It failed."""
+        """It failed. A program that does not listen is told in the log that its robotID is in use."""
+        if self.on_state is None and isinstance(error, InUseError) and self._reminder.is_due(str(error)):
+            _log.warning("%s: %s", self.robot_id, error)
         self._set_state(State.CONNECTING, str(error))
 
     def on_connected(self) -> None:

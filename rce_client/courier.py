@@ -16,7 +16,7 @@ from rce.protocol.limits import Limits
 from rce.protocol.stream import ProtocolStream
 from rce_client.backoff import Backoff, judge
 from rce_client.discovery import VERSION, locate
-from rce_client.exceptions import LostError, RefusedError
+from rce_client.exceptions import InUseError, LostError, RefusedError
 from rce_client.sendqueue import Parcel, QueueLimits, SendQueue
 from rce_client.socket import EngineSocket
 
@@ -29,6 +29,10 @@ if TYPE_CHECKING:
     from rce_client.exceptions import ClientError
 
 _log = logging.getLogger(__name__)
+
+
+IN_USE_DELAY = 3.0
+"""Most seconds until the next attempt if another client has the robotID."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,7 +128,8 @@ class Courier:
                 self._listener.on_failure(error)
                 if isinstance(error, RefusedError):
                     raise error from raised
-                await asyncio.sleep(next(delays))
+                delay = next(delays)
+                await asyncio.sleep(min(delay, IN_USE_DELAY) if isinstance(error, InUseError) else delay)
                 continue
             delays = self._timing.backoff.delays()
             self._listener.on_lost(await self._use(socket))

@@ -5,6 +5,7 @@
     ClientError
     +-- RefusedError          the engine says no, and asking again will not help (credentials, version)
     +-- UnavailableError      nobody answers, or not now: worth another try
+    |   +-- InUseError        another client has this robotID
     |   +-- LostError         the connection broke
     +-- NotConnectedError     nothing can be sent at this moment
     +-- InterfaceError        an interface cannot be used as the program tries to
@@ -51,6 +52,13 @@ class UnavailableError(ClientError):
 
     def __str__(self) -> str:
         return f"unavailable ({self.status}): {self.reason}" if self.status else self.reason
+
+
+class InUseError(UnavailableError):
+    """Another client is connected with this robotID; the text says from where and since when."""
+
+    def __str__(self) -> str:
+        return f"waiting until the robotID is free: {self.reason}"
 
 
 class LostError(UnavailableError):

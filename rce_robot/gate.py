@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Protocol
 from urllib.parse import urlsplit
 
@@ -74,9 +75,8 @@ class Gate:
         except HandshakeError as error:
             _log.info("refused %s: %s %s", connection.remote_address, error.status, error.reason)
             return connection.respond(error.status, f"{error.reason}\n")
-        if namespace.session is not None:
-            return connection.respond(_CONFLICT, f"{_already(namespace.id)}\n")
-        session = Session(connection, namespace, self._settings, namespace.dropped)
+        client = f"{address or 'an unknown address'} since {_clock()} UTC"
+        session = Session(connection, namespace, self._settings, namespace.dropped, client=client)
         namespace.session = session
         connection.receiver = session
         connection.become_known()
@@ -99,8 +99,15 @@ class Gate:
             if error.status != _CONFLICT or former is None or await former.probe():
                 raise
             spec = await self._house.log_in(credentials, address)
-        return await self._house.settle(spec)
+        namespace = await self._house.settle(spec)
+        if namespace.session is not None:
+            raise HandshakeError(_CONFLICT, _already(namespace.id, namespace.session.client))
+        return namespace
 
 
-def _already(robot: EndpointId) -> str:
-    return f"Robot {robot.tag} of user {robot.user} is already connected."
+def _already(robot: EndpointId, client: str) -> str:
+    return f"robot {robot.tag!r} is connected already, from {client}; a robotID can be used once at a time"
+
+
+def _clock() -> str:
+    return datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S")

@@ -126,6 +126,7 @@ class Namespace:
             interfaces=dict(self._endpoint.interfaces),
             connections=tuple(self._endpoint.connections),
             address=self._address,
+            client=self.session.client if self.session is not None else "",
         )
 
     def usage(self) -> EndpointUsage:

@@ -84,7 +84,13 @@ class Session:
     """
 
     def __init__(
-        self, socket: RobotSocket, owner: Owner, settings: SessionSettings, dropped: Counter[str]
+        self,
+        socket: RobotSocket,
+        owner: Owner,
+        settings: SessionSettings,
+        dropped: Counter[str],
+        *,
+        client: str = "",
     ) -> None:
         self._socket = socket
         self._owner = owner
@@ -105,6 +111,8 @@ class Session:
         self._reason = ""
         self._abort: asyncio.TimerHandle | None = None
         """A robot that was dropped has a moment to hear why."""
+        self.client = client
+        """From where the robot is connected, and since when."""
         self.lost = False
         """Whether the connection ended."""
         self.ended = asyncio.Event()

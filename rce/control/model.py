@@ -223,6 +223,8 @@ class EndpointStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     connections: tuple[int, ...] = ()
     """Ids of the established connections."""
     address: LinkAddress = LinkAddress()
+    client: str = ""
+    """From where a robot is connected, and since when, in words for its user; robots only."""
 
 
 class InterfaceUsage(Struct, frozen=True, kw_only=True, omit_defaults=True):

@@ -7,6 +7,7 @@ import contextlib
 import logging
 import signal
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,6 +22,7 @@ from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce_client.connection import CONNECTING, Connection, State
 from rce_client.exceptions import ClientError
+from rce_client.reminder import Reminder
 from rce_client.ros_bridge.bridge import build, joined_graph, wait_ready
 from rce_client.ros_bridge.plan import check, make_plan
 
@@ -106,7 +108,7 @@ async def serve(config: ClientConfig, plan: Plan, types: TypeRegistry, master_ur
         config.password.get_secret_value(),
         config.robot,
         on_error=lambda text: say(f"engine: {text}"),
-        on_state=_tell_state,
+        on_state=partial(_tell_state, Reminder()),
     )
     async with joined_graph(config.robot, master_uri, types, say) as node, conn:
         try:
@@ -152,8 +154,9 @@ def say(text: str) -> None:
     print(f"rce-ros: {text}", file=sys.stderr, flush=True)  # noqa: T201
 
 
-def _tell_state(state: State, words: str) -> None:
-    if state in (State.LOST, State.RESTORED) or (state is State.CONNECTING and words != CONNECTING):
+def _tell_state(reminder: Reminder, state: State, words: str) -> None:
+    failed = state is State.CONNECTING and words != CONNECTING and reminder.is_due(words)
+    if failed or state in (State.LOST, State.RESTORED):
         say(f"{state.value}: {words}")
 
 

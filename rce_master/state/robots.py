@@ -63,7 +63,11 @@ def _enter(tx: Transaction, command: RobotLogin) -> None:
     assert robot is not None
     live = tx.tables.robot_live(id_)
     if live.session is RobotSession.CONNECTED:
-        raise Conflict(f"robot {robot.tag!r} is connected already; a robotID can be used once at a time")
+        client = live.status.client if live.status is not None else ""
+        where = f", from {client}" if client else ""
+        raise Conflict(
+            f"robot {robot.tag!r} is connected already{where}; a robotID can be used once at a time"
+        )
     if robot.task_set != process:
         if robot.task_set:
             endpoints.withdraw(tx, robot, "the robot connected elsewhere")

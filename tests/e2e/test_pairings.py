@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
+import re
+import sys
 from collections.abc import AsyncIterator
+from hashlib import sha256
+from pathlib import Path
+from urllib.parse import urlencode
 
 import pytest
-from support.engine import Engine, running_engine, until
+from support.engine import Engine, Program, running_engine, until
 from support.stranger import Stranger, stranger
+from websockets.asyncio.client import connect
+from websockets.exceptions import InvalidStatus
+
+from rce.ros.core import Core
 
 pytestmark = [pytest.mark.e2e, pytest.mark.timeout(120)]
 
@@ -144,6 +154,30 @@ async def test_container_with_container_and_with_robot(runtime: str, machines: s
         await robot.publish("say", STRING, {"data": "hello"})
         assert await robot.receive("hear") == {"data": "hello"}
         assert robot.errors == []
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+async def test_who_has_a_robot_id_is_told_to_its_user(processes: int) -> None:
+    """At whichever robot process the second client tries to come in; by ``rce-ros`` in a line of its own."""
+    query = urlencode({"userID": "testUser", "robotID": "first", "password": sha256(b"testUser").hexdigest()})
+    holder = r"connected already, from 127\.0\.0\.1 since \d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC"
+    async with running_engine(robots=processes) as engine, stranger(engine.url, robot="first"):
+        for port, _ in engine.robot_ports:
+            with pytest.raises(InvalidStatus) as caught:
+                await connect(f"ws://127.0.0.1:{port}/?{query}", proxy=None)
+            assert caught.value.response.status_code == 409
+            assert re.search(holder, bytes(caught.value.response.body or b"").decode())
+        file = engine.folder / "robot.config"
+        login = {"url": engine.url, "userID": "testUser", "password": "testUser", "robotID": "first"}
+        file.write_text(json.dumps(login))
+        async with Core("127.0.0.1", 0) as core:
+            program = str(Path(sys.executable).parent / "rce-ros")
+            bridge = Program("rce-ros", [program, str(file)], engine.env, engine.folder)
+            bridge.env = {**engine.env, "ROS_MASTER_URI": core.uri}
+            await bridge.start(ready="waiting until the robotID is free")
+            assert re.search(holder, bridge.output())
+            await until(lambda: bridge.output().count("robotID is free") > 1, what="it is said again")
+            await bridge.stop()
 
 
 async def test_interfaces_of_one_endpoint_and_a_topic_in_both_directions() -> None:

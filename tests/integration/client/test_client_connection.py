@@ -17,6 +17,7 @@ from rce_client.exceptions import (
     NotConnectedError,
     RefusedError,
 )
+from rce_client.reminder import Reminder
 
 if TYPE_CHECKING:
     from tests.integration.client.conftest import Door, Engine
@@ -222,6 +223,26 @@ async def test_a_wrong_password_is_raised(engine: Engine) -> None:
         async with Connection(engine.door.url, "testUser", "wrong", "testRobot"):
             pass
     assert caught.value.status == 401
+
+
+async def test_a_robot_id_in_use_is_told_at_once_and_again(
+    engine: Engine, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who has it is told, and the second client comes in when the first is gone."""
+    monkeypatch.setattr(Reminder.__init__, "__defaults__", (0.1, *Reminder.__init__.__defaults__[1:]))
+
+    def told() -> list[str]:
+        return [record.message for record in caplog.records if "robotID is free" in record.message]
+
+    async with asyncio.timeout(30):
+        async with engine.connection():
+            second = asyncio.create_task(engine.connection().__aenter__())
+            while len(told()) < 3:
+                await asyncio.sleep(0.02)
+            assert not second.done()
+        conn = await second
+        await conn.__aexit__(None, None, None)
+    assert "already" in told()[0]
 
 
 async def test_waits_for_an_engine_that_is_not_there_yet(engine: Engine) -> None:

@@ -30,7 +30,13 @@ def test_delays_use_the_whole_range() -> None:
     assert max(delays) > 0.95
 
 
-@pytest.mark.parametrize("status", [409, 429, 500, 503, 504])
+def test_a_robot_id_in_use_is_worth_another_try() -> None:
+    error = judge_status(409, "robot 'r' is connected already, from 192.0.2.1")
+    assert isinstance(error, UnavailableError)
+    assert str(error).startswith("waiting until the robotID is free: robot 'r'")
+
+
+@pytest.mark.parametrize("status", [429, 500, 503, 504])
 def test_statuses_that_may_pass(status: int) -> None:
     error = judge_status(status, "later")
     assert isinstance(error, UnavailableError)
