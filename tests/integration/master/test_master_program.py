@@ -12,12 +12,14 @@ import sys
 from typing import TYPE_CHECKING
 
 import aiohttp
+import pytest
 from support.master_program import environment, master, rce
 from websockets.asyncio.client import connect
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+pytestmark = pytest.mark.timeout(300)  # each command is a process, which is slow on a busy machine
 
 async def test_what_was_accepted_survives_kill_9(tmp_path: Path) -> None:
     async with master(tmp_path, "--dev", end=signal.SIGKILL) as url:

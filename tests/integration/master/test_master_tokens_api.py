@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from contextlib import AbstractAsyncContextManager
 
-    from integration.master.conftest import Site
+    from conftest import Site
 
 
 async def test_tokens_are_listed_without_their_text(site: Site) -> None:
