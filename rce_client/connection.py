@@ -74,8 +74,9 @@ class Connection(Requests, OwnInterfaces):
     Args:
         url: The master, ``http://HOST:9000/`` or ``https://``.
         user_id: User ID.
-        password: The user's password; only its SHA-256 is sent.
+        password: The user's password; only its SHA-256 is sent. Empty if there is a token.
         robot_id: Names this robot; one connection at a time.
+        token: The robot's own token (``rce robot add``), in place of the user's password.
         tls: TLS settings; the system's if None.
         on_error: Called with the text of every ``ER`` that belongs to no service call.
         on_state: Called with every new state and a few words.
@@ -90,6 +91,7 @@ class Connection(Requests, OwnInterfaces):
         password: str,
         robot_id: str,
         *,
+        token: str = "",
         tls: ssl.SSLContext | None = None,
         on_error: Callable[[str], None] | None = None,
         on_state: Callable[[State, str], None] | None = None,
@@ -104,7 +106,7 @@ class Connection(Requests, OwnInterfaces):
         """The newest error texts."""
         self.active: dict[str, bool] = {}
         """Own interface tags to whether they are joined with a peer."""
-        target = Target(url=url, user=user_id, password=password, robot=robot_id, tls=tls)
+        target = Target(url=url, user=user_id, password=password, token=token, robot=robot_id, tls=tls)
         self._courier = Courier(target, self, timing, limits)
         self._desired = Desired()
         self._ends: dict[str, End] = {}

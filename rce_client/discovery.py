@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import json
 from http import HTTPStatus
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import urlencode, urlsplit
 
 import h11
@@ -27,6 +27,15 @@ _MAX_BODY = 65536
 _PORTS = {"http": 80, "https": 443}
 
 
+class Endpoint(NamedTuple):
+    """Where a robot is to connect."""
+
+    url: str
+    """WebSocket URL."""
+    takes_header: bool
+    """Whether the credential may go in the header ``Authorization``."""
+
+
 async def locate(
     url: str,
     user: str,
@@ -34,8 +43,8 @@ async def locate(
     version: str = VERSION,
     tls: ssl.SSLContext | None = None,
     timeout: float = 10.0,
-) -> str:
-    """Ask the master at ``url`` for the WebSocket URL of a robot endpoint.
+) -> Endpoint:
+    """Ask the master at ``url`` for a robot endpoint.
 
     Args:
         url: The master, ``http://HOST:PORT/`` or ``https://``.
@@ -55,7 +64,7 @@ async def locate(
         raise RefusedError(0, f"{url!r} is not an http or https URL") from error
     if not parts.hostname:
         raise RefusedError(0, f"{url!r} names no host")
-    target = f"{parts.path or '/'}?{urlencode({'userID': user, 'version': version})}"
+    target = f"{parts.path or '/'}?{urlencode({'userID': user, 'version': version, 'auth': 'bearer'})}"
     try:
         async with asyncio.timeout(timeout):
             reader, writer = await asyncio.open_connection(
@@ -100,15 +109,16 @@ async def _get(
             return status, bytes(body)
 
 
-def _read_answer(url: str, status: int, body: bytes) -> str:
-    """Return the WebSocket URL in the master's answer, or raise what the answer means."""
+def _read_answer(url: str, status: int, body: bytes) -> Endpoint:
+    """Return the endpoint in the master's answer, or raise what the answer means."""
     text = body.decode(errors="replace").strip()
     if status != HTTPStatus.OK:
         raise judge_status(status, text or f"{url} answered {status}")
     try:
-        found = json.loads(text)["url"]
+        answer = json.loads(text)
+        found = answer["url"]
     except (ValueError, KeyError, TypeError) as error:
         raise UnavailableError(f"{url} did not answer as a master does") from error
     if not isinstance(found, str) or urlsplit(found).scheme not in ("ws", "wss"):
         raise UnavailableError(f"the master gave {found!r}, which is not a WebSocket URL")
-    return found
+    return Endpoint(found, answer.get("auth") == "bearer")

@@ -9,8 +9,16 @@ from typing import TYPE_CHECKING
 
 from rce.control.messages import ClientReply, ClientRequest, Left, Login, LoginReply
 from rce_master import requests
-from rce_master.exceptions import MasterError, Refused, TooManyFailures, TooManyLogins, WrongCredentials
+from rce_master.exceptions import (
+    Forbidden,
+    MasterError,
+    Refused,
+    TooManyFailures,
+    TooManyLogins,
+    WrongCredentials,
+)
 from rce_master.state import commands
+from rce_master.tokens import Tokens
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
@@ -27,7 +35,7 @@ MAX_PENDING = 1000
 MAX_LOGINS = 4096
 """Logins in work; beyond it robots are told to try later. Nothing else waits for a login that is put off."""
 
-_UNAUTHORIZED, _CONFLICT, _TOO_MANY, _UNAVAILABLE = 401, 409, 429, 503
+_UNAUTHORIZED, _FORBIDDEN, _CONFLICT, _TOO_MANY, _UNAVAILABLE = 401, 403, 409, 429, 503
 
 
 @dataclass(eq=False, slots=True)
@@ -47,7 +55,14 @@ class Desk:
     comes after them.
     """
 
-    def __init__(self, realm: Realm, reconciler: Reconciler, authenticator: Authenticator) -> None:
+    def __init__(
+        self,
+        realm: Realm,
+        reconciler: Reconciler,
+        authenticator: Authenticator,
+        tokens: Tokens | None = None,
+    ) -> None:
+        self._tokens = Tokens(realm.tables) if tokens is None else tokens
         self._realm = realm
         self._reconciler = reconciler
         self._authenticator = authenticator
@@ -115,13 +130,14 @@ class Desk:
 
     async def _answer_login(self, process: str, id_: str, login: Login) -> LoginReply:
         try:
-            await self._authenticator.verify(login.user, login.password, login.address)
-            await self._realm.submit(commands.RobotLogin(process=process, id=id_))
+            await self._realm.submit(await self._admission(process, id_, login))
             return LoginReply(request=login.request, endpoint=self._realm.spec(id_))
         except WrongCredentials as error:
             status, reason = _UNAUTHORIZED, str(error)
         except TooManyFailures as error:
             status, reason = _TOO_MANY, str(error)
+        except Forbidden as error:
+            status, reason = _FORBIDDEN, str(error)
         except Refused as error:
             status, reason = _CONFLICT, str(error)
             self._doubt(process, id_)
@@ -130,6 +146,23 @@ class Desk:
         except KeyError:
             status, reason = _UNAVAILABLE, "the robot was removed while it logged in"
         return LoginReply(request=login.request, status=status, reason=reason)
+
+    async def _admission(self, process: str, id_: str, login: Login) -> commands.RobotLogin:
+        """Check what a robot shows; return the command that lets it in.
+
+        Raises:
+            AuthError: It is not right, or cannot be checked now.
+            Forbidden: It is right, and not for this.
+        """
+        if not login.token:
+            user = await self._authenticator.verify(login.user, login.password, login.address)
+            return commands.RobotLogin(process=process, id=id_, password=user.password)
+        user, token = self._tokens.find(login.token)
+        if not token.robot:
+            raise Forbidden("this token is not for robots; make one for this robot: rce robot add ROBOT")
+        if (user.name, token.robot) != (login.user, login.robot):
+            raise Forbidden("this token is good for another robot; make one for this: rce robot add ROBOT")
+        return commands.RobotLogin(process=process, id=id_, credential=token.digest)
 
     def _doubt(self, process: str, id_: str) -> None:
         """Look after a robot that wants to come in while it is connected at another task set.

@@ -97,7 +97,8 @@ class Master:
             key=self._secret.derive("known logins"),
             remember=lambda login: realm.enqueue([commands.RememberLogin(login=login)]),
         )
-        desk = Desk(realm, reconciler, authenticator)
+        tokens = Tokens(realm.tables)
+        desk = Desk(realm, reconciler, authenticator, tokens)
         lifetime = self._settings.token_lifetime
         self._contents = ContentStore(self._settings.state_dir / "bundles")
         packages = PackageOffice(realm, self._contents)
@@ -109,7 +110,7 @@ class Master:
             time.time,
             lifetime,
             packages,
-            Tokens(realm.tables),
+            tokens,
             TrustedProxies(self._settings.trusted_proxies),
         )
         try:

@@ -68,7 +68,8 @@ class Gate:
             return None  # the library knows what to say to what is no WebSocket handshake
         try:
             self._check_origin(request.headers.get("Origin"))
-            credentials = read_credentials(urlsplit(request.path).query)
+            authorization = request.headers.get_all("Authorization")
+            credentials = read_credentials(urlsplit(request.path).query, authorization)
             forwarded = request.headers.get_all("X-Forwarded-For")
             address = self._proxies.origin(connection.remote_address, forwarded)
             namespace = await self._claim(credentials, address)

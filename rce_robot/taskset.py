@@ -58,7 +58,9 @@ class Channel(Protocol):
     def send(self, message: ToMaster) -> None:
         """Send, or drop while the master is away."""
 
-    async def login(self, user: str, robot: str, password: str, address: str = "") -> LoginReply:
+    async def login(
+        self, user: str, robot: str, password: str, address: str = "", token: str = ""
+    ) -> LoginReply:
         """Ask whether a robot may come in; raises :class:`ControlError` if the master stays away."""
 
     async def client_request(self, id: str, type: str, data: object) -> ClientReply:  # noqa: A002
@@ -131,6 +133,7 @@ class RobotTaskSet:
             url=self._url,
             address=self._address,
             endpoints=tuple(namespace.status() for namespace in self._namespaces.values()),
+            bearer=True,
         )
 
     async def handle(self, message: ToTaskSet) -> None:
@@ -179,9 +182,8 @@ class RobotTaskSet:
         """
         try:
             async with asyncio.timeout(self._settings.login_timeout):
-                reply = await self._channel.login(
-                    credentials.user, credentials.robot, credentials.password, address
-                )
+                who = credentials
+                reply = await self._channel.login(who.user, who.robot, who.password, address, who.token)
         except (ControlError, TimeoutError) as error:
             reason = "The master cannot be reached, so nobody can log in now. Try again."
             raise HandshakeError(_UNAVAILABLE, reason) from error

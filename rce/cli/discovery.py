@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 import uvloop
 
+from rce.config.logs import start_logging
 from rce.ros.errors import RosError
 from rce.ros.multimaster.discovery import Discovery
 from rce.ros.multimaster.listing import list_masters
@@ -57,9 +58,7 @@ def discovery(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what happens.")] = False,
 ) -> None:
     """Announce this machine's ROS master, find others, print what changes."""
-    logging.basicConfig(
-        level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s %(message)s"
-    )
+    start_logging(logging.INFO if verbose else logging.WARNING, line="%(levelname)s %(message)s")
     try:
         settings = DiscoverySettings(
             master_uri=master_uri,

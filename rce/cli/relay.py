@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 import uvloop
 
+from rce.config.logs import start_logging
 from rce.ros.errors import RosError
 from rce.ros.multimaster.relay.throttle import ByteThrottle, MessageThrottle, Throttle
 from rce.ros.multimaster.relay.topic import TopicRelay
@@ -36,7 +37,7 @@ def relay(
 ) -> None:
     """Publish under one name what is published under another."""
     level = logging.INFO if verbose else logging.WARNING
-    logging.basicConfig(level=level, format="%(levelname)s %(message)s")
+    start_logging(level, line="%(levelname)s %(message)s")
     try:
         chosen = _throttle(throttle, max_bytes, window)
         node = Node(

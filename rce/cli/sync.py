@@ -14,6 +14,7 @@ import typer
 import uvloop
 import yaml
 
+from rce.config.logs import start_logging
 from rce.ros.errors import RosError
 from rce.ros.multimaster.errors import MultimasterError
 from rce.ros.multimaster.filters import SyncLists
@@ -76,9 +77,7 @@ def sync(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what happens.")] = False,
 ) -> None:
     """Have topics and services of other ROS masters at the local one; needs a discovery."""
-    logging.basicConfig(
-        level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s %(message)s"
-    )
+    start_logging(logging.INFO if verbose else logging.WARNING, line="%(levelname)s %(message)s")
     chosen = {
         "sync_topics": _split(topics),
         "sync_services": _split(services),

@@ -233,7 +233,10 @@ class ClientConfig(Strict):
     url: Annotated[str, AfterValidator(_check_url)]
     """The master's address."""
     user: Name = Field(alias="userID")
-    password: SecretStr = Field(min_length=1)
+    password: SecretStr = SecretStr("")
+    """The user's password; empty if there is a token."""
+    token: SecretStr = SecretStr("")
+    """The robot's own token, as ``rce robot add`` gives it."""
     robot: Name = Field(alias="robotID")
     containers: tuple[Container, ...] = Field(default=(), strict=False)
     nodes: tuple[Node, ...] = Field(default=(), strict=False)
@@ -331,6 +334,7 @@ def loads(text: str, source: str = "config") -> ClientConfig:
         config, faults = ClientConfig.model_validate(data), []
     except ValidationError as error:
         config, faults = None, faults_of(error, ClientConfig)
+    faults += client_checks.credential_faults(data)
     faults += client_checks.check(client_checks.Parts.salvage(data, _ITEMS))
     if faults or config is None:
         raise ConfigError(source, faults)

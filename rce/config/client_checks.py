@@ -54,6 +54,17 @@ class Parts:
         return parts
 
 
+def credential_faults(data: Mapping[str, Any]) -> list[Fault]:
+    """Check that a document has one credential: a password or a token."""
+    given = [key for key in ("password", "token") if data.get(key) not in (None, "")]
+    if len(given) == 1:
+        return []
+    if given:
+        return [Fault("token", "must not be there beside a password; leave one of the two out")]
+    what = "must be the user's password, or leave it out and give a token (rce robot add ROBOT)"
+    return [Fault("password", f"is missing: {what}" if "password" not in data else what)]
+
+
 def check(parts: Parts) -> list[Fault]:
     """Find everything that does not fit together."""
     return [

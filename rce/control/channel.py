@@ -118,21 +118,29 @@ class TaskSetChannel:
         except asyncio.QueueFull:
             self._abort(f"{MAX_QUEUED} messages wait for the master")
 
-    async def login(self, user: str, robot: str, password: str, address: str = "") -> LoginReply:
-        """Ask whether a robot may come in.
+    async def login(
+        self, user: str, robot: str, password: str, address: str = "", token: str = ""
+    ) -> LoginReply:
+        """Ask whether a robot may come in, by the digest of its user's password or by its own token.
 
         Args:
             user: Whose robot it says that it is.
             robot: Its ID.
             password: As it sent it.
             address: Where it connects from.
+            token: As it sent it, in place of a password.
 
         Raises:
             MasterUnavailableError: No answer in time.
             UnsendableError: It holds something that cannot be sent.
         """
         message = Login(
-            request=next(self._numbers), user=user, robot=robot, password=password, address=address
+            request=next(self._numbers),
+            user=user,
+            robot=robot,
+            password=password,
+            address=address,
+            token=token,
         )
         return await self._request(message, LoginReply)
 

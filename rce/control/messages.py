@@ -78,6 +78,8 @@ class Hello(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """Robot task sets: where links to any of its robots are accepted."""
     endpoints: tuple[EndpointStatus, ...] = ()
     """All that is there now."""
+    bearer: bool = False
+    """Robot task sets: whether robots may show their credential in the header ``Authorization``."""
 
 
 class Status(_Message, frozen=True, kw_only=True, omit_defaults=True):
@@ -123,9 +125,14 @@ class Login(_Message, frozen=True, kw_only=True, omit_defaults=True):
     user: str
     robot: str
     password: str
-    """SHA-256 of the password, in hex, as the client sent it."""
+    """SHA-256 of the password, in hex, as the client sent it; empty: there is a token."""
     address: str = ""
     """Where the robot connects from, as :func:`rce.guard.lobby.address_of` writes it."""
+    token: str = ""
+    """The robot's own token."""
+
+    def __repr__(self) -> str:
+        return f"Login(request={self.request}, user={self.user!r}, robot={self.robot!r})"
 
 
 class Left(_Message, frozen=True, kw_only=True, omit_defaults=True):

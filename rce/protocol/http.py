@@ -1,29 +1,38 @@
 """The two HTTP requests with which a client comes in, without I/O.
 
 First ``GET /?userID=U&version=V`` at the master, which answers where the robot endpoint is; then the
-WebSocket handshake there, ``GET /?userID=U&robotID=R&password=P``. Wire source: ``docs/protocol.md``.
+WebSocket handshake there, ``GET /?userID=U&robotID=R&password=P``, or without a password and with the header
+``Authorization: Bearer``. Wire source: ``docs/protocol.md``.
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from urllib.parse import parse_qs
+from typing import TYPE_CHECKING
+from urllib.parse import parse_qs, parse_qsl
 
 import msgspec
 
 from rce.protocol.exceptions import HandshakeError
 from rce.protocol.names import is_name
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
 CURRENT_VERSION = "20130902"
 """The protocol's version, a date."""
 MIN_VERSION = "20130415"
 """The oldest version that is served."""
 
+AUTH_KEY, AUTH_BEARER = "auth", "bearer"
+"""A client that asks with ``auth=bearer`` is told the same if its credential may go in a header."""
+
 _MAX_QUERY = 4096
 _MAX_FIELDS = 32
 _VERSION = re.compile(r"[0-9]{1,16}")
 _PASSWORD = re.compile(r"[0-9A-Fa-f]{64}")
+_TOKEN = re.compile(r"[A-Za-z0-9._~+/=-]{1,256}")
 
 _BAD_REQUEST, _UNAUTHORIZED, _GONE, _NOT_IMPLEMENTED = 400, 401, 410, 501
 
@@ -34,6 +43,8 @@ class MasterRequest:
 
     user: str
     version: str
+    asks_for_header: bool = False
+    """Whether the client wants to know if its credential may go in a header."""
 
     @property
     def is_outdated(self) -> bool:
@@ -47,8 +58,10 @@ class Credentials:
 
     user: str
     robot: str
-    password: str = field(repr=False)
-    """SHA-256 of the password, 64 lower-case hex characters."""
+    password: str = field(default="", repr=False)
+    """SHA-256 of the password, 64 lower-case hex characters; empty: there is a token."""
+    token: str = field(default="", repr=False)
+    """The robot's own token; empty: there is a password."""
 
 
 def read_master_request(query: str) -> MasterRequest:
@@ -72,32 +85,38 @@ def read_master_request(query: str) -> MasterRequest:
     if int(version) > int(CURRENT_VERSION):
         reason = f"Client version {version} is newer than this server; use {CURRENT_VERSION}."
         raise HandshakeError(_NOT_IMPLEMENTED, reason)
-    return MasterRequest(user, version)
+    return MasterRequest(user, version, asks_for_header=(AUTH_KEY, AUTH_BEARER) in _pairs(query))
 
 
-def master_reply(request: MasterRequest, url: str) -> bytes:
+def master_reply(request: MasterRequest, url: str, *, header: bool = False) -> bytes:
     """Write the body of the master's answer (JSON, UTF-8).
 
     Args:
         request: What was asked.
         url: WebSocket URL of the robot endpoint, such as ``ws://host:9010/``.
+        header: Whether that endpoint takes the credential in a header; only who asks is told.
     """
     body = {"url": url}
+    if header and request.asks_for_header:
+        body[AUTH_KEY] = AUTH_BEARER
     if request.is_outdated:
         body["current"] = CURRENT_VERSION
     return msgspec.json.encode(body)
 
 
-def read_credentials(query: str) -> Credentials:
-    """Read the query of a WebSocket handshake.
+def read_credentials(query: str, authorization: Sequence[str] = ()) -> Credentials:
+    """Read what a WebSocket handshake says of who comes.
 
     Args:
         query: What comes after the ``?``, still percent-encoded.
+        authorization: Values of the header ``Authorization``. With one, the query needs no password.
 
     Raises:
-        HandshakeError: 400 for a missing, repeated or malformed parameter, 401 for a password that is no
-            SHA-256.
+        HandshakeError: 400 for a missing, repeated or malformed parameter, or a credential in both places;
+            401 for a password that is no SHA-256, or a header that is not understood.
     """
+    if authorization:
+        return _read_header(query, authorization)
     values = _single_values(query, ("userID", "robotID", "password"))
     _check_name("userID", values["userID"])
     _check_name("robotID", values["robotID"])
@@ -105,6 +124,28 @@ def read_credentials(query: str) -> Credentials:
         reason = "Parameter 'password' must be the SHA-256 of the password in 64 hexadecimal characters."
         raise HandshakeError(_UNAUTHORIZED, reason)
     return Credentials(values["userID"], values["robotID"], values["password"].lower())
+
+
+def _read_header(query: str, authorization: Sequence[str]) -> Credentials:
+    values = _single_values(query, ("userID", "robotID"))
+    _check_name("userID", values["userID"])
+    _check_name("robotID", values["robotID"])
+    if any(name == "password" for name, _ in _pairs(query)):
+        reason = "Give either the header 'Authorization' or the parameter 'password', not both."
+        raise HandshakeError(_BAD_REQUEST, reason)
+    scheme, _, text = authorization[0].partition(" ")
+    text = text.strip()
+    if len(authorization) != 1 or scheme.lower() != "bearer" or not _TOKEN.fullmatch(text):
+        reason = "The header 'Authorization' must be 'Bearer' and the robot's token or password's SHA-256."
+        raise HandshakeError(_UNAUTHORIZED, reason)
+    if _PASSWORD.fullmatch(text):
+        return Credentials(values["userID"], values["robotID"], password=text.lower())
+    return Credentials(values["userID"], values["robotID"], token=text)
+
+
+def _pairs(query: str) -> list[tuple[str, str]]:
+    """Return the parameters of a query that is known to be readable."""
+    return parse_qsl(query, keep_blank_values=True, max_num_fields=_MAX_FIELDS)
 
 
 def _single_values(query: str, names: tuple[str, ...]) -> dict[str, str]:

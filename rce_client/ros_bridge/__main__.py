@@ -16,6 +16,7 @@ import uvloop
 
 from rce.config.client import load
 from rce.config.exceptions import ConfigError, ShippedFileError
+from rce.config.logs import start_logging
 from rce.config.resources import examples_dir
 from rce.ros.errors import RosError
 from rce.ros.packages import PackageIndex
@@ -54,8 +55,7 @@ def bridge(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log more.")] = False,
 ) -> None:
     """Join a robot's ROS graph to the engine as CONFIG says, until stopped; then remove what was made."""
-    level = logging.DEBUG if verbose else logging.WARNING
-    logging.basicConfig(level=level, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    start_logging(logging.DEBUG if verbose else logging.WARNING)
     types = TypeRegistry(_packages(package_path or ()))
     try:
         read = load(config)
@@ -107,6 +107,7 @@ async def serve(config: ClientConfig, plan: Plan, types: TypeRegistry, master_ur
         config.user,
         config.password.get_secret_value(),
         config.robot,
+        token=config.token.get_secret_value(),
         on_error=lambda text: say(f"engine: {text}"),
         on_state=partial(_tell_state, Reminder()),
     )

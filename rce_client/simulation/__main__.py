@@ -12,6 +12,7 @@ import typer
 import uvloop
 
 from rce.config.exceptions import ConfigError
+from rce.config.logs import start_logging
 from rce.ros.types import TypeRegistry
 from rce_client.exceptions import RefusedError
 from rce_client.simulation.account import Account
@@ -47,7 +48,7 @@ def simulate(
     ] = None,
 ) -> None:
     """Simulate robots in a world, in real time; each is a ROS graph of its own unless --core names one."""
-    logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    start_logging(logging.WARNING)
     types = TypeRegistry()
     watch: CellWatch | None = None
     if planner_core:

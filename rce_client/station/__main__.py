@@ -16,6 +16,7 @@ import uvloop
 
 from rce.config.client import ClientConfig, load
 from rce.config.exceptions import ConfigError
+from rce.config.logs import start_logging
 from rce.config.resources import examples_dir
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
@@ -49,7 +50,7 @@ def ui(
     ] = "",
 ) -> None:
     """Serve the page and the API that steer a fleet; CONFIG's planner is run in the cloud for that."""
-    logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    start_logging(logging.WARNING)
     if (config is None) == (not ros_master):
         raise typer.BadParameter("give either CONFIG or --ros-master")
     try:

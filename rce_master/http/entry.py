@@ -54,7 +54,9 @@ class Entry:
                 status=503, text="No robot process is free; try again later.\n", headers={"Retry-After": "1"}
             )
         return web.Response(
-            body=master_reply(wanted, task_set.url), content_type="application/json", charset="utf-8"
+            body=master_reply(wanted, task_set.url, header=task_set.bearer),
+            content_type="application/json",
+            charset="utf-8",
         )
 
     def choose(self) -> TaskSet | None:

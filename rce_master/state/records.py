@@ -238,6 +238,8 @@ class TaskSet(Struct, frozen=True, kw_only=True):
     machine: MachineInfo
     url: str = ""
     address: LinkAddress = LinkAddress()
+    bearer: bool = False
+    """Whether its robots may show their credential in the header ``Authorization``."""
 
 
 class Drain(Struct, frozen=True, kw_only=True):

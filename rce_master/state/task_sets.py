@@ -74,6 +74,7 @@ def _register(tx: Transaction, hello: Hello) -> None:
             machine=hello.machine,
             url=hello.url,
             address=hello.address,
+            bearer=hello.bearer,
         )
     )
     tx.put(Presence(process=hello.process, connected=True, since=tx.now))

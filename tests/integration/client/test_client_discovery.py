@@ -20,8 +20,13 @@ if TYPE_CHECKING:
 
 async def test_asks_for_user_and_version(door: Door) -> None:
     door.body = '{"url": "ws://here:1/", "current": "20300101"}'
-    assert await locate(door.url, "a b", version="20130902") == "ws://here:1/"
-    assert door.targets == ["/?userID=a+b&version=20130902"]
+    assert await locate(door.url, "a b", version="20130902") == ("ws://here:1/", False)
+    assert door.targets == ["/?userID=a+b&version=20130902&auth=bearer"]
+
+
+async def test_is_told_that_the_endpoint_takes_a_header(door: Door) -> None:
+    door.body = '{"url": "ws://here:1/", "auth": "bearer"}'
+    assert await locate(door.url, "u") == ("ws://here:1/", True)
 
 
 @pytest.mark.parametrize(
@@ -81,6 +86,7 @@ async def test_https(open_door: Any, tmp_path: Path) -> None:
         door.body = '{"url": "wss://here:1/"}'
         with pytest.raises(RefusedError, match="certificate"):
             await locate(door.url, "u")
-        assert (
-            await locate(door.url, "u", tls=ssl.create_default_context(cafile=str(cert))) == "wss://here:1/"
+        assert await locate(door.url, "u", tls=ssl.create_default_context(cafile=str(cert))) == (
+            "wss://here:1/",
+            False,
         )

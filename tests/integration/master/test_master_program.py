@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.timeout(300)  # each command is a process, which is slow on a busy machine
 
+
 async def test_what_was_accepted_survives_kill_9(tmp_path: Path) -> None:
     async with master(tmp_path, "--dev", end=signal.SIGKILL) as url:
         await rce(tmp_path, "login", url, "--user", "testUser", "--password-stdin", text="testUser\n")
