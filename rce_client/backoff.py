@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from websockets.exceptions import InvalidHandshake, InvalidStatus, WebSocketException
 
+from rce.tls.faults import explain_to_client, find_tls_error
 from rce_client.exceptions import ClientError, InUseError, RefusedError, UnavailableError
 
 if TYPE_CHECKING:
@@ -64,10 +65,10 @@ def judge(error: Exception) -> ClientError:
         response = error.response
         body = bytes(response.body or b"").decode(errors="replace").strip()
         return judge_status(response.status_code, body or response.reason_phrase)
-    if isinstance(error, ssl.SSLCertVerificationError):
-        return RefusedError(0, f"the engine's certificate is not trusted: {error}")
-    if isinstance(error, TimeoutError):
-        return UnavailableError("no answer in time")
+    if why := explain_to_client(error):
+        untrusted = isinstance(find_tls_error(error), ssl.SSLCertVerificationError)
+        return RefusedError(0, why) if untrusted else UnavailableError(why)
     if isinstance(error, (OSError, EOFError, InvalidHandshake, WebSocketException)):
-        return UnavailableError(str(error) or type(error).__name__)
+        late = isinstance(error, TimeoutError)
+        return UnavailableError("no answer in time" if late else str(error) or type(error).__name__)
     return RefusedError(0, f"{type(error).__name__}: {error}")

@@ -206,7 +206,7 @@ class Courier:
         socket = await connect(
             urlunsplit(parts._replace(query=query)),
             additional_headers=headers,
-            ssl=target.tls if parts.scheme == "wss" else None,
+            ssl=(target.tls or True) if parts.scheme == "wss" else None,
             compression=None,  # costs more time than it saves for all but slow links
             proxy=None,
             max_size=timing.max_message,

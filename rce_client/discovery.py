@@ -54,7 +54,8 @@ async def locate(
         timeout: Seconds for the whole exchange.
 
     Raises:
-        RefusedError: The master does not take this client, or the URL is none.
+        RefusedError: The master does not take this client, or the URL is none, or one with ``https`` leads to
+            an endpoint without TLS.
         UnavailableError: It may on another attempt.
     """
     parts = urlsplit(url)
@@ -78,7 +79,15 @@ async def locate(
         if isinstance(error, h11.ProtocolError):
             raise UnavailableError(f"{url} does not speak HTTP: {error}") from error
         raise judge(error) from error
-    return _read_answer(url, status, body)
+    found = _read_answer(url, status, body)
+    if parts.scheme == "https" and urlsplit(found.url).scheme != "wss":
+        raise RefusedError(
+            0,
+            f"the master at {url} sends robots to {found.url}, which is not encrypted: what proves who"
+            " this robot is would travel in clear; run rce-robot with --tls, or behind a proxy with"
+            " --public-url wss://...",
+        )
+    return found
 
 
 async def _get(

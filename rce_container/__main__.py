@@ -14,12 +14,15 @@ from rce.config.exceptions import RunDirError, SecretError
 from rce.config.secret import load_secret
 from rce.config.settings import EngineSettings
 from rce.guard.files import raise_file_limit
+from rce.tls.choice import TlsChoice
+from rce.tls.exceptions import CertificateError
 from rce_container.app import App, package_path
 from rce_container.bundles.requirements import InstallerSettings
 from rce_container.exceptions import ContainerError
 from rce_container.settings import ContainerSettings
 
-OPTIONS = SettingsOptions("container", "master.control_port", *COMMON, master=True)
+TLS = ("tls.enabled", "tls.certificates", "tls.name")
+OPTIONS = SettingsOptions("container", "master.control_port", *TLS, *COMMON, master=True)
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
@@ -59,9 +62,10 @@ def container(engine: EngineSettings, *, verbose: Verbose = False) -> None:
             host=own.bind,
             name=own.name,
             state_dir=engine.container_state,
+            tls=TlsChoice.of(engine),
         )
         uvloop.run(program.run(_announce))
-    except (SecretError, RunDirError, ContainerError, OSError) as error:
+    except (SecretError, RunDirError, ContainerError, CertificateError, OSError) as error:
         typer.echo(f"rce-container: {error}", err=True)
         raise typer.Exit(1) from error
 

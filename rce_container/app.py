@@ -10,7 +10,7 @@ import math
 import os
 import signal
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import psutil
@@ -27,6 +27,8 @@ from rce.link.address import in_url, is_any, own_address
 from rce.link.handover import Doorman
 from rce.link.listening import listen_on
 from rce.ros.packages import PackageIndex, installed_shares
+from rce.tls.choice import TlsChoice
+from rce.tls.identity import Context
 from rce_container.bundles.cache import BundleCache
 from rce_container.bundles.requirements import Installer
 from rce_container.bundles.supply import Library
@@ -66,6 +68,7 @@ class App:
     """Address to accept links on; empty for all."""
     name: str = ""
     state_dir: Path | None = None
+    tls: TlsChoice = field(default_factory=TlsChoice)
 
     async def run(self, ready: Callable[[str, str], None]) -> None:
         """Run until SIGINT or SIGTERM; a second one ends the containers without waiting for their nodes.
@@ -76,7 +79,10 @@ class App:
         Raises:
             ContainerError: The state directory or the runtime cannot be used.
             OSError: The link port cannot be taken.
+            CertificateError: The certificates cannot be used.
         """
+        identity = self.tls.for_task_sets()
+        tls = None if identity is None else identity.client
         uids = UidPool(self.settings.first_uid, self.settings.uids)
         namespace = NamespaceRuntime(home_bytes=self.settings.home_bytes, uids=uids)
         podman = PodmanRuntime(self.settings.images, home_bytes=self.settings.home_bytes, uids=uids)
@@ -99,7 +105,7 @@ class App:
                 stack.callback(limiter.close)
                 for one in runtimes.values():
                     stack.callback(one.close)
-                library = await asyncio.to_thread(self._library, state)
+                library = await asyncio.to_thread(self._library, state, tls)
                 reach = own_address(self.master, self.control_port) if is_any(self.host) else self.host
                 manager = Manager(
                     name=name,
@@ -113,20 +119,20 @@ class App:
                     limiter=limiter,
                     library=library,
                 )
-                await self._manage(manager, lambda: ready(name, runtime.name))
+                await self._manage(manager, tls, lambda: ready(name, runtime.name))
 
-    def _library(self, state: StateFolder) -> Library:
+    def _library(self, state: StateFolder, tls: Context | None) -> Library:
         """Where packages that users bring come from. Blocks."""
-        client = ContentClient(self.master, self.control_port, self.secret)
+        client = ContentClient(self.master, self.control_port, self.secret, tls=tls)
         cache = BundleCache(state.library, client.piece, space=self.settings.bundle_space)
         wish = self.settings.requirements
         library = Library(cache=cache, installer=Installer(state.requirements, wish) if wish else None)
         library.open()
         return library
 
-    async def _manage(self, manager: Manager, ready: Callable[[], None]) -> None:
-        url = f"ws://{in_url(self.master)}:{self.control_port}"
-        channel = TaskSetChannel(url, self.secret, manager.hello, manager.handle)
+    async def _manage(self, manager: Manager, tls: Context | None, ready: Callable[[], None]) -> None:
+        url = f"{'ws' if tls is None else 'wss'}://{in_url(self.master)}:{self.control_port}"
+        channel = TaskSetChannel(url, self.secret, manager.hello, manager.handle, tls=tls)
         manager.send = channel.send
         async with asyncio.TaskGroup() as tasks:
             dialing: list[asyncio.Task[None]] = []

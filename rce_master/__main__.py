@@ -16,6 +16,8 @@ from rce.config.exceptions import RunDirError, SecretError
 from rce.config.secret import load_secret
 from rce.config.settings import EngineSettings
 from rce.guard.files import raise_file_limit
+from rce.tls.choice import TlsChoice
+from rce.tls.exceptions import CertificateError
 from rce_master.exceptions import MasterError
 from rce_master.master import Master, RunningMaster
 from rce_master.settings import MasterSettings
@@ -25,7 +27,7 @@ from rce_master.store import SqliteStore
 if TYPE_CHECKING:
     from rce.config.secret import Secret
 
-OPTIONS = SettingsOptions("master", *COMMON)
+OPTIONS = SettingsOptions("master", "tls", *COMMON)
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
@@ -40,7 +42,7 @@ def command(engine: EngineSettings, *, verbose: Verbose = False) -> None:
         secret = load_secret(engine.secret_file, dev=engine.dev)
         with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
             runner.run(_run(_settings(engine), secret))
-    except* (MasterError, SecretError, RunDirError) as group:
+    except* (MasterError, SecretError, RunDirError, CertificateError) as group:
         faults = group.exceptions
     for fault in faults:
         typer.echo(f"rce-master: {fault}", err=True)
@@ -57,8 +59,7 @@ def _settings(engine: EngineSettings) -> MasterSettings:
         control_port=own.control_port,
         state_dir=engine.master_state,
         dev=engine.dev,
-        tls_cert=own.tls_cert,
-        tls_key=own.tls_key,
+        tls=TlsChoice.of(engine),
         allowed_origins=own.origins,
         trusted_proxies=own.trusted_proxies,
         token_lifetime=own.token_lifetime,

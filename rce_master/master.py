@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 
 from rce.control.server import ControlServer
 from rce.guard.proxies import TrustedProxies
+from rce.tls.choice import plain_warning
+from rce.tls.expiry import watch_expiry
 from rce.web.server import HttpServer
 from rce_master.auth import Authenticator, client_digest
 from rce_master.bundles.contents import ContentStore
@@ -85,7 +87,8 @@ class Master:
 
         Raises:
             StoreError: The store cannot be read.
-            MasterError: A port or a certificate cannot be used.
+            MasterError: A port cannot be used.
+            CertificateError: A certificate cannot be used.
         """
         realm = await Realm.open(self._store, self._settings.state)
         events = EventLog(time.time())
@@ -138,6 +141,7 @@ class Master:
         settings = self._settings
         if settings.dev:
             await make_dev_user(services)
+        for_clients, for_task_sets = settings.tls.for_clients(), settings.tls.for_task_sets()
         app = make_app(services, allowed_origins=settings.allowed_origins)
         control = ControlServer(
             self._secret,
@@ -148,8 +152,13 @@ class Master:
             host=settings.bind,
             port=settings.control_port,
             contents=self._contents.read,
+            tls=for_task_sets.mutual_server if for_task_sets else None,
         )
-        http = HttpServer(app, settings.bind, settings.http_port, settings.ssl_context())
+        http = HttpServer(app, settings.bind, settings.http_port, for_clients.server if for_clients else None)
+        if for_clients is None or for_task_sets is None:
+            what = "passwords travel" if for_clients is None else "what task sets tell each other travels"
+            if text := plain_warning(what, settings.bind):
+                logger.warning("%s", text)
         async with AsyncExitStack() as stack:
             try:
                 await stack.enter_async_context(control)
@@ -157,7 +166,7 @@ class Master:
             except OSError as error:
                 raise MasterError(f"cannot listen: {error}") from error
             on_ready(RunningMaster(http.url, control.port, services.realm))
-            await asyncio.Event().wait()
+            await watch_expiry([one.files for one in (for_clients, for_task_sets) if one is not None])
 
 
 async def make_dev_user(services: Services) -> None:

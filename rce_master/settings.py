@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import ssl
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rce.config.folders import default_state_dir
 from rce.config.settings import ANYWHERE
-from rce_master.exceptions import MasterError
+from rce.tls.choice import TlsChoice
 from rce_master.state.settings import StateSettings
 from rce_master.tokens import TOKEN_LIFETIME_S
 
@@ -29,28 +28,10 @@ class MasterSettings:
     state_dir: Path = field(default_factory=lambda: default_state_dir() / "master")
     dev: bool = False
     """Make the user testUser with the password testUser, an administrator."""
-    tls_cert: Path | None = None
-    tls_key: Path | None = None
+    tls: TlsChoice = field(default_factory=TlsChoice)
     allowed_origins: tuple[str, ...] = ()
     trusted_proxies: tuple[str, ...] = ()
     """Addresses or networks of proxies whose ``X-Forwarded-For`` is believed."""
     token_lifetime: float = TOKEN_LIFETIME_S
     """Seconds."""
     state: StateSettings = field(default_factory=StateSettings)
-
-    def ssl_context(self) -> ssl.SSLContext | None:
-        """Make the TLS context of the HTTP server; None: plain HTTP.
-
-        Raises:
-            MasterError: The certificate or its key cannot be used.
-        """
-        if self.tls_cert is None:
-            if self.tls_key is not None:
-                raise MasterError("a TLS key needs its certificate (--tls-cert)")
-            return None
-        context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
-        try:
-            context.load_cert_chain(self.tls_cert, self.tls_key)
-        except (OSError, ssl.SSLError) as error:
-            raise MasterError(f"cannot use the certificate {self.tls_cert}: {error}") from error
-        return context

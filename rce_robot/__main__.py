@@ -12,10 +12,14 @@ from rce.config.secret import load_secret
 from rce.config.settings import EngineSettings
 from rce.guard.files import raise_file_limit
 from rce.ros.tcpros.allocator import keep_large_blocks
+from rce.tls.choice import TlsChoice
+from rce.tls.exceptions import CertificateError
 from rce_robot.app import App
 from rce_robot.settings import RobotSettings
 
-OPTIONS = SettingsOptions("robot", "master.control_port", "container.package_path", *COMMON, master=True)
+OPTIONS = SettingsOptions(
+    "robot", "master.control_port", "container.package_path", "tls", *COMMON, master=True
+)
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
@@ -48,9 +52,10 @@ def robot(engine: EngineSettings, *, verbose: Verbose = False) -> None:
             secret=secret,
             packages=engine.container.package_path,
             settings=settings,
+            tls=TlsChoice.of(engine),
         )
         uvloop.run(program.run(_announce))
-    except (SecretError, RunDirError, OSError) as error:
+    except (SecretError, RunDirError, CertificateError, OSError) as error:
         typer.echo(f"rce-robot: {error}", err=True)
         raise typer.Exit(1) from error
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import os
 import secrets
 import signal
 import socket
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import psutil
@@ -27,6 +28,8 @@ from rce.link.listening import listen_on
 from rce.link.unix import remove_stale_sockets
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
+from rce.tls.choice import TlsChoice, plain_warning
+from rce.tls.expiry import name_warning
 from rce_robot.conversion import ConversionPool
 from rce_robot.factory import FormFactory
 from rce_robot.gate import Gate
@@ -40,6 +43,8 @@ if TYPE_CHECKING:
 
     from rce.config.secret import Secret
 
+_log = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class App:
@@ -51,6 +56,7 @@ class App:
     secret: Secret
     packages: Sequence[Path]
     settings: RobotSettings
+    tls: TlsChoice = field(default_factory=TlsChoice)
 
     async def run(self, ready: Callable[[str], None]) -> None:
         """Run until SIGINT or SIGTERM.
@@ -60,6 +66,7 @@ class App:
 
         Raises:
             OSError: A port cannot be taken.
+            CertificateError: The certificates cannot be used.
         """
         stop = asyncio.Event()
         loop = asyncio.get_running_loop()
@@ -72,6 +79,7 @@ class App:
     async def started(self, ready: Callable[[str], None]) -> AsyncIterator[None]:
         """Run for as long as the context lasts."""
         settings = self.settings
+        for_robots, for_task_sets = self.tls.for_clients(), self.tls.for_task_sets()
         machine = settings.machine or socket.gethostname()
         reach = settings.public_host or settings.host
         if is_any(reach):
@@ -85,7 +93,12 @@ class App:
             address = await _listen(hub, machine, name, reach, settings)
             listener = await _bind(settings.host, settings.ws_port)
             port: int = listener.getsockname()[1]
-            url = settings.public_url or f"ws://{in_url(reach)}:{port}/"
+            scheme = "ws" if for_robots is None else "wss"
+            url = settings.public_url or f"{scheme}://{in_url(reach)}:{port}/"
+            if for_robots is None and not url.startswith("wss:"):
+                _warn(plain_warning("robots' passwords and messages travel", settings.host))
+            elif for_robots is not None and not settings.public_url:
+                _warn(name_warning(for_robots, reach))
             info = MachineInfo(name=machine, cores=os.cpu_count() or 0, memory=psutil.virtual_memory().total)
             lobby = Lobby("robots", per_address=settings.strangers_per_address, in_all=settings.strangers)
             task_set = RobotTaskSet(
@@ -99,15 +112,23 @@ class App:
                 lobby=lobby,
                 pool=pool,
             )
-            control = f"ws://{in_url(self.master)}:{self.control_port}"
-            channel = TaskSetChannel(control, self.secret, task_set.hello, task_set.handle)
+            control = f"{'wss' if for_task_sets else 'ws'}://{in_url(self.master)}:{self.control_port}"
+            channel = TaskSetChannel(
+                control,
+                self.secret,
+                task_set.hello,
+                task_set.handle,
+                tls=for_task_sets.client if for_task_sets else None,
+            )
             task_set.use(channel)
             gate = Gate(
                 task_set, settings.session, settings.origins, TrustedProxies(settings.trusted_proxies)
             )
             async with asyncio.TaskGroup() as tasks:
                 running = [tasks.create_task(channel.run())]
-                async with serve_robots(gate, settings, listener, lobby):
+                async with serve_robots(
+                    gate, settings, listener, lobby, for_robots.server if for_robots else None
+                ):
                     running.append(tasks.create_task(task_set.run()))
                     running.append(tasks.create_task(_announce(channel, url, ready)))
                     yield
@@ -116,6 +137,11 @@ class App:
         finally:
             await pool.close()
             await hub.close()
+
+
+def _warn(text: str | None) -> None:
+    if text is not None:
+        _log.warning("%s", text)
 
 
 def _package_index(given: Sequence[Path]) -> PackageIndex:

@@ -31,7 +31,13 @@ COMMON = ("dev", "secret_file", "machine", "log_level")
 """Settings that every program of the engine has as options."""
 MASTER_IP = "MASTER_IP"
 
-_PANELS = {"": "Engine", "master": "Master", "robot": "Robot endpoints", "container": "Containers"}
+_PANELS = {
+    "": "Engine",
+    "master": "Master",
+    "robot": "Robot endpoints",
+    "container": "Containers",
+    "tls": "TLS",
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,9 +19,12 @@ from rce.config.fields import SettingError, fields_of
 from rce.config.loading import as_document
 from rce.config.settings import LOOPBACK, EngineSettings, MasterSettings
 from rce.supervision.supervisor import Program, StartError, Supervisor
+from rce.tls.choice import WARNED_VARIABLE, plain_warning
+from rce.tls.exceptions import CertificateError
+from rce.tls.keeping import keep_certificates
 
 OPTIONS = SettingsOptions(
-    "dev", "state_dir", "secret_file", "log_level", "master", "robot", "container", up=True
+    "dev", "state_dir", "secret_file", "log_level", "master", "robot", "container", "tls", up=True
 )
 ROBOT_LINK_PORT, CONTAINER_LINK_PORT = 10030, 10031
 
@@ -65,17 +68,31 @@ async def run(settings: EngineSettings) -> int:
 
     def announce() -> None:
         typer.echo(f"RCE ready: {settings.http_url}")
+        if settings.tls.enabled:
+            typer.echo(f"RCE authority, which clients need: {settings.certificates.absolute()}/authority.pem")
 
+    if text := warning(settings):
+        typer.echo(f"[up] {text}", err=True)
     supervisor = Supervisor(list(programs(settings)), typer.echo)
     faults: tuple[BaseException, ...] = ()
     with contextlib.suppress(asyncio.CancelledError):
         try:
-            await supervisor.run(announce)
-        except* (StartError, OSError) as group:
+            async with keep_certificates(settings, lambda text: typer.echo(f"[up] {text}")):
+                await supervisor.run(announce)
+        except* (StartError, OSError, CertificateError) as group:
             faults = group.exceptions
     for fault in faults:
         typer.echo(f"rce up: {fault}", err=True)
     return 1 if faults else 0
+
+
+def warning(settings: EngineSettings) -> str | None:
+    """Return what is to be said of an engine that serves other machines without TLS."""
+    if settings.tls.enabled:
+        return None
+    return plain_warning(
+        "passwords and messages travel", settings.master.bind, settings.robot.bind, settings.container.bind
+    )
 
 
 def programs(settings: EngineSettings) -> Iterable[Program]:
@@ -101,4 +118,5 @@ def _next(port: int, offset: int) -> int:
 
 
 def _program(name: str, module: str, document: dict[str, Any]) -> Program:
-    return Program(name, [sys.executable, "-m", module, "--settings", json.dumps(document)])
+    argv = [sys.executable, "-m", module, "--settings", json.dumps(document)]
+    return Program(name, argv, {WARNED_VARIABLE: "1"})

@@ -6,6 +6,7 @@ Keys are those of the RoboEarth Cloud Engine's files (``docs/protocol.md``).
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import urlsplit
 
@@ -35,10 +36,11 @@ from rce.protocol.messages import (
 )
 from rce.protocol.names import InterfaceType
 from rce.protocol.quantities import read_bandwidth, read_cores, read_memory
+from rce.tls.identity import client_context
 
 if TYPE_CHECKING:
+    import ssl
     from collections.abc import Callable
-    from pathlib import Path
 
 
 def _matches(kind: Any) -> AfterValidator:
@@ -65,6 +67,12 @@ def _check_url(url: str) -> str:
     if not valid:
         raise ValueError("must be the master's address such as http://master:9000/")
     return url
+
+
+def _check_authority(text: str) -> str:
+    if text and not Path(text).expanduser().is_file():
+        raise ValueError(f"there is no file {text}; copy authority.pem from the engine's certificates folder")
+    return text
 
 
 def _check_type(text: str) -> str:
@@ -238,6 +246,8 @@ class ClientConfig(Strict):
     token: SecretStr = SecretStr("")
     """The robot's own token, as ``rce robot add`` gives it."""
     robot: Name = Field(alias="robotID")
+    authority: Annotated[str, AfterValidator(_check_authority)] = ""
+    """File with the authority that issued the engine's certificate; the system's authorities if empty."""
     containers: tuple[Container, ...] = Field(default=(), strict=False)
     nodes: tuple[Node, ...] = Field(default=(), strict=False)
     parameters: tuple[Parameter, ...] = Field(default=(), strict=False)
@@ -248,6 +258,17 @@ class ClientConfig(Strict):
     def robot_interfaces(self) -> tuple[Interface, ...]:
         """The interfaces of the robot itself."""
         return tuple(item for item in self.interfaces if item.endpoint == self.robot)
+
+    def tls(self, authority: Path | None = None) -> ssl.SSLContext | None:
+        """Return the TLS settings for connections to the engine; None for the system's.
+
+        Args:
+            authority: In place of the file's.
+
+        Raises:
+            CertificateError: The authority cannot be used.
+        """
+        return client_context(authority or (Path(self.authority).expanduser() if self.authority else None))
 
     def setup(self) -> list[Request]:
         """Return the requests that make everything, in the order in which they must be sent."""

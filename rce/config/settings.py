@@ -52,10 +52,6 @@ class MasterSettings(Section, frozen=True, kw_only=True):
         Path | None,
         Setting("Folder of users and desired state.", unset="folder `master` in the engine's state folder"),
     ] = None
-    tls_cert: Annotated[Path | None, Setting("Serve HTTPS with this certificate.", unset="HTTP")] = None
-    tls_key: Annotated[Path | None, Setting("The certificate's key.", unset="in the certificate's file")] = (
-        None
-    )
     origins: Annotated[
         tuple[str, ...],
         Setting("Origins whose web pages may use the server.", option="allow-origin"),
@@ -230,6 +226,45 @@ class ContainerSettings(Section, frozen=True, kw_only=True):
     ] = ""
 
 
+class TlsSettings(Section, frozen=True, kw_only=True):
+    """TLS, for every program."""
+
+    enabled: Annotated[
+        bool,
+        Setting(
+            "Use TLS for every connection, with certificates of the engine's own authority.",
+            option="tls",
+            up="tls",
+        ),
+    ] = False
+    certificates: Annotated[
+        Path | None,
+        Setting(
+            "Folder with `authority.pem`, `NAME.pem` and `NAME.key`.",
+            up="certificates",
+            unset="folder `certificates` in the engine's state folder",
+        ),
+    ] = None
+    name: Annotated[
+        str,
+        Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,62}$"),
+        Setting("The certificate of that folder that this machine's programs use.", option="certificate"),
+    ] = "engine"
+    cert: Annotated[
+        Path | None,
+        Setting(
+            "Show clients and robots this certificate in its place, such as one of a public authority.",
+            option="tls-cert",
+            up="tls-cert",
+            unset="the one of `name`",
+        ),
+    ] = None
+    key: Annotated[
+        Path | None,
+        Setting("The key of that certificate.", option="tls-key", up="tls-key", unset="in the same file"),
+    ] = None
+
+
 class EngineSettings(Section, frozen=True, kw_only=True):
     """What all programs share."""
 
@@ -272,6 +307,7 @@ class EngineSettings(Section, frozen=True, kw_only=True):
     master: MasterSettings = MasterSettings()
     robot: RobotSettings = RobotSettings()
     container: ContainerSettings = ContainerSettings()
+    tls: TlsSettings = TlsSettings()
 
     @property
     def master_state(self) -> Path:
@@ -284,10 +320,16 @@ class EngineSettings(Section, frozen=True, kw_only=True):
         return self.container.state_dir or self.state_dir / "container"
 
     @property
+    def certificates(self) -> Path:
+        """The folder with the authority and what it issued."""
+        return self.tls.certificates or self.state_dir / "certificates"
+
+    @property
     def control_url(self) -> str:
         """Where task sets dial the master."""
         host = self.master_host or LOOPBACK
-        return f"ws://{f'[{host}]' if ':' in host else host}:{self.master.control_port}"
+        scheme = "wss" if self.tls.enabled else "ws"
+        return f"{scheme}://{f'[{host}]' if ':' in host else host}:{self.master.control_port}"
 
     @property
     def http_url(self) -> str:
@@ -296,4 +338,5 @@ class EngineSettings(Section, frozen=True, kw_only=True):
         with contextlib.suppress(ValueError):
             if ipaddress.ip_address(host).is_unspecified:
                 host = LOOPBACK
-        return f"http://{f'[{host}]' if ':' in host else host}:{self.master.http_port}/"
+        scheme = "https" if self.tls.enabled or self.tls.cert else "http"
+        return f"{scheme}://{f'[{host}]' if ':' in host else host}:{self.master.http_port}/"

@@ -30,6 +30,8 @@ from rce.control.messages import (
     encode,
 )
 from rce.control.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, MAX_QUEUED, MAX_TEXT, ControlTimeouts
+from rce.tls.exceptions import CertificateError
+from rce.tls.faults import explain_to_client
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -38,8 +40,12 @@ if TYPE_CHECKING:
 
     from rce.config.secret import Secret
     from rce.control.messages import Hello, ToMaster, ToTaskSet
+    from rce.tls.identity import Context
 
 _log = logging.getLogger(__name__)
+
+_MOST_SAID = 200
+"""Bytes of an answer that are repeated in the log."""
 
 Reply = TypeVar("Reply", LoginReply, ClientReply)
 
@@ -67,6 +73,7 @@ class TaskSetChannel:
             order, and never cancelled by a lost connection. An exception from it is logged, and after a
             while the master is dialed anew so that it says everything again.
         timeouts: Times of this end.
+        tls: Gives the TLS context for each connection to a ``wss://`` URL.
     """
 
     def __init__(
@@ -77,8 +84,10 @@ class TaskSetChannel:
         handler: Callable[[ToTaskSet], Awaitable[None]],
         *,
         timeouts: ControlTimeouts = DEFAULT_TIMEOUTS,
+        tls: Context | None = None,
     ) -> None:
         self._url = url
+        self._tls = tls
         self._secret = secret
         self._hello = hello
         self._handler = handler
@@ -188,6 +197,7 @@ class TaskSetChannel:
             async with connect(
                 self._url,
                 additional_headers={"Authorization": f"Bearer {self._secret.reveal()}"},
+                ssl=None if self._tls is None else self._tls(),
                 compression=None,
                 proxy=None,
                 open_timeout=self._timeouts.open,
@@ -205,13 +215,15 @@ class TaskSetChannel:
             if status in (HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN):
                 _log.error("the master at %s refuses our secret (HTTP %d)", self._url, status)
                 return self._timeouts.backoff_refused
-            _log.warning("the master at %s answered HTTP %d", self._url, status)
+            body = bytes(error.response.body or b"")[:_MOST_SAID].decode(errors="replace").strip()
+            _log.warning("the master at %s answered HTTP %d: %s", self._url, status, body)
         except _RefusedError as error:
             _log.error("the master at %s refuses this task set: %s", self._url, error)
             return self._timeouts.backoff_refused
-        except (OSError, TimeoutError, WebSocketException) as error:
-            level = logging.INFO if self._failures == 0 else logging.DEBUG
-            _log.log(level, "no connection to the master at %s: %s", self._url, error)
+        except (OSError, TimeoutError, WebSocketException, CertificateError) as error:
+            why = explain_to_client(error)
+            level = (logging.INFO if why is None else logging.ERROR) if self._failures == 0 else logging.DEBUG
+            _log.log(level, "no connection to the master at %s: %s", self._url, why or error)
         if self._handler_failed:  # it may fail again, so not at once
             self._handler_failed = False
             return self._timeouts.backoff_refused

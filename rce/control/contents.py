@@ -20,6 +20,8 @@ from websockets.http11 import Response
 from rce.control.exceptions import ContentError
 from rce.control.timeouts import DEFAULT_TIMEOUTS, ControlTimeouts
 from rce.dialing import open_socket
+from rce.tls.exceptions import CertificateError
+from rce.tls.faults import explain_to_client
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from websockets.http11 import Request
 
     from rce.config.secret import Secret
+    from rce.tls.identity import Context
 
     ReadContent = Callable[[str, int, int], Awaitable[tuple[bytes, int] | None]]
     """Gives a piece (hash, offset, bytes) and the size of the whole; None if there is no such content."""
@@ -94,15 +97,23 @@ class ContentClient:
         port: Its port for task sets.
         secret: Proves that this is a task set of the same engine.
         timeouts: Times of this end.
+        tls: Gives the TLS context for each connection; none for a plain one.
     """
 
     def __init__(
-        self, host: str, port: int, secret: Secret, timeouts: ControlTimeouts = DEFAULT_TIMEOUTS
+        self,
+        host: str,
+        port: int,
+        secret: Secret,
+        timeouts: ControlTimeouts = DEFAULT_TIMEOUTS,
+        *,
+        tls: Context | None = None,
     ) -> None:
         self._host = host
         self._port = port
         self._secret = secret
         self._timeouts = timeouts
+        self._tls = tls
 
     async def piece(self, sha256: str, offset: int) -> Piece:
         """Fetch the piece that begins at ``offset``. Cancelling closes the connection.
@@ -113,8 +124,8 @@ class ContentClient:
         try:
             async with asyncio.timeout(self._timeouts.request):
                 status, headers, body = await self._get(f"{_PREFIX}{sha256}", offset)
-        except (OSError, TimeoutError, h11.RemoteProtocolError) as error:
-            why = str(error) or "no answer in time"
+        except (OSError, TimeoutError, h11.RemoteProtocolError, CertificateError) as error:
+            why = explain_to_client(error) or str(error) or "no answer in time"
             raise ContentError(
                 f"the master at {self._host}:{self._port} does not hand it out: {why}"
             ) from error
@@ -127,7 +138,11 @@ class ContentClient:
         return Piece(body, int(found[1]))
 
     async def _get(self, path: str, offset: int) -> tuple[int, dict[str, str], bytes]:
-        reader, writer = await asyncio.open_connection(sock=await open_socket(self._host, self._port))
+        tls = None if self._tls is None else self._tls()
+        sock = await open_socket(self._host, self._port)
+        reader, writer = await asyncio.open_connection(
+            sock=sock, ssl=tls, server_hostname=None if tls is None else self._host
+        )
         try:
             connection = h11.Connection(h11.CLIENT)
             request = h11.Request(

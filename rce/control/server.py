@@ -26,6 +26,8 @@ from rce.control.peer import Peer
 from rce.control.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, ControlTimeouts
 from rce.guard.lobby import PER_ADDRESS, Lobby
 from rce.guard.websocket import GuardedConnection, guarded
+from rce.tls.gate import TlsGate
+from rce.tls.websocket import behind_gate
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
     from rce.config.secret import Secret
     from rce.control.contents import ReadContent
     from rce.control.messages import ToMaster
+    from rce.tls.identity import Context
 
 _log = logging.getLogger(__name__)
 
@@ -65,6 +68,8 @@ class ControlServer:
         port: Port to listen on; 0 takes a free one.
         timeouts: Times of this end.
         contents: Gives contents to task sets that ask for them (:mod:`rce.control.contents`).
+        tls: Gives the TLS context for each connection, which demands the task sets' certificates; none for a
+            plain channel.
     """
 
     def __init__(
@@ -79,8 +84,11 @@ class ControlServer:
         port: int = 8080,
         timeouts: ControlTimeouts = DEFAULT_TIMEOUTS,
         contents: ReadContent | None = None,
+        tls: Context | None = None,
     ) -> None:
         self._secret = secret
+        self._tls = tls
+        self._gate: TlsGate | None = None
         self._contents = contents
         self._on_hello = on_hello
         self._on_message = on_message
@@ -106,14 +114,16 @@ class ControlServer:
         return tuple(self._peers.values())
 
     async def __aenter__(self) -> Self:
+        lobby = Lobby("task sets", per_address=STRANGERS_PER_ADDRESS)
+        connection = guarded(GuardedConnection, lobby)
+        if self._tls is not None:
+            self._gate = TlsGate("control channel", self._tls, lobby)
         self._server = await serve(
             self._serve,
             self._host,
             self._port,
             process_request=self._admit,
-            create_connection=guarded(
-                GuardedConnection, Lobby("task sets", per_address=STRANGERS_PER_ADDRESS)
-            ),
+            create_connection=behind_gate(connection, self._gate),
             origins=[None],  # no browser's page has any business here
             compression=None,
             open_timeout=self._timeouts.open,
@@ -129,6 +139,8 @@ class ControlServer:
     ) -> None:
         assert self._server is not None
         self._server.close(code=_GOING_AWAY, reason="the master is shutting down")
+        if self._gate is not None:
+            await self._gate.close()
         await self._server.wait_closed()
 
     async def _admit(self, socket: ServerConnection, request: Request) -> Response | None:

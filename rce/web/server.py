@@ -9,17 +9,18 @@ from aiohttp import web
 from yarl import URL
 
 from rce.guard.lobby import Guest, Lobby, address_of
+from rce.tls.gate import TlsGate
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
-    from ssl import SSLContext
+
+    from rce.tls.identity import Context
 
 SHUTDOWN_S = 0.5
 """How long open requests may go on when the server ends."""
 IDLE_S = 30.0
 """A connection that sends no request, or does not come to its end, for so long is closed."""
 
-_TLS_HANDSHAKE_S = 10.0
 _BACKLOG = 512
 _FIRST_ERROR = 400
 _SWEEP_EVERY = 32
@@ -32,6 +33,14 @@ class HttpServer:
     Who has no answer is a stranger, and so is who waits between requests; a connection that streams what it
     was granted is not. When there are too many strangers, those without a request are closed first.
 
+    Args:
+        app: What is served.
+        host: Address to listen on; empty for all.
+        port: 0 takes a free one.
+        tls: Gives the TLS context for each connection; none serves plain HTTP.
+        idle_timeout: Seconds without a request after which a connection is closed.
+        lobby: Where strangers are counted; one of its own if none.
+
     Attributes:
         url: Where it listens, once it does.
         lobby: The strangers.
@@ -42,7 +51,7 @@ class HttpServer:
         app: web.Application,
         host: str,
         port: int,
-        ssl: SSLContext | None = None,
+        tls: Context | None = None,
         *,
         idle_timeout: float = IDLE_S,
         lobby: Lobby | None = None,
@@ -59,7 +68,7 @@ class HttpServer:
         )
         self._host = host
         self._port = port
-        self._ssl = ssl
+        self._gate = None if tls is None else TlsGate("HTTPS", tls, self.lobby)
         self._server: asyncio.Server | None = None
         self.url = ""
 
@@ -67,28 +76,30 @@ class HttpServer:
         await self._runner.setup()
         try:
             self._server = await asyncio.get_running_loop().create_server(
-                lambda: _Arrival(self._let_in),
-                self._host or None,
-                self._port,
-                ssl=self._ssl,
-                ssl_handshake_timeout=_TLS_HANDSHAKE_S if self._ssl else None,
-                backlog=_BACKLOG,
+                self._make_arrival, self._host or None, self._port, backlog=_BACKLOG
             )
         except BaseException:
             await self._runner.cleanup()
             raise
         port = self._server.sockets[0].getsockname()[1]
         host = "127.0.0.1" if self._host in ("", "0.0.0.0", "::") else self._host  # noqa: S104 - compared, not bound
-        self.url = str(URL.build(scheme="https" if self._ssl else "http", host=host, port=port, path="/"))
+        scheme = "http" if self._gate is None else "https"
+        self.url = str(URL.build(scheme=scheme, host=host, port=port, path="/"))
         return self
 
     async def __aexit__(self, *_: object) -> None:
         assert self._server is not None
         self._server.close()
+        if self._gate is not None:
+            await self._gate.close()
         await self._runner.cleanup()
         await self._server.wait_closed()
 
     # Who comes
+
+    def _make_arrival(self) -> asyncio.Protocol:
+        arrival = _Arrival(self._let_in)
+        return arrival if self._gate is None else self._gate.guard(arrival)
 
     def _let_in(self, transport: asyncio.Transport) -> None:
         """Serve a new connection, if there is room for it."""

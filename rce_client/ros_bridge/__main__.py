@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 import uvloop
 
+from rce.cli.tls_options import Authority
 from rce.config.client import load
 from rce.config.exceptions import ConfigError, ShippedFileError
 from rce.config.logs import start_logging
@@ -21,6 +22,7 @@ from rce.config.resources import examples_dir
 from rce.ros.errors import RosError
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
+from rce.tls.exceptions import CertificateError
 from rce_client.connection import CONNECTING, Connection, State
 from rce_client.exceptions import ClientError
 from rce_client.reminder import Reminder
@@ -28,6 +30,7 @@ from rce_client.ros_bridge.bridge import build, joined_graph, wait_ready
 from rce_client.ros_bridge.plan import check, make_plan
 
 if TYPE_CHECKING:
+    import ssl
     from collections.abc import Iterable
 
     from rce.config.client import ClientConfig
@@ -52,6 +55,7 @@ def bridge(
     package_path: Annotated[
         list[Path] | None, typer.Option(help="Folder with packages that define messages; may be repeated.")
     ] = None,
+    authority: Authority = None,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log more.")] = False,
 ) -> None:
     """Join a robot's ROS graph to the engine as CONFIG says, until stopped; then remove what was made."""
@@ -70,13 +74,15 @@ def bridge(
         print(summary(read, plan))  # noqa: T201
         return
     try:
-        uvloop.run(run(read, plan, types, ros_master_uri))
-    except (ClientError, RosError) as error:
+        uvloop.run(run(read, plan, types, ros_master_uri, read.tls(authority)))
+    except (ClientError, RosError, CertificateError) as error:
         print(f"rce-ros: {error}", file=sys.stderr)  # noqa: T201
         raise typer.Exit(FAILED) from error
 
 
-async def run(config: ClientConfig, plan: Plan, types: TypeRegistry, master_uri: str) -> None:
+async def run(
+    config: ClientConfig, plan: Plan, types: TypeRegistry, master_uri: str, tls: ssl.SSLContext | None = None
+) -> None:
     """Bridge until SIGINT or SIGTERM. A second signal ends the program at once, and leaves what it made.
 
     Raises:
@@ -95,12 +101,14 @@ async def run(config: ClientConfig, plan: Plan, types: TypeRegistry, master_uri:
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, on_signal, number)
     try:
-        await serve(config, plan, types, master_uri)
+        await serve(config, plan, types, master_uri, tls)
     except asyncio.CancelledError:
         task.uncancel()
 
 
-async def serve(config: ClientConfig, plan: Plan, types: TypeRegistry, master_uri: str) -> None:
+async def serve(
+    config: ClientConfig, plan: Plan, types: TypeRegistry, master_uri: str, tls: ssl.SSLContext | None = None
+) -> None:
     """Bridge until cancelled or refused, then remove what was made."""
     conn = Connection(
         config.url,
@@ -108,6 +116,7 @@ async def serve(config: ClientConfig, plan: Plan, types: TypeRegistry, master_ur
         config.password.get_secret_value(),
         config.robot,
         token=config.token.get_secret_value(),
+        tls=tls,
         on_error=lambda text: say(f"engine: {text}"),
         on_state=partial(_tell_state, Reminder()),
     )

@@ -14,12 +14,16 @@ from typing import Annotated, Any, Protocol
 import typer
 import uvloop
 
+from rce.cli.tls_options import Authority, CertificateName, Certificates, Tls, TlsCert, TlsKey
 from rce.config.client import ClientConfig, load
 from rce.config.exceptions import ConfigError
 from rce.config.logs import start_logging
 from rce.config.resources import examples_dir
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
+from rce.tls.choice import ENGINE, TlsChoice, default_folder, plain_warning
+from rce.tls.exceptions import CertificateError
+from rce.tls.identity import Context
 from rce.web.server import HttpServer
 from rce_client.exceptions import RefusedError
 from rce_client.station.engine_watch import EngineWatch
@@ -48,20 +52,36 @@ def ui(
         str,
         typer.Option(envvar="RCE_STATION_TOKEN", help="Callers must show it; needed beyond loopback."),
     ] = "",
+    tls: Tls = False,
+    certificates: Certificates = None,
+    certificate: CertificateName = ENGINE,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+    authority: Authority = None,
 ) -> None:
     """Serve the page and the API that steer a fleet; CONFIG's planner is run in the cloud for that."""
     start_logging(logging.WARNING)
     if (config is None) == (not ros_master):
         raise typer.BadParameter("give either CONFIG or --ros-master")
     try:
-        way = RosWay(ros_master) if config is None else EngineWay(load(config))
-    except ConfigError as error:
+        way = RosWay(ros_master) if config is None else EngineWay(load(config), authority)
+        chosen = TlsChoice(
+            enabled=tls,
+            folder=certificates or default_folder(),
+            name=certificate,
+            certificate=tls_cert,
+            key=tls_key,
+        )
+        identity = chosen.for_clients()
+    except (ConfigError, CertificateError) as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(2) from None
+    if identity is None and (text := plain_warning("the station's token travels", bind)):
+        logging.getLogger(__name__).warning("%s", text)
     if not token and not _is_loopback(bind):
         raise typer.BadParameter(f"--bind {bind} opens the station to others: give it a --token")
     try:
-        uvloop.run(serve(way, bind, port, token))
+        uvloop.run(serve(way, bind, port, token, identity.server if identity else None))
     except* RefusedError as group:
         typer.echo(f"rce ui: {group.exceptions[0]}", err=True)
         raise typer.Exit(1) from None
@@ -125,8 +145,9 @@ class Way(Protocol):
 class EngineWay:
     """Through the engine, which runs the planner in a container."""
 
-    def __init__(self, config: ClientConfig) -> None:
-        self.wire = EngineWire(config)
+    def __init__(self, config: ClientConfig, authority: Path | None = None) -> None:
+        self._tls = config.tls(authority)
+        self.wire = EngineWire(config, self._tls)
         self._config = config
 
     async def watch(self, on_state: Callable[[dict[str, Any]], None]) -> None:
@@ -137,7 +158,8 @@ class EngineWay:
             on_state(state)
             self.wire.on_engine(state)
 
-        await EngineWatch(config.url, config.user, config.password.get_secret_value(), on_state=take).run()
+        password = config.password.get_secret_value()
+        await EngineWatch(config.url, config.user, password, tls=self._tls, on_state=take).run()
 
 
 class RosWay:
@@ -153,7 +175,7 @@ class RosWay:
         await GraphWatch(self._master_uri, on_state=on_state).run()
 
 
-async def serve(way: Way, bind: str, port: int, token: str) -> None:
+async def serve(way: Way, bind: str, port: int, token: str, tls: Context | None = None) -> None:
     """Serve until SIGINT or SIGTERM."""
     view, pages = FleetView(), Broadcast()
     feed = Feed(view, pages)
@@ -161,7 +183,7 @@ async def serve(way: Way, bind: str, port: int, token: str) -> None:
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    async with HttpServer(Station(view, fleet, pages, token=token).make_app(), bind, port) as server:
+    async with HttpServer(Station(view, fleet, pages, token=token).make_app(), bind, port, tls) as server:
 
         async def announce() -> None:
             typer.echo(f"rce ui ready: {server.url}")

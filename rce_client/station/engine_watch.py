@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import ssl
 from collections.abc import Callable
 from http import HTTPStatus
 from typing import Any
@@ -24,12 +25,20 @@ class EngineWatch:
         master: URL of the master.
         user: User ID.
         password: The user's password.
+        tls: TLS settings; the system's if None.
         on_state: Called with the engine's state whenever it changed; ``{"error": text}`` if out of reach.
     """
 
     def __init__(
-        self, master: str, user: str, password: str, *, on_state: Callable[[dict[str, Any]], None]
+        self,
+        master: str,
+        user: str,
+        password: str,
+        *,
+        tls: ssl.SSLContext | None = None,
+        on_state: Callable[[dict[str, Any]], None],
     ) -> None:
+        self._tls = tls
         self._api = URL(master) / "api/v1"
         self._login = {"userID": user, "password": password, "label": "operator station"}
         self._on_state = on_state
@@ -38,7 +47,10 @@ class EngineWatch:
 
     async def run(self) -> None:
         """Watch until cancelled; then give the token back."""
-        async with aiohttp.ClientSession(timeout=TIMEOUT, raise_for_status=True) as session:
+        connector = aiohttp.TCPConnector(ssl=True if self._tls is None else self._tls)
+        async with aiohttp.ClientSession(
+            timeout=TIMEOUT, raise_for_status=True, connector=connector
+        ) as session:
             try:
                 await self._watch(session)
             finally:
@@ -64,14 +76,14 @@ class EngineWatch:
             return
         headers = {"Authorization": f"Bearer {self._token}"}
         try:
-            async with session.delete(self._api / "login", headers=headers):
+            async with session.delete(self._api / "login", headers=headers, allow_redirects=False):
                 self._token = ""
         except (aiohttp.ClientError, TimeoutError) as error:
             _log.info("the token of this station was not given back, it expires by itself: %s", error)
 
     async def _read(self, session: aiohttp.ClientSession) -> dict[str, Any]:
         if not self._token:
-            async with session.post(self._api / "login", json=self._login) as reply:
+            async with session.post(self._api / "login", json=self._login, allow_redirects=False) as reply:
                 self._token = (await reply.json())["token"]
         containers, nodes, connections = [
             (await self._get(session, kind))[kind] for kind in ("containers", "nodes", "connections")
@@ -102,7 +114,10 @@ class EngineWatch:
     async def _get(self, session: aiohttp.ClientSession, kind: str) -> dict[str, Any]:
         headers = {"Authorization": f"Bearer {self._token}"}
         async with session.get(
-            self._api / kind, headers=headers, params={"user": self._login["userID"]}
+            self._api / kind,
+            headers=headers,
+            params={"user": self._login["userID"]},
+            allow_redirects=False,
         ) as reply:
             found: dict[str, Any] = await reply.json()
             return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import ssl
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -34,13 +35,15 @@ class EngineWire(PlannerWire):
 
     Args:
         config: The operator's configuration; its first container is the planner's.
+        tls: TLS settings; the system's if None.
     """
 
-    def __init__(self, config: ClientConfig) -> None:
+    def __init__(self, config: ClientConfig, tls: ssl.SSLContext | None = None) -> None:
         if not config.containers:
             raise ValueError("containers: the fleet's configuration names no container for the planner")
         super().__init__("the planner's container is not ready yet")
         self._config = config
+        self._tls = tls
         self._container = config.containers[0].tag
         self._repairs: asyncio.Queue[Request] = asyncio.Queue()
         self._listener: Listener
@@ -54,6 +57,7 @@ class EngineWire(PlannerWire):
             config.user,
             config.password.get_secret_value(),
             config.robot,
+            tls=self._tls,
             on_error=lambda text: listener.take_event(text, "bad"),
             on_state=self._on_state,
         ) as connection:

@@ -195,7 +195,9 @@ class Station:
             return _problem(401, "the station wants its token: as 'Authorization: Bearer', or ?token= once")
         response = await handler(request)
         if request.query.get("token") and not response.prepared:
-            response.set_cookie("rce_station", self._token, httponly=True, samesite="Strict")
+            response.set_cookie(
+                "rce_station", self._token, httponly=True, samesite="Strict", secure=request.secure
+            )
         return response
 
 

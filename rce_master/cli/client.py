@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import aiohttp
 import msgspec
 import typer
 
+from rce.tls.exceptions import CertificateError
+from rce.tls.faults import explain_to_client
+from rce.tls.identity import client_context
 from rce_master.cli.exceptions import ApiError, CliError
 from rce_master.events import Event
 from rce_master.exceptions import MasterError
@@ -26,6 +30,7 @@ UPLOAD_S = 300.0
 """For an answer to what was sent: the master looks through it first."""
 RETRY_S = 1.0
 _OK = 400
+_REDIRECTS = 300, 400
 
 
 class ApiClient:
@@ -34,20 +39,27 @@ class ApiClient:
     Args:
         url: Of the master's HTTP server.
         token: Bearer token; empty before the login.
+        authority: File with the authority that issued the master's certificate; the system's if empty.
     """
 
-    def __init__(self, url: str, token: str = "") -> None:
+    def __init__(self, url: str, token: str = "", *, authority: str = "") -> None:
+        self._authority = authority
         self._base = f"{url.rstrip('/')}/api/v1"
         self._headers = {"Authorization": f"Bearer {token}"} if token else {}
 
     @classmethod
     def of(cls, credentials: Credentials) -> ApiClient:
         """Make a client for a login."""
-        return cls(credentials.url, credentials.token)
+        return cls(credentials.url, credentials.token, authority=credentials.authority)
 
     async def __aenter__(self) -> Self:
         timeout = aiohttp.ClientTimeout(total=REQUEST_S)
-        self._session = aiohttp.ClientSession(headers=self._headers, timeout=timeout)
+        try:
+            tls = client_context(Path(self._authority) if self._authority else None)
+        except CertificateError as error:
+            raise CliError(str(error)) from error
+        connector = aiohttp.TCPConnector(ssl=True if tls is None else tls)
+        self._session = aiohttp.ClientSession(headers=self._headers, timeout=timeout, connector=connector)
         return self
 
     async def __aexit__(
@@ -72,10 +84,12 @@ class ApiClient:
             CliError: The master could not be reached.
         """
         try:
-            async with self._session.request(method, self._base + path, json=body, params=query) as reply:
+            async with self._session.request(
+                method, self._base + path, json=body, params=query, allow_redirects=False
+            ) as reply:
                 return await _result(reply)
         except (aiohttp.ClientError, TimeoutError, ValueError) as error:
-            raise CliError(f"cannot use the master at {self._base}: {str(error) or 'no answer'}") from error
+            raise CliError(f"cannot use the master at {self._base}: {_words(error)}") from error
 
     async def upload(self, path: str, file: BinaryIO, query: dict[str, str]) -> Any:
         """Send a file's contents.
@@ -91,11 +105,16 @@ class ApiClient:
         headers = {"Content-Type": "application/gzip"}
         try:
             async with self._session.put(
-                self._base + path, data=file, params=query, headers=headers, timeout=timeout
+                self._base + path,
+                data=file,
+                params=query,
+                headers=headers,
+                timeout=timeout,
+                allow_redirects=False,
             ) as reply:
                 return await _result(reply)
         except (aiohttp.ClientError, TimeoutError, ValueError) as error:
-            raise CliError(f"cannot use the master at {self._base}: {str(error) or 'no answer'}") from error
+            raise CliError(f"cannot use the master at {self._base}: {_words(error)}") from error
 
     async def events(self, since: int | None = None) -> AsyncIterator[Event]:
         """Follow events for ever; a stream that breaks is resumed where it broke.
@@ -114,13 +133,15 @@ class ApiClient:
                 reached = True
             except (aiohttp.ClientError, TimeoutError) as error:
                 if not reached and last is None:
-                    raise CliError(f"cannot use the master at {self._base}: {error}") from error
+                    raise CliError(f"cannot use the master at {self._base}: {_words(error)}") from error
             await asyncio.sleep(RETRY_S)
 
     async def _stream(self, last: int | None) -> AsyncIterator[Event]:
         headers = {} if last is None else {"Last-Event-ID": str(last)}
         timeout = aiohttp.ClientTimeout(total=None, sock_connect=REQUEST_S, sock_read=2 * REQUEST_S)
-        async with self._session.get(f"{self._base}/events", headers=headers, timeout=timeout) as reply:
+        async with self._session.get(
+            f"{self._base}/events", headers=headers, timeout=timeout, allow_redirects=False
+        ) as reply:
             if reply.status >= _OK:
                 await _result(reply)
             async for line in reply.content:
@@ -128,8 +149,15 @@ class ApiClient:
                     yield msgspec.json.decode(line[6:], type=Event)
 
 
+def _words(error: Exception) -> str:
+    return explain_to_client(error) or str(error) or "no answer"
+
+
 async def _result(reply: aiohttp.ClientResponse) -> Any:
     text = await reply.text()
+    if reply.status in range(*_REDIRECTS):
+        where = reply.headers.get("Location", "nowhere")
+        raise ApiError(reply.status, f"the answer leads to {where}; log in there: rce login URL")
     if reply.status < _OK:
         return msgspec.json.decode(text) if text else None
     with contextlib.suppress(msgspec.MsgspecError, KeyError, TypeError):

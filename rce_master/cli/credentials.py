@@ -23,6 +23,8 @@ class Credentials(Struct, frozen=True, kw_only=True):
     token: str
     expires: float
     """Seconds since 1970."""
+    authority: str = ""
+    """File with the authority that issued the master's certificate; the system's authorities if empty."""
 
     def __repr__(self) -> str:
         return f"Credentials(url={self.url!r}, user={self.user!r})"

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from rce.cli.tls_options import Authority
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
 from rce_master.cli.exceptions import ApiError, CliError
@@ -20,19 +21,23 @@ def login(
     *,
     user: Annotated[str, typer.Option("--user", "-u", prompt=True, help="User name.")],
     password_stdin: Annotated[bool, typer.Option(help="Read the password from standard input.")] = False,
+    authority: Authority = None,
 ) -> None:
     """Log in at a master and keep the token for the other commands."""
-    run(_login(url, user, read_password(from_stdin=password_stdin)))
+    file = "" if authority is None else str(authority.absolute())
+    run(_login(url, user, read_password(from_stdin=password_stdin), file))
 
 
-async def _login(url: str, user: str, password: str) -> None:
-    async with ApiClient(url) as client:
+async def _login(url: str, user: str, password: str, authority: str) -> None:
+    async with ApiClient(url, authority=authority) as client:
         reply = await client.call(
             "POST", "/login", {"userID": user, "password": password, "label": "rce login"}
         )
         await _give_back(url)
     file = credentials.save(
-        credentials.Credentials(url=url, user=user, token=reply["token"], expires=reply["expires"])
+        credentials.Credentials(
+            url=url, user=user, token=reply["token"], expires=reply["expires"], authority=authority
+        )
     )
     typer.echo(f"logged in as {user} ({reply['role']}); the token is in {file}")
 

@@ -19,6 +19,7 @@ from rce.config.settings import (
     MasterSettings,
     RobotSettings,
     Runtime,
+    TlsSettings,
 )
 from rce_container.__main__ import OPTIONS as CONTAINER
 from rce_container.__main__ import app as container
@@ -48,6 +49,13 @@ SETTINGS = EngineSettings(
         max_cpu=1.5,
         max_memory=5,
         trusted_proxies=("10.0.0.0/8",),
+    ),
+    tls=TlsSettings(
+        enabled=True,
+        certificates=Path("/c"),
+        name="cloud",
+        cert=Path("/public.pem"),
+        key=Path("/public.key"),
     ),
     robot=RobotSettings(count=2, public_host="robots.example.org", origins=("https://a.example",)),
     container=ContainerSettings(

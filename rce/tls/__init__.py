@@ -1,0 +1,1 @@
+"""TLS for every connection of the engine: certificates, contexts, and servers that answer in TLS."""

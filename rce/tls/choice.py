@@ -1,0 +1,107 @@
+"""Which certificates a program uses: what the options ``--tls``, ``--certificates``, ... come to."""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from rce.config.folders import default_state_dir
+from rce.tls.exceptions import CertificateError
+from rce.tls.identity import TlsFiles, TlsIdentity
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from rce.config.settings import EngineSettings
+
+ENGINE = "engine"
+"""Name of the certificate that an engine's programs use if nothing else was said."""
+FOLDER = "certificates"
+WARNED_VARIABLE = "RCE_TLS_WARNED"
+"""Set for programs whose starter has warned already."""
+
+
+def default_folder() -> Path:
+    """Return where certificates are kept if nothing else was said."""
+    return default_state_dir() / FOLDER
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TlsChoice:
+    """What a program was told of TLS."""
+
+    enabled: bool = False
+    """Use TLS everywhere, with certificates of the engine's own authority."""
+    folder: Path = field(default_factory=default_folder)
+    name: str = ENGINE
+    certificate: Path | None = None
+    """Show clients this certificate, of a public authority for example; alone it gives TLS to them only."""
+    key: Path | None = None
+
+    @classmethod
+    def of(cls, settings: EngineSettings) -> TlsChoice:
+        """Read it from the engine's settings."""
+        tls = settings.tls
+        return cls(
+            enabled=tls.enabled,
+            folder=settings.certificates,
+            name=tls.name,
+            certificate=tls.cert,
+            key=tls.key,
+        )
+
+    def for_clients(self) -> TlsIdentity | None:
+        """Return what a server shows to clients, robots and browsers; None for a plain one.
+
+        Raises:
+            CertificateError: The files cannot be used.
+        """
+        if self.certificate is None:
+            if self.key is not None:
+                raise CertificateError("a TLS key needs its certificate: give --tls-cert too")
+            identity = TlsIdentity(self._own()) if self.enabled else None
+        else:
+            identity = TlsIdentity(TlsFiles(certificate=self.certificate, key=self.key))
+        if identity is not None:
+            identity.server()
+        return identity
+
+    def for_task_sets(self) -> TlsIdentity | None:
+        """Return what task sets show each other; None for plain connections.
+
+        Raises:
+            CertificateError: The files cannot be used.
+        """
+        if not self.enabled:
+            return None
+        identity = TlsIdentity(self._own())
+        identity.mutual_server()
+        return identity
+
+    def _own(self) -> TlsFiles:
+        authority = self.folder / "authority.pem"
+        return TlsFiles(self.folder / f"{self.name}.pem", self.folder / f"{self.name}.key", authority)
+
+
+def plain_warning(what: str, *hosts: str) -> str | None:
+    """Return the warning of a program that serves other machines without TLS; None if there is no reason.
+
+    Args:
+        what: What travels in clear.
+        hosts: The addresses that it listens on without TLS.
+    """
+    open_ones = [host or "all addresses" for host in hosts if not is_loopback(host)]
+    if not open_ones or os.environ.get(WARNED_VARIABLE):
+        return None
+    where = ", ".join(dict.fromkeys(open_ones))
+    return f"{what} in clear: this listens on {where} without TLS; start it with --tls (docs/how-to/tls.md)"
+
+
+def is_loopback(host: str) -> bool:
+    """Tell whether an address is reached from this machine only."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -1,0 +1,184 @@
+"""Take TLS connections in: a server's protocol sees one only after its handshake.
+
+asyncio's own TLS servers tell of no handshake that fails, and count no connection while it lasts. Here an
+accepted connection waits in a lobby until its handshake is done; one that fails is one line in the log, and a
+client that speaks plain HTTP is told so.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import socket
+from typing import TYPE_CHECKING, cast
+
+from rce.guard.lobby import address_of
+from rce.tls.exceptions import CertificateError
+from rce.tls.faults import explain_to_server
+
+if TYPE_CHECKING:
+    from rce.guard.lobby import Lobby
+    from rce.tls.identity import Context
+
+_log = logging.getLogger(__name__)
+
+HANDSHAKE_S = 10.0
+"""From an accepted connection to the end of its handshake."""
+_SHUTDOWN_S = 1.0
+"""For the other end's farewell."""
+_HANDSHAKE_RECORD = 0x16
+"""First byte of a TLS client."""
+_COMPLAIN_EVERY_S = 10.0
+"""The log is told of an address at most so often."""
+_MAX_COMPLAINTS = 1024
+_TEXT = b"This port speaks TLS only: use https:// or wss://\n"
+_PLAIN_ANSWER = (
+    b"HTTP/1.1 400 Bad Request\r\nContent-Type: text/plain\r\nConnection: close\r\n"
+    b"Content-Length: %d\r\n\r\n%b" % (len(_TEXT), _TEXT)
+)
+
+
+class TlsGate:
+    """Does the handshakes of one server.
+
+    Args:
+        name: What is served, for the log.
+        context: Gives the context for the next connection.
+        lobby: Where connections wait until their handshake is done.
+    """
+
+    def __init__(self, name: str, context: Context, lobby: Lobby) -> None:
+        self._name = name
+        self._context = context
+        self._lobby = lobby
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._complaints: dict[str, float] = {}
+        self._closed = False
+
+    def guard(self, protocol: asyncio.Protocol) -> asyncio.Protocol:
+        """Return what ``loop.create_server`` is to have in place of ``protocol``."""
+        return _Arrival(self, protocol)
+
+    async def close(self) -> None:
+        """End the handshakes that go on."""
+        self._closed = True
+        tasks = list(self._tasks)
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            await asyncio.wait(tasks)
+
+    def take(self, transport: asyncio.BaseTransport, protocol: asyncio.Protocol) -> None:
+        """Take the socket of an accepted connection over, and shake hands on it."""
+        accepted = transport.get_extra_info("socket")
+        sock = None if self._closed else socket.socket(fileno=os.dup(accepted.fileno()))
+        address = address_of(transport.get_extra_info("peername"))
+        cast("asyncio.Transport", transport).abort()  # uvloop's only behave like one
+        if sock is not None:
+            task = asyncio.get_running_loop().create_task(self._run(sock, protocol, address))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+
+    async def _run(self, sock: socket.socket, protocol: asyncio.Protocol, address: str) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        guest = self._lobby.enter(address, task.cancel)
+        if guest is None:
+            sock.close()
+            return
+        try:
+            async with asyncio.timeout(HANDSHAKE_S):
+                first = await _first_byte(sock)
+                if first == _HANDSHAKE_RECORD:
+                    await self._shake_hands(sock, protocol)
+                elif first is not None:
+                    self._complain(address, "it does not speak TLS")
+                    with contextlib.suppress(OSError):
+                        sock.send(_PLAIN_ANSWER)
+                        sock.shutdown(socket.SHUT_WR)
+                        await _discard(sock)
+        except (OSError, EOFError, TimeoutError, CertificateError) as error:
+            self._complain(address, "no handshake in time" if _is_late(error) else explain_to_server(error))
+        finally:
+            guest.leave()
+            sock.close()
+
+    async def _shake_hands(self, sock: socket.socket, protocol: asyncio.Protocol) -> None:
+        context = self._context()
+        # The transport owns this one and closes it in its own time; the other one is closed here.
+        own = socket.socket(fileno=os.dup(sock.fileno()))
+        own.setblocking(False)
+        try:
+            await asyncio.get_running_loop().connect_accepted_socket(
+                lambda: protocol,
+                own,
+                ssl=context,
+                ssl_handshake_timeout=HANDSHAKE_S,
+                ssl_shutdown_timeout=_SHUTDOWN_S,
+            )
+        except BaseException:
+            with contextlib.suppress(OSError):
+                sock.shutdown(socket.SHUT_RDWR)
+            raise
+
+    def _complain(self, address: str, why: str) -> None:
+        now = asyncio.get_running_loop().time()
+        if now - self._complaints.get(address, -_COMPLAIN_EVERY_S) < _COMPLAIN_EVERY_S:
+            return
+        if len(self._complaints) >= _MAX_COMPLAINTS:
+            self._complaints.clear()
+        self._complaints[address] = now
+        _log.warning("%s: a client at %s was not taken: %s", self._name, address or "this machine", why)
+
+
+class _Arrival(asyncio.Protocol):
+    """A connection's protocol until its handshake."""
+
+    def __init__(self, gate: TlsGate, protocol: asyncio.Protocol) -> None:
+        self._gate = gate
+        self._protocol = protocol
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._gate.take(transport, self._protocol)
+
+
+async def _first_byte(sock: socket.socket) -> int | None:
+    """Wait for the first byte and leave it there; None if the peer hung up."""
+    sock.setblocking(False)
+    while True:
+        try:
+            data = sock.recv(1, socket.MSG_PEEK)
+        except BlockingIOError:
+            await _readable(sock)
+        else:
+            return data[0] if data else None
+
+
+async def _discard(sock: socket.socket) -> None:
+    """Read until the peer hangs up, so that what it was told is not lost by a reset."""
+    loop = asyncio.get_running_loop()
+    with contextlib.suppress(OSError, TimeoutError):
+        async with asyncio.timeout(_SHUTDOWN_S):
+            while await loop.sock_recv(sock, 1 << 16):
+                pass
+
+
+async def _readable(sock: socket.socket) -> None:
+    loop = asyncio.get_running_loop()
+    ready: asyncio.Future[None] = loop.create_future()
+    loop.add_reader(sock, _resolve, ready)
+    try:
+        await ready
+    finally:
+        loop.remove_reader(sock)
+
+
+def _resolve(ready: asyncio.Future[None]) -> None:
+    if not ready.done():
+        ready.set_result(None)
+
+
+def _is_late(error: BaseException) -> bool:
+    return isinstance(error, TimeoutError) or "handshake is taking longer" in str(error)

@@ -1,0 +1,180 @@
+"""A program's certificate as TLS contexts, which follow the files: a renewed certificate needs no restart."""
+
+from __future__ import annotations
+
+import logging
+import ssl
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+from rce.tls.exceptions import CertificateError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+_log = logging.getLogger(__name__)
+
+Context: TypeAlias = "Callable[[], ssl.SSLContext]"
+"""Gives the context for the next connection."""
+_Signature: TypeAlias = "tuple[tuple[int, int, int] | None, ...]"
+
+
+@dataclass(frozen=True, slots=True)
+class TlsFiles:
+    """The files of one end. Each is optional where its use allows it."""
+
+    certificate: Path | None = None
+    key: Path | None = None
+    authority: Path | None = None
+    """Whose certificates the other end may have; the system's authorities if None."""
+
+
+class TlsIdentity:
+    """Makes contexts from files, and makes them anew when the files have changed.
+
+    The files are looked at when a connection begins. New ones that cannot be used are complained of once, and
+    the last good ones stay in use.
+
+    Args:
+        files: Where everything is.
+
+    Example::
+
+        identity = TlsIdentity(TlsFiles(certificate, key, authority))
+        reader, writer = await asyncio.open_connection(host, port, ssl=identity.client())
+    """
+
+    def __init__(self, files: TlsFiles) -> None:
+        self.files = files
+        self._contexts: dict[str, tuple[_Signature, ssl.SSLContext]] = {}
+        self._bad: dict[str, _Signature] = {}
+
+    def server(self) -> ssl.SSLContext:
+        """Return the context of a server that asks clients for no certificate.
+
+        Raises:
+            CertificateError: The files cannot be used, and never could.
+        """
+        return self._get("server", self._make_server)
+
+    def mutual_server(self) -> ssl.SSLContext:
+        """Return the context of a server that demands a certificate of the authority.
+
+        Raises:
+            CertificateError: The files cannot be used, and never could.
+        """
+        return self._get("mutual", self._make_mutual)
+
+    def client(self) -> ssl.SSLContext:
+        """Return the context of a client; it shows the certificate if there is one.
+
+        Raises:
+            CertificateError: The files cannot be used, and never could.
+        """
+        return self._get("client", self._make_client)
+
+    def _get(self, role: str, make: Callable[[], ssl.SSLContext]) -> ssl.SSLContext:
+        now = self._signature()
+        signature, context = self._contexts.get(role, (None, None))
+        if context is not None and signature == now:
+            return context
+        try:
+            made = make()
+        except CertificateError as error:
+            if context is None:
+                raise
+            if self._bad.get(role) != now:
+                self._bad[role] = now
+                _log.warning("the former certificate stays in use: %s", error)
+            return context
+        if context is not None:
+            _log.info("loaded the changed certificate %s", self.files.certificate or self.files.authority)
+        self._contexts[role] = now, made
+        return made
+
+    def _signature(self) -> _Signature:
+        files = self.files
+        return tuple(_stamp(file) for file in (files.certificate, files.key, files.authority))
+
+    def _make_server(self) -> ssl.SSLContext:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        self._load_certificate(context)
+        return context
+
+    def _make_mutual(self) -> ssl.SSLContext:
+        context = self._make_server()
+        context.minimum_version = ssl.TLSVersion.TLSv1_3
+        context.verify_mode = ssl.CERT_REQUIRED
+        self._trust(context)
+        return context
+
+    def _make_client(self) -> ssl.SSLContext:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        self._trust(context)
+        if self.files.certificate is not None:
+            self._load_certificate(context)
+        return context
+
+    def _trust(self, context: ssl.SSLContext) -> None:
+        authority = self.files.authority
+        if authority is None:
+            context.load_default_certs()
+            return
+        try:
+            context.load_verify_locations(authority)
+        except (OSError, ssl.SSLError) as error:
+            raise CertificateError(
+                f"cannot use the authority {authority}: {_reason(error)};"
+                " copy authority.pem from the engine's certificates folder"
+            ) from error
+
+    def _load_certificate(self, context: ssl.SSLContext) -> None:
+        certificate, key = self.files.certificate, self.files.key
+        if certificate is None:
+            raise CertificateError("a TLS server needs a certificate; make one: rce certificate issue NAME")
+        try:
+            context.load_cert_chain(certificate, key, _no_password)
+        except (OSError, ssl.SSLError) as error:
+            missing = next(
+                (file for file in (certificate, key) if file is not None and not file.exists()), None
+            )
+            if missing is not None:
+                raise CertificateError(
+                    f"{missing} does not exist;"
+                    " make it (rce certificate issue NAME) or copy it from the engine"
+                ) from error
+            raise CertificateError(f"cannot use the certificate {certificate}: {_reason(error)}") from error
+
+
+def client_context(authority: Path | None) -> ssl.SSLContext | None:
+    """Return a client's context that trusts one authority only; None, which means the system's, without one.
+
+    Raises:
+        CertificateError: The authority cannot be used.
+    """
+    return None if authority is None else TlsIdentity(TlsFiles(authority=authority)).client()
+
+
+def _no_password() -> str:
+    """Keep OpenSSL from asking at the terminal for the password of an encrypted key."""
+    return ""
+
+
+def _stamp(file: Path | None) -> tuple[int, int, int] | None:
+    if file is None:
+        return None
+    try:
+        found = file.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size, found.st_ino
+
+
+def _reason(error: OSError) -> str:
+    if isinstance(error, ssl.SSLError):
+        known = {"KEY_VALUES_MISMATCH": "its key belongs to another certificate"}
+        return known.get(error.reason or "", str(error.reason or error))
+    return error.strerror or str(error)

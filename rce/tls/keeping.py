@@ -1,0 +1,69 @@
+"""Have the certificates of an engine that ``rce up`` runs: made at first, renewed while it runs."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING
+
+from rce.tls.exceptions import CertificateError
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from rce.config.settings import EngineSettings
+
+CHECK_EVERY_S = 6 * 3600.0
+
+
+@contextlib.asynccontextmanager
+async def keep_certificates(settings: EngineSettings, say: Callable[[str], None]) -> AsyncIterator[None]:
+    """Keep the engine's certificate good while the context lasts. Does nothing for an engine without TLS.
+
+    Args:
+        settings: Of the engine.
+        say: Told what was made or renewed.
+
+    Raises:
+        CertificateError: The certificates cannot be made.
+    """
+    if not settings.tls.enabled:
+        yield
+        return
+    if done := await asyncio.to_thread(ensure, settings):
+        say(done)
+    task = asyncio.create_task(_keep(settings, say))
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.wait([task])
+
+
+def ensure(settings: EngineSettings) -> str:
+    """Make what is missing of the engine's certificates; blocks.
+
+    Returns:
+        What was done, in words; empty if nothing.
+
+    Raises:
+        CertificateError: They cannot be made.
+    """
+    from rce.tls.folder import CertificateFolder  # takes 10 MB, which only engines with TLS spend
+    from rce.tls.hosts import own_hosts
+
+    binds = (settings.master.bind, settings.robot.bind, settings.container.bind)
+    named = (settings.master_host, settings.robot.public_host or "", *binds)
+    folder = CertificateFolder(settings.certificates.absolute())
+    return folder.ensure(settings.tls.name, own_hosts(named))
+
+
+async def _keep(settings: EngineSettings, say: Callable[[str], None]) -> None:
+    while True:
+        await asyncio.sleep(CHECK_EVERY_S)
+        try:
+            done = await asyncio.to_thread(ensure, settings)
+        except CertificateError as error:
+            done = f"cannot renew certificates: {error}"
+        if done:
+            say(done)

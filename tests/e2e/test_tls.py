@@ -1,0 +1,359 @@
+"""An engine with ``rce up --tls``, seen by programs that are not of its making: curl, openssl, aiohttp."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import json
+import os
+import signal
+import ssl
+import sys
+import tempfile
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+import pytest_asyncio
+from support.engine import engine_processes, free_ports, until
+
+from rce.tls.folder import CertificateFolder
+from rce_client import Connection
+from rce_client.exceptions import RefusedError
+
+pytestmark = [pytest.mark.e2e, pytest.mark.timeout(240)]
+
+BIN = Path(sys.executable).parent
+START_S = 120.0
+STRING = "std_msgs/String"
+
+
+class World:
+    """``rce up --dev --tls``, and what its files and ports are."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.http, self.control, self.robots, *self.links = free_ports(5)
+        self.log = folder / "log"
+        self.certificates = CertificateFolder(folder / "state" / "certificates")
+        kept = {key: value for key, value in os.environ.items() if not key.startswith(("RCE_", "ROS_"))}
+        self.env = kept | {"XDG_RUNTIME_DIR": str(folder), "RCE_LOGIN_FILE": str(folder / "login")}
+        self.process: asyncio.subprocess.Process | None = None
+
+    @property
+    def url(self) -> str:
+        return f"https://127.0.0.1:{self.http}/"
+
+    @property
+    def authority(self) -> str:
+        return str(self.certificates.authority)
+
+    def trusting(self) -> ssl.SSLContext:
+        return ssl.create_default_context(cafile=self.authority)
+
+    def output(self) -> str:
+        return self.log.read_text(errors="replace") if self.log.exists() else ""
+
+    async def start(self) -> None:
+        ports = {
+            "http-port": self.http,
+            "control-port": self.control,
+            "ws-port": self.robots,
+            "robot-link-port": self.links[0],
+            "container-link-port": self.links[1],
+        }
+        options = [text for name, port in ports.items() for text in (f"--{name}", str(port))]
+        state = ["--state-dir", str(self.folder / "state"), "--runtime", "process"]
+        with self.log.open("ab") as log:
+            self.process = await asyncio.create_subprocess_exec(
+                *(str(BIN / "rce"), "up", "--dev", "--tls", *state, *options),
+                stdin=asyncio.subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                env=self.env,
+                start_new_session=True,
+            )
+
+        def is_ready() -> bool:
+            assert self.process is not None
+            assert self.process.returncode is None, self.output()
+            return "RCE ready" in self.output() and "task_set_connected container" in self.output()
+
+        await until(is_ready, timeout=START_S, what="rce up --tls is ready")
+
+    async def stop(self) -> None:
+        assert self.process is not None
+        if self.process.returncode is None:
+            self.process.send_signal(signal.SIGINT)
+        await self.process.wait()
+        assert not engine_processes(self.folder)
+
+    async def run(self, *argv: object, text: str = "") -> tuple[int, str]:
+        """Run a program to its end.
+
+        Returns:
+            Its exit code and all that it wrote.
+        """
+        process = await asyncio.create_subprocess_exec(
+            *map(str, argv),
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.STDOUT,
+            env=self.env,
+        )
+        output, _ = await process.communicate(text.encode())
+        assert process.returncode is not None
+        return process.returncode, output.decode()
+
+    async def curl(self, *arguments: object) -> tuple[int, str]:
+        return await self.run("curl", "-sS", "-m", "20", *arguments)
+
+    async def says(self, *words: str) -> None:
+        """Wait until one line of the engine's log holds all these words."""
+        await until(
+            lambda: any(all(word in line for word in words) for line in self.output().splitlines()),
+            timeout=30,
+            what=f"the log says {words}\n{self.output()[-3000:]}",
+        )
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def shared_engine() -> AsyncIterator[World]:
+    with tempfile.TemporaryDirectory(prefix="rce-", dir="/tmp") as folder:
+        found = World(Path(folder))
+        await found.start()
+        try:
+            yield found
+            assert "Traceback" not in found.output()
+        finally:
+            await found.stop()
+
+
+@pytest.fixture
+def world(shared_engine: World) -> World:
+    return shared_engine
+
+
+in_world = pytest.mark.asyncio(loop_scope="module")
+
+
+@contextlib.asynccontextmanager
+async def stranger(world: World) -> AsyncIterator[aiohttp.ClientWebSocketResponse]:
+    """A robot by aiohttp, which shares no code with the engine's client."""
+    async with aiohttp.ClientSession(connector=aiohttp.TCPConnector(ssl=world.trusting())) as session:
+        query = {"userID": "testUser", "version": "20130902"}
+        async with session.get(world.url, params=query) as reply:
+            url = (await reply.json(content_type=None))["url"]
+        assert url == f"wss://127.0.0.1:{world.robots}/"
+        login = {"userID": "testUser", "robotID": "stranger"}
+        login["password"] = hashlib.sha256(b"testUser").hexdigest()
+        async with session.ws_connect(url, params=login) as socket:
+            yield socket
+
+
+def frame(type_: str, **data: Any) -> str:
+    return json.dumps({"type": type_, "data": data})
+
+
+async def make_echo(socket: aiohttp.ClientWebSocketResponse) -> None:
+    """Have a container with a node that hands the robot's messages back."""
+    await socket.send_str(frame("CC", containerTag="echo"))
+    kinds = [("up", "SubscriberConverter", ""), ("down", "PublisherConverter", "")]
+    inside = [
+        ("in", "PublisherInterface", "/stringEchoReq"),
+        ("out", "SubscriberInterface", "/stringEchoResp"),
+    ]
+    await socket.send_str(
+        frame(
+            "CN",
+            addNodes=[{"containerTag": "echo", "nodeTag": "echo", "pkg": "Test", "exe": "stringEcho.py"}],
+            addInterfaces=[
+                {
+                    "endpointTag": end,
+                    "interfaceTag": tag,
+                    "interfaceType": kind,
+                    "className": STRING,
+                    "addr": addr,
+                }
+                for end, items in (("stranger", kinds), ("echo", inside))
+                for tag, kind, addr in items
+            ],
+        )
+    )
+    pairs = [("stranger/up", "echo/in"), ("echo/out", "stranger/down")]
+    await socket.send_str(frame("CX", connect=[{"tagA": a, "tagB": b} for a, b in pairs]))
+
+
+async def await_message(socket: aiohttp.ClientWebSocketResponse, text: str) -> None:
+    """Send a text again and again until it comes back."""
+    async with asyncio.timeout(60):
+        while True:
+            await socket.send_str(frame("DM", iTag="up", type=STRING, msgID="nil", msg={"data": text}))
+            with contextlib.suppress(TimeoutError):
+                while True:
+                    message = json.loads(await socket.receive_str(timeout=1.0))
+                    if message["type"] == "DM" and message["data"]["msg"]["data"] == text:
+                        return
+
+
+@in_world
+async def test_curl_with_the_authority_is_served(world: World) -> None:
+    code, text = await world.curl(
+        "--cacert", world.authority, f"{world.url}?userID=testUser&version=20130902"
+    )
+    assert (code, json.loads(text)) == (0, {"url": f"wss://127.0.0.1:{world.robots}/"})
+
+
+@in_world
+async def test_curl_without_the_authority_refuses(world: World) -> None:
+    """And the engine's log has one line of it."""
+    code, text = await world.curl(world.url)
+    assert code == 60, text
+    await world.says("HTTPS: a client at 127.0.0.1 was not taken")
+
+
+@in_world
+async def test_robot_by_aiohttp_gets_its_message_back(world: World) -> None:
+    async with stranger(world) as socket:
+        await make_echo(socket)
+        await await_message(socket, "over TLS")
+        await socket.send_str(frame("DC", containerTag="echo"))
+
+
+@in_world
+@pytest.mark.parametrize("port", ["http", "robots", "control"])
+async def test_plain_client_is_told_to_use_tls(world: World, port: str) -> None:
+    code, text = await world.curl(f"http://127.0.0.1:{getattr(world, port)}/")
+    assert (code, text) == (0, "This port speaks TLS only: use https:// or wss://\n")
+
+
+@in_world
+async def test_our_programs_name_the_fault_of_a_wrong_authority(world: World, tmp_path: Path) -> None:
+    other = CertificateFolder(tmp_path)
+    other.make_authority()
+    arguments = ("login", "-u", "testUser", "--password-stdin", world.url)
+    code, text = await world.run(BIN / "rce", *arguments, "--authority", other.authority, text="testUser\n")
+    assert code == 1
+    assert "the server's certificate is not trusted" in text
+    assert "--authority FILE" in text
+    with pytest.raises(RefusedError, match="--authority FILE"):
+        async with Connection(world.url, "testUser", "testUser", "r"):
+            pass
+
+
+@in_world
+async def test_login_keeps_the_authority_for_other_commands(world: World) -> None:
+    arguments = ("login", "-u", "testUser", "--password-stdin", world.url, "--authority", world.authority)
+    code, text = await world.run(BIN / "rce", *arguments, text="testUser\n")
+    assert code == 0, text
+    code, text = await world.run(BIN / "rce", "user", "list")
+    assert code == 0, text
+    assert "testUser" in text
+
+
+@in_world
+async def test_program_without_its_certificate_says_how_to_make_it(world: World) -> None:
+    code, text = await world.run(
+        *(BIN / "rce-robot", "127.0.0.1", "--dev", "--tls", "--certificate", "nobody"),
+        *("--certificates", world.certificates.path),
+    )
+    assert code == 1
+    assert "nobody.pem does not exist; make it (rce certificate issue NAME)" in text
+
+
+@in_world
+async def test_certificate_for_another_name_is_refused(world: World) -> None:
+    """The engine is asked by a name that is in no certificate, as ``curl --resolve`` can."""
+    where = f"elsewhere.example:{world.http}"
+    code, text = await world.curl(
+        *("--cacert", world.authority, "--resolve", f"{where}:127.0.0.1", f"https://{where}/")
+    )
+    assert code == 60, text
+    assert "elsewhere.example" in text
+
+
+@in_world
+@pytest.mark.parametrize("certificate", ["none", "stranger's"])
+async def test_task_set_without_certificate_of_the_authority_is_refused(
+    world: World, tmp_path: Path, certificate: str
+) -> None:
+    """Although it knows the secret: the handshake ends before it can show one."""
+    secret = world.folder / "rce" / "dev-secret"
+    other = CertificateFolder(tmp_path)
+    other.make_authority()
+    other.issue("stranger", ("127.0.0.1",))
+    own = ["--cert", other.certificate("stranger"), "--key", other.key("stranger")]
+    code, text = await world.curl(
+        *("--cacert", world.authority, "-H", f"Authorization: Bearer {secret.read_text().strip()}"),
+        *(own if certificate == "stranger's" else []),
+        *("-H", "Connection: Upgrade", "-H", "Upgrade: websocket", "-H", "Sec-WebSocket-Version: 13"),
+        *("-H", "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==", f"https://127.0.0.1:{world.control}/"),
+    )
+    assert code != 0
+    assert "101" not in text
+    await world.says("control channel: a client at 127.0.0.1 was not taken")
+
+
+@in_world
+async def test_task_set_with_certificate_and_wrong_secret_is_refused(world: World) -> None:
+    own = world.certificates
+    code, text = await world.curl(
+        *("--cacert", world.authority, "--cert", own.certificate("engine"), "--key", own.key("engine")),
+        *("-H", "Authorization: Bearer wrong-secret", f"https://127.0.0.1:{world.control}/"),
+    )
+    assert (code, text) == (0, "Task sets prove themselves by the engine's secret.\n")
+
+
+@in_world
+async def test_renewed_certificate_is_used_without_restart(world: World) -> None:
+    """Connections that are there go on with the old one; traffic flows the whole time."""
+
+    async def serial(port: int) -> str:
+        code, text = await world.run(
+            *(
+                "openssl",
+                "s_client",
+                "-connect",
+                f"127.0.0.1:{port}",
+                "-CAfile",
+                world.authority,
+                "-showcerts",
+            )
+        )
+        assert code == 0, text
+        assert "Verify return code: 0" in text
+        return text[text.index("BEGIN CERTIFICATE") : text.index("END CERTIFICATE")]
+
+    async with stranger(world) as socket:
+        await make_echo(socket)
+        await await_message(socket, "before")
+        before = {port: await serial(port) for port in (world.http, world.robots)}
+        code, text = await world.run(
+            *(BIN / "rce", "certificate", "issue", "engine", "--certificates", world.certificates.path)
+        )
+        assert code == 0, text
+        await await_message(socket, "on the old connection")
+        for port, old in before.items():
+            assert await serial(port) != old
+        await await_message(socket, "after")
+        await socket.send_str(frame("DC", containerTag="echo"))
+    async with stranger(world) as socket:
+        await socket.send_str(frame("DC", containerTag="echo"))
+
+
+@in_world
+async def test_expired_certificate_is_named(world: World) -> None:
+    """The last test of this world: clients refuse, and the engine's programs say what to do."""
+    hosts = world.certificates.details("engine").hosts
+    world.certificates.issue("engine", hosts, days=-1)
+    try:
+        with pytest.raises(RefusedError, match="has expired; renew it there: rce certificate issue NAME"):
+            async with Connection(world.url, "testUser", "testUser", "r", tls=world.trusting()):
+                pass
+    finally:
+        world.certificates.issue("engine", hosts)
+    async with Connection(world.url, "testUser", "testUser", "r", tls=world.trusting()) as connection:
+        assert connection.connected

@@ -1,0 +1,142 @@
+"""An authority, what it issues, and the folder that holds them."""
+
+from __future__ import annotations
+
+import ssl
+import stat
+from pathlib import Path
+
+import pytest
+
+from rce.tls.authority import Issued, is_signed_by, issue, make_authority, read_details
+from rce.tls.exceptions import CertificateError
+from rce.tls.folder import AUTHORITY, CertificateFolder
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> CertificateFolder:
+    found = CertificateFolder(tmp_path / "certificates")
+    found.make_authority()
+    return found
+
+
+def shake_hands(server: ssl.SSLContext, client: ssl.SSLContext, host: str) -> None:
+    """Do a whole handshake in memory; raises what either side does."""
+    to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
+    ends = [
+        client.wrap_bio(to_client, to_server, server_hostname=host),
+        server.wrap_bio(to_server, to_client, server_side=True),
+    ]
+    done: set[int] = set()
+    while len(done) < len(ends):
+        for index, end in enumerate(ends):
+            try:
+                end.do_handshake()
+                done.add(index)
+            except ssl.SSLWantReadError:
+                continue
+    ends[0].write(b"x")
+    assert ends[1].read(1) == b"x"
+
+
+def contexts(folder: CertificateFolder, name: str) -> tuple[ssl.SSLContext, ssl.SSLContext]:
+    server = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH, cafile=folder.authority)
+    server.verify_mode = ssl.CERT_REQUIRED
+    server.load_cert_chain(folder.certificate(name), folder.key(name))
+    client = ssl.create_default_context(cafile=folder.authority)
+    client.verify_flags |= ssl.VERIFY_X509_STRICT
+    client.load_cert_chain(folder.certificate(name), folder.key(name))
+    return server, client
+
+
+@pytest.mark.parametrize("host", ["robots.example.org", "10.0.0.7", "::1", "a.wild.example.org"])
+def test_issued_certificate_proves_its_hosts(folder: CertificateFolder, host: str) -> None:
+    """Strict rules of RFC 5280 included, as newer Pythons apply them."""
+    folder.issue("cloud", ("robots.example.org", "10.0.0.7", "[::1]", "*.wild.example.org"))
+    shake_hands(*contexts(folder, "cloud"), host)
+    assert folder.details("cloud").covers(host)
+    with pytest.raises(ssl.SSLCertVerificationError):
+        shake_hands(*contexts(folder, "cloud"), "elsewhere.example.org")
+    assert not folder.details("cloud").covers("elsewhere.example.org")
+
+
+def test_files_are_private_and_complete(folder: CertificateFolder) -> None:
+    folder.issue("cloud")
+    assert stat.S_IMODE(folder.path.stat().st_mode) == 0o700
+    files = {file.name: stat.S_IMODE(file.stat().st_mode) for file in folder.path.iterdir()}
+    assert files == dict.fromkeys(("authority.pem", "authority.key", "cloud.pem", "cloud.key"), 0o600)
+
+
+def test_second_authority_is_refused(folder: CertificateFolder) -> None:
+    before = folder.authority.read_bytes()
+    with pytest.raises(CertificateError, match="there is an authority in"):
+        folder.make_authority()
+    assert folder.authority.read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["authority", "../x", "", ".hidden", "a/b", "x" * 64])
+def test_bad_name_is_refused(folder: CertificateFolder, name: str) -> None:
+    with pytest.raises(CertificateError, match="cannot be a certificate's name"):
+        folder.issue(name)
+
+
+@pytest.mark.parametrize("host", ["", "a b", "http://x/", "ü.example"])
+def test_bad_host_is_refused(folder: CertificateFolder, host: str) -> None:
+    with pytest.raises(CertificateError, match="neither a host name nor an IP address"):
+        folder.issue("cloud", (host,))
+
+
+def test_issue_without_authority_says_what_to_do(tmp_path: Path) -> None:
+    with pytest.raises(CertificateError, match="rce certificate init"):
+        CertificateFolder(tmp_path).issue("cloud")
+
+
+def test_renewal_keeps_hosts_and_replaces_key(folder: CertificateFolder) -> None:
+    folder.issue("cloud", ("one.example", "10.0.0.7"), days=1)
+    key = folder.key("cloud").read_bytes()
+    assert folder.issue("cloud").hosts == ("one.example", "10.0.0.7")
+    assert folder.details("cloud").days_left() > 390
+    assert folder.key("cloud").read_bytes() != key
+
+
+def test_certificate_ends_with_its_authority() -> None:
+    authority = make_authority(days=2)
+    found = read_details(issue(authority, "cloud", ["x"], days=100).certificate)
+    assert 1 < found.days_left() <= 2
+
+
+def test_ensure_makes_renews_and_adds_hosts(folder: CertificateFolder, tmp_path: Path) -> None:
+    fresh = CertificateFolder(tmp_path / "fresh")
+    assert "made an authority" in fresh.ensure("engine", ["a.example"])
+    assert fresh.ensure("engine", ["a.example"]) == ""
+    assert "for b.example" in fresh.ensure("engine", ["a.example", "b.example"])
+    assert set(fresh.details("engine").hosts) == {"a.example", "b.example"}
+    fresh.issue("engine", days=29)
+    assert "before it expires" in fresh.ensure("engine", ["a.example"])
+    assert fresh.details("engine").days_left() > 390
+
+
+def test_ensure_leaves_certificates_of_others_alone(folder: CertificateFolder, tmp_path: Path) -> None:
+    other = CertificateFolder(tmp_path / "other")
+    other.make_authority()
+    other.issue("engine", ("a.example",), days=1)
+    for file in (other.certificate("engine"), other.key("engine")):
+        (folder.path / file.name).write_bytes(file.read_bytes())
+    assert folder.ensure("engine", ["b.example"]) == ""
+    assert folder.certificate("engine").read_bytes() == other.certificate("engine").read_bytes()
+
+
+def test_signature_tells_authorities_apart() -> None:
+    one, other = make_authority(), make_authority()
+    found = issue(one, "cloud", ["x"])
+    assert is_signed_by(found.certificate, one.certificate)
+    assert not is_signed_by(found.certificate, other.certificate)
+
+
+def test_garbage_is_refused_with_its_file(folder: CertificateFolder) -> None:
+    folder.certificate("cloud").write_text("no certificate")
+    with pytest.raises(CertificateError, match=r"cloud\.pem: no certificate in PEM form"):
+        folder.details("cloud")
+    with pytest.raises(CertificateError, match="the authority cannot be read"):
+        issue(Issued(b"x", b"y"), "cloud", [])
+    assert dict(folder.all())[AUTHORITY] == folder.details(AUTHORITY)
