@@ -7,6 +7,7 @@ import logging
 from collections import deque
 from typing import TYPE_CHECKING
 
+from rce.guard.holdings import Holdings
 from rce.link.exceptions import NotConnected, Overloaded
 from rce.link.frames import MAX_ID
 from rce.link.tasks import TaskScope
@@ -14,6 +15,7 @@ from rce.link.tasks import TaskScope
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
+    from rce.guard.holdings import Holding
     from rce.link.channel import Channel
     from rce.link.interface import Buffer
     from rce.link.settings import LinkLimits
@@ -75,17 +77,27 @@ class PendingCalls:
 class CallServer:
     """Answers the requests that peers send to one interface.
 
+    A request is held until it has been answered. When memory is short, the oldest is answered with a fault.
+
     At most :attr:`LinkLimits.serving` requests are served at a time; :attr:`LinkLimits.waiting` more wait in
     order, and what comes then is answered with a fault at once.
     """
 
-    def __init__(self, serve: Callable[[bytes], Awaitable[Buffer]], limits: LinkLimits, name: str) -> None:
+    def __init__(
+        self,
+        serve: Callable[[bytes], Awaitable[Buffer]],
+        limits: LinkLimits,
+        name: str,
+        holdings: Holdings | None = None,
+    ) -> None:
         self._serve = serve
         self._limits = limits
         self._name = name
         self._scope = TaskScope()
         self._serving: dict[tuple[Channel, int], asyncio.Task[None]] = {}
         self._waiting: deque[tuple[Channel, int, bytes]] = deque()
+        self._holdings = Holdings() if holdings is None else holdings
+        self._held: dict[tuple[Channel, int], Holding] = {}
         self._closed = False
 
     def accept(self, channel: Channel, call_id: int, payload: bytes) -> None:
@@ -103,6 +115,12 @@ class CallServer:
             self._waiting.append((channel, call_id, payload))
         else:
             raise Overloaded(f"{len(self._waiting)} requests wait to be served")
+        key = channel, call_id
+        holding = self._holdings.hold(len(payload), lambda: self._give_up(*key))
+        if self.has(*key):
+            self._held[key] = holding
+        else:
+            holding.release()
 
     def has(self, channel: Channel, call_id: int) -> bool:
         """Tell whether a request is being served or waits."""
@@ -112,6 +130,8 @@ class CallServer:
 
     def cancel(self, channel: Channel, call_id: int | None = None) -> None:
         """Stop working on a request, or on all requests of a channel; they get no answer."""
+        for key in [key for key in self._held if key[0] is channel and call_id in (None, key[1])]:
+            self._held.pop(key).release()
         self._waiting = deque(
             request
             for request in self._waiting
@@ -125,6 +145,9 @@ class CallServer:
         self._closed = True
         self._waiting.clear()
         self._serving.clear()
+        for holding in self._held.values():
+            holding.release()
+        self._held.clear()
         await self._scope.close()
 
     def _begin(self, channel: Channel, call_id: int, payload: bytes) -> None:
@@ -148,7 +171,16 @@ class CallServer:
         if self._serving.get((channel, call_id)) is not asyncio.current_task():
             return False
         del self._serving[channel, call_id]
+        holding = self._held.pop((channel, call_id), None)
+        if holding is not None:
+            holding.release()
         return True
+
+    def _give_up(self, channel: Channel, call_id: int) -> None:
+        """Answer a request with a fault, because memory is short."""
+        if self.has(channel, call_id):
+            self.cancel(channel, call_id)
+            channel.fault(call_id, Overloaded("memory is short; the request was given up"))
 
     def _next(self, _ended: asyncio.Task[None]) -> None:
         while self._waiting and len(self._scope) < self._limits.serving and not self._closed:

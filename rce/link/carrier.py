@@ -26,6 +26,10 @@ class CarrierHandler(Protocol):
         """
         ...
 
+    def grew(self) -> None:
+        """Notice that the carrier's :attr:`Carrier.unfinished_bytes` grew."""
+        ...
+
     def carrier_lost(self, carrier: Carrier, reason: Exception) -> None:
         """Notice that the carrier ended. Called once, and nothing comes after it."""
         ...
@@ -52,6 +56,11 @@ class Carrier(ABC):
     def traffic(self) -> tuple[int, int]:
         """Bytes that came in and that went out, with headers."""
 
+    @property
+    @abstractmethod
+    def unfinished_bytes(self) -> int:
+        """Bytes that are set aside for messages that have not come as a whole yet."""
+
     @abstractmethod
     def control(self, frame: Frame) -> None:
         """Send a small frame of the link itself, before all messages. Ignored when the carrier ended."""
@@ -71,6 +80,10 @@ class Carrier(ABC):
     @abstractmethod
     def clear(self, queue: OutgoingQueue) -> None:
         """Throw away what waits on a channel."""
+
+    @abstractmethod
+    def abort(self, reason: Exception) -> None:
+        """End the carrier at once; who handles the frames is told the reason in a later step."""
 
     @abstractmethod
     def close(self) -> None:
@@ -118,6 +131,17 @@ class LocalCarrier(Carrier):
     def traffic(self) -> tuple[int, int]:
         """Nothing."""
         return 0, 0
+
+    @property
+    def unfinished_bytes(self) -> int:
+        """Nothing: messages come as a whole."""
+        return 0
+
+    def abort(self, reason: Exception) -> None:
+        """End both halves."""
+        self.close()
+        if self._handler is not None:
+            self._loop.call_soon(self._handler.carrier_lost, self, reason)
 
     def control(self, frame: Frame) -> None:
         """Send a frame."""

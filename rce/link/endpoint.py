@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from rce.guard.holdings import Holdings
 from rce.link.carrier import LocalCarrier
 from rce.link.channel import Channel
 from rce.link.dialer import keep_dialed
+from rce.link.exceptions import LinkLost
 from rce.link.link import Link, add_traffic
 from rce.link.pacing import Pacer
 from rce.link.queues import Backlog
@@ -64,6 +66,8 @@ class Endpoint:
         self._channels: dict[tuple[int, str], Channel] = {}
         """By number and interface: both ends of a connection may be here."""
         self._backlog = Backlog(on_growth)
+        self._holdings = Holdings(on_growth)
+        self._on_growth = on_growth
         self._pacer: Pacer | None = None
         self._former_traffic = (0, 0)
         self._refused: set[InterfaceSpec | ConnectionSpec] = set()
@@ -99,16 +103,25 @@ class Endpoint:
 
     @property
     def waiting_bytes(self) -> int:
-        """Payload bytes that wait to be sent to peers."""
-        return self._backlog.bytes
+        """Payload bytes that are held: to be sent, to be answered, incomplete, or latched."""
+        unfinished = sum(link.unfinished_bytes for link in self._links.values())
+        return self._backlog.bytes + self._holdings.bytes + unfinished
 
     def shed(self, size: int) -> None:
-        """Drop the oldest messages of the topics where most waits, until ``size`` bytes are free."""
-        goal = self._backlog.bytes - size
+        """Throw away what is held until ``size`` bytes are free.
+
+        First the oldest messages of topics, where most waits; then links with much that is incomplete, which
+        are dialed anew; then requests and latched messages, the oldest first.
+        """
+        goal = self.waiting_bytes - size
         for channel in sorted(self._channels.values(), key=lambda channel: -channel.waiting_bytes):
-            if self._backlog.bytes <= goal:
+            if self.waiting_bytes <= goal:
                 return
-            channel.shed(self._backlog.bytes - goal)
+            channel.shed(self.waiting_bytes - goal)
+        for link in sorted(self._links.values(), key=lambda link: -link.unfinished_bytes):
+            if self.waiting_bytes > goal and link.unfinished_bytes:
+                link.abort(LinkLost("memory is short"))
+        self._holdings.shed(self.waiting_bytes - goal)
 
     async def apply(self, spec: EndpointSpec) -> None:
         """Make up the difference between ``spec`` and what is there.
@@ -236,7 +249,7 @@ class Endpoint:
     def _put_link(self, spec: LinkSpec) -> None:
         link = self._links.get(spec.id)
         if link is None:
-            link = self._links[spec.id] = Link(spec, self._hub.limits)
+            link = self._links[spec.id] = Link(spec, self._hub.limits, self._on_growth)
             link.pace(self._pacer)
             if spec.peer == str(self.id):
                 self._far_ends[spec.id] = _bend_back(link)
@@ -269,6 +282,7 @@ class Endpoint:
                 timeouts=self._hub.timeouts,
                 on_change=self._changed,
                 on_fault=self._on_fault,
+                holdings=self._holdings,
             )
             slot.make(self._factory)
         except Exception as error:

@@ -196,12 +196,14 @@ class FrameReader:
 
     Attributes:
         max_message: Largest message that is accepted, in bytes.
+        held_bytes: Set aside for messages that have not come as a whole yet.
     """
 
     def __init__(self, limits: LinkLimits, *, max_message: int | None = None) -> None:
         self.max_message = limits.max_message if max_message is None else max_message
         self._max_unfinished_bytes = limits.unfinished_bytes
         self._unfinished_bytes = 0
+        self.held_bytes = 0
         self._scratch = memoryview(bytearray(_SCRATCH_SIZE))
         self._start = 0
         self._end = 0
@@ -287,6 +289,7 @@ class FrameReader:
         if self._missing == 0:
             self._current = None
             if message.filled == message.total:
+                self.held_bytes -= message.total
                 if self._unfinished.get(message.first.channel) is message:
                     del self._unfinished[message.first.channel]
                     self._unfinished_bytes -= message.total
@@ -329,8 +332,10 @@ class FrameReader:
                 raise ProtocolError("too many unfinished messages")
             message = self._unfinished[first.channel] = _Message(first, total)
             self._unfinished_bytes += total
+            self.held_bytes += total
         else:
             message = _Message(first, total)
+            self.held_bytes += total
         self._current = message
         self._missing = length
 
@@ -340,6 +345,7 @@ class FrameReader:
             raise ProtocolError("ABORT without an unfinished message")
         message.discard()
         self._unfinished_bytes -= message.total
+        self.held_bytes -= message.total
 
     def _compact(self) -> None:
         if self._start == self._end:

@@ -9,6 +9,8 @@ from rce.link.exceptions import ProtocolError
 from rce.link.frames import FrameType
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rce.control.model import LinkSpec
     from rce.link.carrier import Carrier
     from rce.link.channel import Channel
@@ -29,11 +31,14 @@ class Link:
         peer_open: Channels that the peer opened on this carrier; also those that are unknown here yet.
     """
 
-    def __init__(self, spec: LinkSpec, limits: LinkLimits) -> None:
+    def __init__(
+        self, spec: LinkSpec, limits: LinkLimits, on_growth: Callable[[], None] = lambda: None
+    ) -> None:
         self.spec = spec
         self.limits = limits
         self.carrier: Carrier | None = None
         self.peer_open: set[int] = set()
+        self._on_growth = on_growth
         self._channels: dict[int, Channel] = {}
         self._pacer: Pacer | None = None
         self._traffic = (0, 0)
@@ -43,6 +48,20 @@ class Link:
     def traffic(self) -> tuple[int, int]:
         """Bytes that came in and that went out, with headers."""
         return self._traffic if self.carrier is None else add_traffic(self._traffic, self.carrier.traffic)
+
+    @property
+    def unfinished_bytes(self) -> int:
+        """Bytes that are set aside for messages that have not come as a whole yet."""
+        return 0 if self.carrier is None else self.carrier.unfinished_bytes
+
+    def grew(self) -> None:
+        """Take note that :attr:`unfinished_bytes` grew."""
+        self._on_growth()
+
+    def abort(self, reason: Exception) -> None:
+        """End the carrier; the dialing end makes another."""
+        if self.carrier is not None:
+            self.carrier.abort(reason)
 
     def pace(self, pacer: Pacer | None) -> None:
         """Limit what passes; none for no limit."""

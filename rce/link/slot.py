@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
+from rce.guard.holdings import Holdings
 from rce.link.calls import CallServer
 from rce.link.channel import as_payload
 from rce.link.exceptions import MessageTooLarge, NotConnected
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rce.control.model import InterfaceSpec
+    from rce.guard.holdings import Holding
     from rce.link.channel import Channel
     from rce.link.interface import Buffer, Interface, InterfaceFactory
     from rce.link.settings import LinkLimits, LinkTimeouts
@@ -41,6 +43,7 @@ class InterfaceSlot:
         timeouts: LinkTimeouts,
         on_change: Callable[[], None],
         on_fault: Callable[[str], None],
+        holdings: Holdings | None = None,
     ) -> None:
         self.role = InterfaceType.parse(spec.type).role
         self.started = False
@@ -55,6 +58,8 @@ class InterfaceSlot:
         self._interface: Interface | None = None
         self._channels: dict[int, Channel] = {}
         self._latched: bytes | memoryview | None = None
+        self._holdings = Holdings() if holdings is None else holdings
+        self._latched_holding: Holding | None = None
         self._faults: set[str] = set()
 
     # Port
@@ -75,7 +80,7 @@ class InterfaceSlot:
             self._fault_once(str(error))
             return
         if latched:
-            self._latched = data
+            self._keep(data)
         for channel in self._channels.values():
             channel.send(data, latched=latched)
 
@@ -95,7 +100,7 @@ class InterfaceSlot:
         """Make the interface. Raises whatever the factory raises."""
         self._interface = interface = factory(self)
         if self.role is Role.SERVICE_CLIENT:
-            self.server = CallServer(interface.serve, self._limits, self._spec.tag)
+            self.server = CallServer(interface.serve, self._limits, self._spec.tag, self._holdings)
 
     async def start(self) -> None:
         """Start the interface and open its channels; a failure is reported."""
@@ -112,6 +117,7 @@ class InterfaceSlot:
 
     async def close(self) -> None:
         """End the interface; its channels were removed before."""
+        self._forget_latched()
         if self.server is not None:
             await self.server.close()
         if self._interface is not None:
@@ -152,6 +158,23 @@ class InterfaceSlot:
         except Exception as error:
             log.debug("interface %s refused a message", self._spec.tag, exc_info=True)
             self._fault_once(str(error) or type(error).__name__)
+
+    def _keep(self, data: bytes | memoryview) -> None:
+        """Keep a latched message in place of the one before."""
+        self._forget_latched()
+        self._latched = data
+        self._latched_holding = self._holdings.hold(len(data), self._give_up_latched)
+
+    def _forget_latched(self) -> None:
+        self._latched = None
+        if self._latched_holding is not None:
+            self._latched_holding.release()
+            self._latched_holding = None
+
+    def _give_up_latched(self) -> None:
+        self._latched = self._latched_holding = None
+        self.counters.dropped += 1
+        self._fault_once("memory is short; its latched message was dropped")
 
     def _tell_interface(self, active: bool) -> None:
         assert self._interface is not None

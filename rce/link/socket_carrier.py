@@ -144,6 +144,11 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         """Bytes that came in and that went out."""
         return self.received, self.sent
 
+    @property
+    def unfinished_bytes(self) -> int:
+        """Bytes that are set aside for messages that have not come as a whole yet."""
+        return 0 if self._ending else self._reader.held_bytes
+
     def control(self, frame: Frame) -> None:
         """Send a small frame of the link itself."""
         if self._ending or self._transport is None:
@@ -284,11 +289,14 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
 
     def _take(self, read: Callable[[T], list[Frame]], argument: T) -> None:
         self._heard = self._loop.time()
+        held = self._reader.held_bytes
         try:
             frames = read(argument)
         except ProtocolError as error:
             self.abort(error)
             return
+        if self._reader.held_bytes > held and self._handler is not None:
+            self._handler.grew()
         if frames:
             self._dispatch(frames)
 

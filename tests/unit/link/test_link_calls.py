@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast
 
 import pytest
 
+from rce.guard.holdings import Holdings
 from rce.link.calls import CallServer, PendingCalls
 from rce.link.carrier import LocalCarrier
 from rce.link.dialer import pauses
@@ -219,3 +220,26 @@ async def test_local_carrier_ends_at_broken_rules() -> None:
     await a.enough.wait()
     assert [type(reason) for reason in b.lost] == [ProtocolError]
     assert len(a.lost) == 1
+
+
+async def test_requests_are_held_until_they_are_answered_and_given_up_oldest_first() -> None:
+    release = asyncio.Event()
+
+    async def serve(payload: bytes) -> bytes:
+        await release.wait()
+        return payload
+
+    holdings = Holdings()
+    server = CallServer(serve, LinkLimits(serving=2, waiting=3), "test", holdings)
+    channel = FakeChannel()
+    for number in range(4):
+        server.accept(channel.as_channel(), number, bytes(10))
+    assert holdings.bytes == 40
+    holdings.shed(15)
+    assert holdings.bytes == 20
+    assert list(channel.faults) == [0, 1]
+    release.set()
+    while holdings.bytes:
+        await asyncio.sleep(0)
+    assert list(channel.replies) == [2, 3]
+    await server.close()
