@@ -9,6 +9,7 @@ from urllib.parse import urlsplit
 
 from websockets.protocol import State
 
+from rce.guard.loop_share import LoopShare
 from rce.guard.proxies import TrustedProxies
 from rce.protocol.exceptions import HandshakeError
 from rce.protocol.http import read_credentials
@@ -59,6 +60,7 @@ class Gate:
         self._settings = settings
         self._origins = origins
         self._proxies = proxies or TrustedProxies()
+        self._share = LoopShare()
 
     async def admit(self, connection: ServerConnection, request: Request) -> Response | None:
         """Let a robot in (None), or say why not."""
@@ -80,6 +82,7 @@ class Gate:
         session = Session(connection, namespace, self._settings, namespace.dropped, client=client)
         namespace.session = session
         connection.receiver = session
+        connection.share_loop(self._share, namespace.id.user)
         connection.become_known()
         if connection.protocol.state is not State.CONNECTING:
             session.on_lost("the robot left during the handshake")

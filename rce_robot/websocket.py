@@ -15,8 +15,10 @@ The rule for writing is the transport's own: write while :attr:`RobotSocket.writ
 from __future__ import annotations
 
 import contextlib
+import math
 import socket
 import struct
+from collections import deque
 from typing import TYPE_CHECKING, Protocol
 
 from websockets.frames import CloseCode, Frame, Opcode
@@ -26,13 +28,19 @@ from rce.guard.websocket import GuardedConnection
 
 if TYPE_CHECKING:
     import asyncio
+    from collections.abc import Generator
 
     from websockets.protocol import Event
+    from websockets.streams import StreamReader
 
+    from rce.guard.loop_share import LoopShare
     from rce_robot.outbox import Buffer, Outgoing
 
 LARGE_PART = 64 << 10
 """Bytes of an incomplete message from which on the receiver is told of every part."""
+
+READS_PER_STEP = 64
+"""Reads of the parser before others may have their turn; a frame takes three or four."""
 
 MAX_FRAGMENTS = 4096
 """Frames that one message may be split into."""
@@ -72,13 +80,16 @@ class Receiver(Protocol):
 class RobotSocket(GuardedConnection):
     """A robot's WebSocket connection."""
 
+    _share: LoopShare | None = None
+    _user = ""
     receiver: Receiver | None = None
     """Gets what arrives. Set while the handshake is answered."""
 
     @property
     def held(self) -> int:
         """Bytes of a message that is not complete, and of those that the network has not taken yet, about."""
-        return self._part_bytes + self._fragment_bytes + self.transport.get_write_buffer_size()
+        incomplete = len(self.protocol.reader.buffer) + self._fragment_bytes + self._input_bytes
+        return incomplete + self.transport.get_write_buffer_size()
 
     @property
     def writable(self) -> bool:
@@ -101,7 +112,8 @@ class RobotSocket(GuardedConnection):
         """Close the connection because of what the robot sent."""
         self._failed = True
         self._fragments.clear()
-        self._part_bytes = self._fragment_bytes = 0
+        self._fragment_bytes = 0
+        self._forget_input()
         if self.protocol.state is State.OPEN:
             self.protocol.fail(code, reason)
             self.send_data()
@@ -110,13 +122,35 @@ class RobotSocket(GuardedConnection):
         """Drop the connection at once; the robot is not expected to answer any more."""
         self.transport.abort()
 
+    def share_loop(self, share: LoopShare, user: str) -> None:
+        """Handle what comes from now on in the turns of this user."""
+        self._share = share
+        self._user = user
+
+    def go_on(self) -> bool:
+        """Handle a few frames of what came; return whether there is more."""
+        data = self._input.popleft() if self._input else b""
+        self._input_bytes -= len(data)
+        self._steps.allow()
+        super().data_received(data)
+        if self._input or self._steps.stopped:
+            return True
+        self._end_of_input()
+        return False
+
     # What the base class calls
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Prepare the socket for small and timely messages."""
         super().connection_made(transport)
-        self._part_bytes = 0
-        """Received since the last frame was complete."""
+        self._input: deque[bytes] = deque()
+        """What came while it was not this user's turn."""
+        self._input_bytes = 0
+        self._waits = False
+        """Whether it waits for its turn."""
+        self._paused_reading = False
+        self._eof = False
+        self._steps = _Steps(self.protocol.reader)
         self._fragments: list[bytes | bytearray] = []
         self._fragment_bytes = 0
         self._opcode = Opcode.TEXT
@@ -128,15 +162,34 @@ class RobotSocket(GuardedConnection):
                 sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_LOW_WATER)
 
     def data_received(self, data: bytes) -> None:
-        """Count what comes."""
-        self._part_bytes += len(data)
-        super().data_received(data)
-        if self._part_bytes > LARGE_PART and self.receiver is not None and not self._failed:
+        """Handle what comes, now or when it is the user's turn."""
+        if self._share is None:
+            self._steps.allow(None)
+            super().data_received(data)
+            return
+        if self._failed:
+            data = b""
+        self._input.append(data)
+        self._input_bytes += len(data)
+        if self._waits:
+            return
+        self._waits = True
+        if not self._share.run(self._user, self) and not self.transport.is_closing():
+            self._paused_reading = True
+            self.transport.pause_reading()
+        if len(self.protocol.reader.buffer) > LARGE_PART and self.receiver is not None and not self._failed:
             self.receiver.on_part()
+
+    def eof_received(self) -> bool | None:  # type: ignore[override]  # true keeps the transport, says asyncio
+        """Handle first what came before the end."""
+        if self._waits and self.transport.get_extra_info("sslcontext") is None:
+            self._eof = True
+            return True
+        super().eof_received()
+        return None
 
     def process_event(self, event: Event) -> None:
         """Take complete data messages out of the base class's hands."""
-        self._part_bytes = 0
         if type(event) is not Frame or event.opcode > Opcode.BINARY:
             super().process_event(event)
         elif event.fin and event.opcode is not Opcode.CONT:
@@ -152,11 +205,32 @@ class RobotSocket(GuardedConnection):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Tell the receiver."""
+        self._forget_input()
+        self._steps.allow(None)
+        if self._share is not None:
+            self._share.forget(self._user, self)
         super().connection_lost(exc)
         if self.receiver is not None:
             self.receiver.on_lost(str(exc or self.close_exc))
 
     # Own
+
+    def _end_of_input(self) -> None:
+        """Read on, because all that came has been handled."""
+        self._waits = False
+        if self._eof:
+            self._eof = False
+            super().eof_received()
+            self.transport.close()
+        elif self._paused_reading and not self.transport.is_closing():
+            self.transport.resume_reading()
+        self._paused_reading = False
+
+    def _forget_input(self) -> None:
+        self._input.clear()
+        self._input_bytes = 0
+        if self._steps.stopped:
+            self.protocol.reader.buffer.clear()
 
     def _collect(self, frame: Frame) -> None:
         if frame.opcode is not Opcode.CONT:
@@ -180,6 +254,33 @@ class RobotSocket(GuardedConnection):
             self.receiver.on_text(bytes(data))
         else:
             self.receiver.on_binary(bytes(data))
+
+
+class _Steps:
+    """Lets the library's parser stop after a few frames; it goes on with the next data, or with none.
+
+    Args:
+        reader: Where the parser reads.
+    """
+
+    def __init__(self, reader: StreamReader) -> None:
+        self._left: float = math.inf
+        self._read = reader.read_exact
+        self.stopped = False
+        """Whether the parser could go on."""
+        reader.read_exact = self._read_exact  # type: ignore[method-assign]  # the library makes the reader
+
+    def allow(self, reads: int | None = READS_PER_STEP) -> None:
+        """Let so many reads pass; None for any number."""
+        self._left = math.inf if reads is None else reads
+        self.stopped = False
+
+    def _read_exact(self, n: int) -> Generator[None, None, bytearray]:
+        self._left -= 1
+        while self._left < 0:
+            self.stopped = True
+            yield
+        return (yield from self._read(n))
 
 
 def _add_frame(buffers: list[Buffer], first: int, head: bytes, body: Buffer) -> None:

@@ -205,6 +205,8 @@ def parse_json(text: str | bytes) -> Any:
     """
     try:
         return _decode_any(text)
+    except RecursionError as error:
+        raise MessageError("", "nested deeper than any message may be") from error
     except _DECODE_FAULTS as error:
         if not _may_hold_nan(text):
             raise MessageError("", f"no valid JSON: {error}") from error

@@ -1,0 +1,109 @@
+"""Shares an event loop among users, so that one who sends much does not keep the others waiting.
+
+What comes in is handled at once, as long as its user has used little of the loop's time of late. Then the
+rest waits until the others have had their turn. No user is slowed down while no other has anything to do.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import OrderedDict, deque
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+SLICE_S = 0.002
+"""What a user may use before others have their turn."""
+_RECOVERY = 0.5
+"""Seconds of use that are forgotten in a second."""
+
+
+class Workload(Protocol):
+    """Something of a user that has work to do."""
+
+    def go_on(self) -> bool:
+        """Do a small part of it; return whether there is more."""
+
+
+class LoopShare:
+    """The shares of all users of one event loop.
+
+    Invariant: a user is in ``_waiting`` exactly while workloads of theirs wait.
+
+    Args:
+        slice_s: Seconds that a user may use before others have their turn.
+        clock: Tells the time in seconds.
+    """
+
+    def __init__(self, *, slice_s: float = SLICE_S, clock: Callable[[], float] = time.perf_counter) -> None:
+        self._slice = slice_s
+        self._clock = clock
+        self._used: dict[str, tuple[float, float]] = {}
+        """User to the seconds that they used, and when that was so."""
+        self._waiting: OrderedDict[str, deque[Workload]] = OrderedDict()
+        self._round: asyncio.Handle | None = None
+
+    def run(self, user: str, workload: Workload) -> bool:
+        """Have work done now, as far as the user's share allows, and the rest in later turns.
+
+        Returns:
+            Whether all is done. If not, do not call this again before ``go_on`` has returned False.
+        """
+        if user not in self._waiting:
+            now = self._clock()
+            used, since = self._used.get(user, (0.0, now))
+            if self._work(user, workload, max(0.0, used - (now - since) * _RECOVERY), now):
+                return True
+        self._waiting.setdefault(user, deque()).append(workload)
+        self._plan()
+        return False
+
+    def forget(self, user: str, workload: Workload) -> None:
+        """Give no more turns to a workload that waits."""
+        workloads = self._waiting.get(user)
+        if workloads is not None and workload in workloads:
+            workloads.remove(workload)
+            if not workloads:
+                del self._waiting[user]
+
+    def leave(self, user: str) -> None:
+        """Forget a user who has nothing here any more."""
+        if user not in self._waiting:
+            self._used.pop(user, None)
+
+    def _work(self, user: str, workload: Workload, used: float, now: float) -> bool:
+        """Work until the user's slice is used up; return whether all was done."""
+        more = True
+        while more and used < self._slice:
+            more = workload.go_on()
+            end = self._clock()
+            used += end - now
+            now = end
+        self._used[user] = used, now
+        return not more
+
+    def _plan(self) -> None:
+        """Have a round after the loop has looked at its sockets, so that who has anything to say is heard."""
+        if self._round is None and self._waiting:
+            self._round = asyncio.get_running_loop().call_soon(self._next_round)
+
+    def _next_round(self) -> None:
+        """Give users who wait a turn each, all of them together no more than two slices."""
+        self._round = None
+        end = self._clock() + 2 * self._slice
+        for user in list(self._waiting):
+            now = self._clock()
+            if now >= end:
+                break
+            workloads = self._waiting.get(user)
+            if workloads is None:
+                continue
+            self._waiting.move_to_end(user)
+            workload = workloads[0]
+            if self._work(user, workload, 0.0, now):
+                self.forget(user, workload)
+            elif workloads[0] is workload:
+                workloads.rotate(-1)
+        self._plan()

@@ -1,0 +1,174 @@
+"""What one user sends is handled in turns; what takes long is handled in other processes."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import struct
+from typing import TYPE_CHECKING, Any
+
+import psutil
+from support.cloud import DIGEST, running_cloud
+from support.engine import until
+from websockets.asyncio.client import ClientConnection, connect
+
+from rce_robot.conversion.pool import ConversionSettings
+from rce_robot.settings import SessionSettings
+
+if TYPE_CHECKING:
+    from support.cloud import Cloud
+
+STRING = "std_msgs/String"
+PATIENT = SessionSettings(ping_interval=None, drain_timeout=1.0)
+
+
+def dial(cloud: Cloud, user: str, robot: str) -> connect:
+    query = f"userID={user}&robotID={robot}&password={DIGEST}"
+    return connect(f"{cloud.ws_url}?{query}", proxy=None, compression=None, max_size=None)
+
+
+def say(msg: str, tag: str = "tag") -> str:
+    return f'{{"type":"DM","data":{{"iTag":"{tag}","type":"{STRING}","msgID":"nil","msg":{msg}}}}}'
+
+
+async def errors(socket: ClientConnection, count: int) -> list[str]:
+    found: list[str] = []
+    async with asyncio.timeout(60):
+        while len(found) < count:
+            message = json.loads(await socket.recv())
+            if message["type"] == "ER":
+                found.append(message["data"])
+    return found
+
+
+def workers() -> list[psutil.Process]:
+    found = []
+    for process in psutil.Process().children(recursive=True):
+        try:
+            if "rce_robot.conversion.worker" in process.cmdline():
+                found.append(process)
+        except psutil.Error:
+            continue
+    return found
+
+
+async def test_many_small_frames_of_one_user_leave_room_for_another() -> None:
+    """20,000 frames come in one piece; a message of another user passes before they are handled."""
+    frames = 20_000
+    async with running_cloud(PATIENT) as cloud:
+        cloud.master.users.add("flood")
+        end = await cloud.joined("tag", "SubscriberConverter", STRING)
+        async with dial(cloud, "flood", "f") as flood, dial(cloud, "testUser", "testRobot") as good:
+            await end.active.until(lambda: end.is_active)
+            handled: list[str] = []
+
+            async def count() -> None:
+                handled.extend(["flood"] * len(await errors(flood, 4000)))
+
+            counting = asyncio.create_task(count())
+            mask = bytes(4)
+            flood.transport.write(struct.pack("!BB", 0x81, 0x80 | 2) + mask + b"{}")
+            flood.transport.write((struct.pack("!BB", 0x81, 0x80 | 2) + mask + b"{}") * frames)
+            await good.send(say('{"data":"hello"}'))
+            async with asyncio.timeout(30):
+                await end.received.get()
+            assert len(handled) < frames
+            counting.cancel()
+            async with asyncio.timeout(10):
+                await (await good.ping())
+
+
+async def test_a_large_message_takes_a_process_that_ends_when_it_has_nothing_to_do() -> None:
+    async with running_cloud(PATIENT, conversion=ConversionSettings(idle=0.1)) as cloud:
+        end = await cloud.wire("tag", "SubscriberConverter", STRING)
+        async with dial(cloud, "testUser", "testRobot") as robot:
+            await end.active.until(lambda: end.is_active)
+            assert not workers()
+            text = "\xe4" * 1_000_000
+            await robot.send(say(json.dumps({"data": text})))
+            await robot.send(say('{"data":"after"}'))
+            async with asyncio.timeout(60):
+                first, second = await end.received.get(), await end.received.get()
+            assert first[4:] == text.encode()
+            assert second[4:] == b"after"
+            await until(lambda: not workers(), what="the process ends")
+
+
+async def test_a_string_of_ten_megabytes_passes_in_both_directions() -> None:
+    async with running_cloud(PATIENT) as cloud:
+        inwards = await cloud.wire("in", "SubscriberConverter", STRING)
+        outwards = await cloud.wire("out", "PublisherConverter", STRING)
+        async with dial(cloud, "testUser", "testRobot") as robot:
+            await inwards.active.until(lambda: inwards.is_active and outwards.is_active)
+            for text in ("x" * 10_000_000, ',[{"' * 2_500_000):
+                await robot.send(say(json.dumps({"data": text}), "in"))
+                async with asyncio.timeout(60):
+                    payload = await inwards.received.get()
+                    assert payload[4:].decode() == text
+                    outwards.port.send(payload)
+                    while (message := json.loads(await robot.recv()))["type"] != "DM":
+                        pass
+                assert message["data"]["msg"]["data"] == text
+
+
+async def test_what_is_too_much_is_refused_with_what_to_do() -> None:
+    async with running_cloud(PATIENT) as cloud:
+        end = await cloud.wire("tag", "SubscriberConverter", STRING)
+        async with dial(cloud, "testUser", "testRobot") as robot:
+            await end.active.until(lambda: end.is_active)
+            bombs = {
+                "[" + "[]," * 5_000_000 + "[]]": "tag: a message of 5000010 objects, lists and members",
+                "{" + ",".join(f'"k{n}":1' for n in range(300_000)) + "}": "tag: a message of 300",
+                "[" * 100_000 + "]" * 100_000: "tag: nested deeper than",
+                "[" + "1," * 3_000_000 + "1]": "tag: a message of 30000",
+            }
+            for bomb in bombs:
+                await robot.send(say(bomb))
+            await robot.send("x" * (16 * 2**20 + 1))
+            await robot.send(say("[" + "[]," * 100_000 + "[]]", "nowhere"))
+            found = sorted(await errors(robot, len(bombs) + 2))
+            for text in (*bombs.values(), "a text frame of 16777217", "nowhere: robot testRobot has no such"):
+                assert any(error.startswith(text) for error in found), (text, [e[:200] for e in found])
+
+
+async def test_a_conversion_that_takes_too_long_is_ended() -> None:
+    async with running_cloud(PATIENT, conversion=ConversionSettings(timeout=0.0)) as cloud:
+        end = await cloud.wire("tag", "SubscriberConverter", STRING)
+        async with dial(cloud, "testUser", "testRobot") as robot:
+            await end.active.until(lambda: end.is_active)
+            await robot.send(say(json.dumps({"data": "\xe4" * 1_000_000})))
+            assert await errors(robot, 1) == ["tag: converting the message takes more than 0 s"]
+            assert not workers()
+            await robot.send(say('{"data":"after"}'))
+            async with asyncio.timeout(30):
+                assert (await end.received.get())[4:] == b"after"
+
+
+async def test_a_conversion_that_needs_too_much_memory_is_refused() -> None:
+    async with running_cloud(PATIENT, conversion=ConversionSettings(memory=160 << 20)) as cloud:
+        end = await cloud.wire("tag", "PublisherConverter", "std_msgs/Int8MultiArray")
+        async with dial(cloud, "testUser", "testRobot") as robot:
+            await end.active.until(lambda: end.is_active)
+            size = 32_000_000
+            end.port.send(struct.pack("<III", 0, 0, size) + os.urandom(size))
+            (error,) = await errors(robot, 1)
+            assert error == "tag: converting the message takes more than 160 MiB of memory"
+            end.port.send(struct.pack("<III", 0, 0, 1) + b"\x07")
+            data: Any = None
+            async with asyncio.timeout(30):
+                while data is None:
+                    message = json.loads(await robot.recv())
+                    data = message["data"] if message["type"] == "DM" else None
+            assert data["msg"]["data"] == [7]
+
+
+async def test_messages_that_are_compressed_are_refused() -> None:
+    """A server that offers no compression cannot be made to inflate anything."""
+    async with running_cloud(PATIENT) as cloud:
+        query = f"userID=testUser&robotID=testRobot&password={DIGEST}"
+        async with connect(f"{cloud.ws_url}?{query}", proxy=None, compression="deflate") as robot:
+            assert not robot.protocol.extensions
+            robot.transport.write(struct.pack("!BB", 0xC1, 0x80 | 2) + bytes(4) + b"{}")
+            await asyncio.wait_for(robot.wait_closed(), 10)
+            assert robot.close_code == 1002
