@@ -41,6 +41,7 @@ from rce_container.launcher import Launcher
 from rce_container.life import Phase
 from rce_container.limits import Cell
 from rce_container.limits.warden import Warden
+from rce_container.log_reads import LogReads
 from rce_container.network import Networks
 from rce_container.reading import read_for
 from rce_container.runtimes.base import Handle
@@ -126,6 +127,7 @@ class Manager:
         self._empty = asyncio.Event()
         self._meter = UsageMeter()
         self._process = psutil.Process()
+        self._log_reads = LogReads(self._read_log, lambda chunk: self.send(chunk))  # noqa: PLW0108 - set later
 
     # The master's side
 
@@ -149,7 +151,7 @@ class Manager:
             case Sync(endpoints=specs):
                 self._feed(events.Sync(specs))
             case ReadLog():
-                self.send(await asyncio.to_thread(self._read_log, message))
+                self._log_reads.take(message)
             case _:
                 log.debug("not for a container task set: %s", type(message).__name__)
 
@@ -182,6 +184,7 @@ class Manager:
                     await self._empty.wait()
                 usage.cancel()
                 pruning.cancel()
+                await self._log_reads.close()
 
     def kill_all(self) -> None:
         """End all containers at once; for a quit that takes too long."""
@@ -333,7 +336,7 @@ class Manager:
         mark = container.mark if container is not None else ""
         try:
             return read_for(self._state.archive, message, mark)
-        except OSError as error:
+        except (OSError, ValueError) as error:
             return LogChunk(request=message.request, offset=message.offset, error=str(error))
 
     async def _report_usage(self) -> None:

@@ -15,8 +15,10 @@ from rce_master.exceptions import (
     Refused,
     TooManyFailures,
     TooManyLogins,
+    TooMuch,
     WrongCredentials,
 )
+from rce_master.quotas import Quotas
 from rce_master.state import commands
 from rce_master.tokens import Tokens
 
@@ -32,6 +34,8 @@ logger = logging.getLogger(__name__)
 
 MAX_PENDING = 1000
 """Requests in work at the same time; beyond it, the channels they come by wait."""
+MAX_TOGETHER = 200
+"""Commands of one request that are done in one go; between the parts of a larger one come those of others."""
 MAX_LOGINS = 4096
 """Logins in work; beyond it robots are told to try later. Nothing else waits for a login that is put off."""
 
@@ -61,11 +65,13 @@ class Desk:
         reconciler: Reconciler,
         authenticator: Authenticator,
         tokens: Tokens | None = None,
+        quotas: Quotas | None = None,
     ) -> None:
         self._tokens = Tokens(realm.tables) if tokens is None else tokens
         self._realm = realm
         self._reconciler = reconciler
         self._authenticator = authenticator
+        self._quotas = quotas or Quotas()
         self._pending = asyncio.Semaphore(MAX_PENDING)
         self._group = asyncio.TaskGroup()
         self._visits: set[_Visit] = set()
@@ -190,12 +196,23 @@ class Desk:
             error = f"robot {request.id!r} is not known any more; connect again"
             peer.send(ClientReply(request=request.request, errors=(error,)))
             return
+        try:
+            self._quotas.robot_request(self._realm.tables.users[user], requests.count_items(request.data))
+        except TooMuch as error:
+            peer.send(ClientReply(request=request.request, errors=(f"{request.type}: {error}",)))
+            return
         wanted, faults = requests.read(user, request.type, request.data)
-        outcomes = await self._realm.enqueue(wanted)
+        parts = [wanted[first : first + MAX_TOGETHER] for first in range(0, len(wanted), MAX_TOGETHER)]
+        outcomes = [await self._realm.enqueue(part) for part in parts]
         await self._spawn(self._answer(peer, request, outcomes, faults))
 
     async def _answer(
-        self, peer: Peer, request: ClientRequest, outcomes: asyncio.Future[list[Outcome]], faults: list[str]
+        self,
+        peer: Peer,
+        request: ClientRequest,
+        outcomes: list[asyncio.Future[list[Outcome]]],
+        faults: list[str],
     ) -> None:
-        errors = [f"{request.type}: {error}" for error in await outcomes if error is not None]
+        found = [error for part in outcomes for error in await part]
+        errors = [f"{request.type}: {error}" for error in found if error is not None]
         peer.send(ClientReply(request=request.request, errors=(*faults, *errors)))

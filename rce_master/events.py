@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections import deque
-from itertools import islice
+from itertools import takewhile
 from typing import TYPE_CHECKING
 
 from msgspec import Struct
@@ -42,7 +42,10 @@ class EventLog:
     """
 
     def __init__(self, start: float, capacity: int = CAPACITY) -> None:
-        self._events: deque[Event] = deque(maxlen=capacity)
+        self._events: dict[str, deque[Event]] = {}
+        """By user."""
+        self._count = 0
+        self._capacity = capacity
         self._next_id = int(start * 1000)
         self._news = asyncio.Event()
 
@@ -62,8 +65,17 @@ class EventLog:
             text=happening.text,
         )
         self._next_id += 1
-        self._events.append(event)
+        self._events.setdefault(event.user, deque()).append(event)
+        self._count += 1
+        if self._count > self._capacity:
+            self._forget_one()
         self.wake()
+
+    def _forget_one(self) -> None:
+        """Forget the oldest event of the user who has the most: nobody's flood costs others theirs."""
+        user = max(self._events, key=lambda user: len(self._events[user]))
+        self._events[user].popleft()
+        self._count -= 1
 
     def wake(self) -> None:
         """Wake all followers, to see whether they may still follow."""
@@ -76,21 +88,34 @@ class EventLog:
             async with asyncio.timeout(timeout):
                 await self._news.wait()
 
-    def since(self, id_: int, limit: int = CAPACITY) -> list[Event]:
-        """List what came after an event, oldest first."""
-        if not self._events or id_ >= self.last_id:
-            return []
-        skip = max(0, id_ + 1 - self._events[0].id)
-        return list(islice(self._events, skip, skip + limit))
+    def since(self, id_: int, limit: int = CAPACITY, user: str | None = None) -> list[Event]:
+        """List what came after an event, oldest first.
 
-    async def wait(self, id_: int, timeout: float) -> list[Event]:
+        Args:
+            id_: The event.
+            limit: At most so many.
+            user: Of this user only; None: of all.
+        """
+        if id_ >= self.last_id:
+            return []
+        logs = self._events.values() if user is None else [self._events.get(user, deque())]
+        found = [event for log in logs for event in takewhile(lambda event: event.id > id_, reversed(log))]
+        return sorted(found, key=lambda event: event.id)[:limit]
+
+    async def wait(self, id_: int, timeout: float, user: str | None = None) -> list[Event]:
         """Wait for what comes after an event.
 
-        A follower that is slower than the ring turns misses events; their ids are missing then.
+        A follower who is slower than events are forgotten misses some.
+
+        Args:
+            id_: The event.
+            timeout: Seconds.
+            user: Of this user only; None: of all.
 
         Returns:
-            At most a hundred events, oldest first; none if nothing came within ``timeout`` seconds.
+            At most a hundred events, oldest first; none if nothing came within ``timeout`` seconds, or others
+            of them may follow now than before.
         """
-        if not self.since(id_, limit=1):
+        if not self.since(id_, limit=1, user=user):
             await self.wait_change(timeout)
-        return self.since(id_, limit=100)
+        return self.since(id_, limit=100, user=user)

@@ -11,6 +11,7 @@
     |   +-- NoRoom              no machine, or not its own, has enough of what a container asks for
     |   +-- Forbidden           this user may not do it
     |   +-- Busy                too much of the kind is done just now
+    |   +-- TooMuch             this user asks too much at a time; wait
     +-- AuthError
     |   +-- WrongCredentials    unknown user, wrong password, unknown or expired token
     |   +-- TooManyFailures     too many wrong passwords; wait
@@ -80,6 +81,20 @@ class Busy(Refused):
     """Too much of the kind is done just now."""
 
     status = 503
+
+
+class TooMuch(Refused):
+    """A user asks too much at a time.
+
+    Attributes:
+        retry_after: Seconds after which it can be tried again.
+    """
+
+    status = 429
+
+    def __init__(self, text: str, retry_after: float) -> None:
+        self.retry_after = retry_after
+        super().__init__(text)
 
 
 class AuthError(MasterError):

@@ -22,6 +22,7 @@ from rce_master.events import EventLog
 from rce_master.exceptions import MasterError
 from rce_master.http.routes import Services
 from rce_master.http.server import make_app
+from rce_master.quotas import Quotas
 from rce_master.realm import Realm
 from rce_master.reconciler import Reconciler
 from rce_master.state import commands
@@ -101,7 +102,8 @@ class Master:
             remember=lambda login: realm.enqueue([commands.RememberLogin(login=login)]),
         )
         tokens = Tokens(realm.tables)
-        desk = Desk(realm, reconciler, authenticator, tokens)
+        quotas = Quotas(self._settings.quotas)
+        desk = Desk(realm, reconciler, authenticator, tokens, quotas)
         lifetime = self._settings.token_lifetime
         self._contents = ContentStore(self._settings.state_dir / "bundles")
         packages = PackageOffice(realm, self._contents)
@@ -114,6 +116,7 @@ class Master:
             lifetime,
             packages,
             tokens,
+            quotas,
             TrustedProxies(self._settings.trusted_proxies),
         )
         try:

@@ -26,6 +26,8 @@ logger = logging.getLogger(__name__)
 
 MAX_WAITING = 10_000
 MAX_BATCH = 256
+MAX_COMMANDS = 512
+"""Commands in one batch, about; while they are done nothing else is."""
 
 Outcome = MasterError | None
 """What became of a command: None if it was done, else why not."""
@@ -145,8 +147,10 @@ class Realm:
         """Work until cancelled."""
         while True:
             jobs = [await self._jobs.get()]
-            while len(jobs) < MAX_BATCH and not self._jobs.empty():
+            size = len(jobs[0].commands)
+            while len(jobs) < MAX_BATCH and size < MAX_COMMANDS and not self._jobs.empty():
                 jobs.append(self._jobs.get_nowait())
+                size += len(jobs[-1].commands)
             await self._work(jobs)
 
     async def _work(self, jobs: list[_Job]) -> None:

@@ -18,6 +18,12 @@ if TYPE_CHECKING:
     from msgspec import Struct
 
 
+def count_items(data: Any) -> int:
+    """Count, without reading them, the nodes, interfaces, ... that a request is about."""
+    lists = data.values() if isinstance(data, dict) else ()
+    return sum(len(items) for items in lists if isinstance(items, list))
+
+
 def read(user: str, kind: str, data: Any) -> tuple[list[commands.Request], list[str]]:
     """Read a request.
 

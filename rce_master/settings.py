@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from rce.config.folders import default_state_dir
 from rce.config.settings import ANYWHERE
 from rce.tls.choice import TlsChoice
+from rce_master.quotas import QuotaSettings
 from rce_master.state.settings import StateSettings
 from rce_master.tokens import TOKEN_LIFETIME_S
 
@@ -34,4 +35,6 @@ class MasterSettings:
     """Addresses or networks of proxies whose ``X-Forwarded-For`` is believed."""
     token_lifetime: float = TOKEN_LIFETIME_S
     """Seconds."""
+    quotas: QuotaSettings = field(default_factory=QuotaSettings)
+    """What one user may ask of the master at a time."""
     state: StateSettings = field(default_factory=StateSettings)

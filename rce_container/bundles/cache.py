@@ -5,13 +5,12 @@ A bundle is fetched, verified and unpacked in a scratch folder, and appears whol
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import errno
 import hashlib
 import os
 import re
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 
@@ -22,8 +21,10 @@ from rce.bundles.unpacking import unpack
 from rce.control.contents import Piece
 from rce.control.exceptions import ContentError
 from rce.control.model import BundleSpec
+from rce.guard.turns import CrowdedError, Turns
 from rce_container.bundles.disk import forget_before_boot, in_thread, scratch_aside
 from rce_container.bundles.exceptions import BundleTrouble, NoSpace, Unfetched, Unverified
+from rce_container.bundles.locks import Locks
 from rce_container.trees import remove, size_of
 
 Fetch = Callable[[str, int], Awaitable[Piece]]
@@ -31,7 +32,9 @@ Fetch = Callable[[str, int], Awaitable[Piece]]
 
 _HASH = re.compile(r"[0-9a-f]{64}")
 _SCRATCH = "incoming"
-_AT_ONCE = 2
+_AT_ONCE = 8
+_OF_ONE_USER = 2
+_MAX_WAITING = 1024
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
@@ -55,10 +58,8 @@ class BundleCache:
         self._sizes: dict[str, int] = {}
         """Bytes of those that are there, the one that was used longest ago first."""
         self._holders: defaultdict[str, set[str]] = defaultdict(set)
-        self._locks: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
-        self._busy: Counter[str] = Counter()
-        """How many hold or wait for each of the locks."""
-        self._turns = asyncio.Semaphore(_AT_ONCE)
+        self._locks = Locks()
+        self._turns = Turns(_AT_ONCE, waiting=_MAX_WAITING, each=_OF_ONE_USER)
 
     def open(self) -> None:
         """Look at what is there, and remove what was begun and not finished. Blocks.
@@ -97,25 +98,28 @@ class BundleCache:
         """
         _check_signature(user, bundle)
         path = self._folder / bundle.sha256
-        async with self._lock(bundle.sha256):
-            if bundle.sha256 not in self._sizes or not path.is_dir():
-                async with self._turns:
-                    await self._bring(bundle, path)
+        async with contextlib.AsyncExitStack() as stack:
+            if not self._has(bundle, path):
+                # The turn first: two users may want the same, and neither waits for the other's turn.
+                await stack.enter_async_context(self._turn(user))
+            await stack.enter_async_context(self._locks.of(bundle.sha256))
+            if not self._has(bundle, path):
+                await self._bring(bundle, path)
             self._sizes[bundle.sha256] = self._sizes.pop(bundle.sha256)
             await in_thread(os.utime, path)
         await self._make_room()
         return path
 
+    def _has(self, bundle: BundleSpec, path: Path) -> bool:
+        return bundle.sha256 in self._sizes and path.is_dir()
+
     @contextlib.asynccontextmanager
-    async def _lock(self, sha256: str) -> AsyncIterator[None]:
-        self._busy[sha256] += 1
+    async def _turn(self, user: str) -> AsyncIterator[None]:
         try:
-            async with self._locks[sha256]:
+            async with self._turns.turn(user):
                 yield
-        finally:
-            self._busy[sha256] -= 1
-            if not self._busy[sha256]:
-                del self._busy[sha256], self._locks[sha256]
+        except CrowdedError:
+            raise Unfetched("too many packages are fetched to its machine just now") from None
 
     async def _bring(self, bundle: BundleSpec, path: Path) -> None:
         self._sizes.pop(bundle.sha256, None)
@@ -167,7 +171,7 @@ class BundleCache:
         for sha256 in list(self._sizes):
             if sum(self._sizes.values()) <= self._space:
                 return
-            if sha256 not in self._holders and sha256 not in self._busy:
+            if sha256 not in self._holders and sha256 not in self._locks:
                 del self._sizes[sha256]
                 await in_thread(remove, self._folder / sha256)
 

@@ -18,9 +18,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rce.bundles.requirements import FILE_NAME, read_requirements
+from rce.guard.turns import CrowdedError, Turns
 from rce.ros.packages import MANIFESTS, BadPackage, parse_manifest
 from rce_container.bundles.disk import forget_before_boot, in_thread, scratch_aside
 from rce_container.bundles.exceptions import RequirementsTrouble
+from rce_container.bundles.locks import Locks
 from rce_container.exceptions import RuntimeUnavailableError
 from rce_container.runtimes.namespace import interpreter_paths, read_only_mounts, system_mounts
 from rce_container.trees import remove, size_of
@@ -29,6 +31,9 @@ BUILD = "/build"
 SITE = "site"
 NOBODY = 65534
 
+INSTALLS_AT_ONCE = 8
+"""Of different users; each runs a pip, which waits for the network most of the time."""
+MAX_WAITING = 1024
 _SCRATCH = "incoming"
 _SYSTEM_PATH = "/usr/local/bin:/usr/bin:/bin"
 _POLL_S = 1.0
@@ -70,7 +75,9 @@ class Installer:
         self._folder = folder
         self._settings = settings
         self._environ = {key: value for key, value in environ.items() if _is_for_pip(key)}
-        self._turn = asyncio.Lock()
+        self._turns = Turns(INSTALLS_AT_ONCE, waiting=MAX_WAITING, each=1)
+        self._locks = Locks()
+        self._tidying = asyncio.Lock()
 
     def open(self) -> None:
         """Look whether it works here, and remove what was begun and not finished. Blocks.
@@ -85,10 +92,11 @@ class Installer:
         forget_before_boot(self._folder)
         remove(self._folder / _SCRATCH)
 
-    async def install(self, package: Path) -> Path:
-        """Have a package's requirements here.
+    async def install(self, user: str, package: Path) -> Path:
+        """Have a package's requirements here. A user's are installed one after the other, beside others'.
 
         Args:
+            user: Whose package it is.
             package: The package's folder.
 
         Returns:
@@ -106,12 +114,22 @@ class Installer:
         text = "\n".join(wanted.lines) + "\n"
         key = hashlib.sha256(f"{tag}\n{text}".encode()).hexdigest()
         path = self._folder / key
-        async with self._turn:
-            if not path.is_dir():
-                await self._build(path, text, python)
-            await in_thread(os.utime, path)
+        if not path.is_dir():
+            try:
+                async with self._turns.turn(user):
+                    await self._have(path, text, python)
+            except CrowdedError:
+                raise RequirementsTrouble("too many requirements wait to be installed here") from None
+        await in_thread(os.utime, path)
+        async with self._tidying:
             await in_thread(self._make_room, path)
         return path
+
+    async def _have(self, path: Path, text: str, python: str) -> None:
+        """Build what is not there; two who want the same at once wait for one build of it."""
+        async with self._locks.of(path.name):
+            if not await in_thread(path.is_dir):
+                await self._build(path, text, python)
 
     async def _build(self, path: Path, text: str, python: str) -> None:
         async with scratch_aside(self._folder / _SCRATCH) as folder:

@@ -139,4 +139,4 @@ class Supply:
         if self._library.installer is None:
             self._tell(f"package {bundle.name} {bundle.version}: {_NOT_INSTALLED}")
             return None
-        return await self._library.installer.install(package)
+        return await self._library.installer.install(self._user, package)

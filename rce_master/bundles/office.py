@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import time
 from dataclasses import dataclass
@@ -12,12 +11,14 @@ from typing import TYPE_CHECKING
 from rce.bundles.exceptions import BadKey, BadSignature
 from rce.bundles.signing import statement, verify
 from rce.control.messages import TaskSetKind
+from rce.guard.turns import CrowdedError, Turns
+from rce_master.bundles.uploads import MAX_UPLOADS, Uploads
 from rce_master.exceptions import Busy, Forbidden, Invalid
 from rce_master.state import commands, packages
 from rce_master.state.records import Bundle, bundle_key, package_key_key
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Iterator
+    from collections.abc import AsyncIterator, Callable
 
     from rce.bundles.contents import Contents
     from rce_master.bundles.contents import ContentStore, Incoming
@@ -26,10 +27,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-UPLOAD_S = 1800.0
-"""How long an archive may take to come in."""
-MAX_UPLOADS = 8
-"""At the same time; of one user one."""
+INSPECTED_AT_ONCE = 2
+"""Archives that are looked through, which takes processor time."""
 
 
 _NOT_INSTALLED = (
@@ -64,7 +63,8 @@ class PackageOffice:
         self._realm = realm
         self._store = store
         self._clock = clock
-        self._uploading: set[str] = set()
+        self._uploads = Uploads()
+        self._turns = Turns(INSPECTED_AT_ONCE, waiting=MAX_UPLOADS)
         # Held while contents are there of which the state does not know yet, or any more.
         self._lock = asyncio.Lock()
         self._dirty = asyncio.Event()
@@ -102,19 +102,15 @@ class PackageOffice:
             StoreError: It cannot be kept.
         """
         self._check_early(wish, size)
-        with self._turn(wish.user):
-            try:
-                async with asyncio.timeout(UPLOAD_S):
-                    bundle, contents = await self._take(wish, chunks)
-            except TimeoutError:
-                raise Busy(f"the archive did not come in within {UPLOAD_S:.0f} s") from None
+        async with self._uploads.one(wish.user) as upload:
+            bundle, contents = await self._take(wish, upload.counted(chunks))
         kept = self._realm.tables.bundles.get(bundle.id) or bundle
         return kept, (*contents.warnings, *self._warnings(contents))
 
     async def _take(self, wish: Wish, chunks: AsyncIterator[bytes]) -> tuple[Bundle, Contents]:
         async with self._store.receive(chunks) as incoming:
             _verify(wish, incoming)
-            contents = await incoming.inspect()
+            contents = await self._inspect(wish.user, incoming)
             bundle = self._bundle(wish, incoming, contents)
             packages.check_new(self._realm.tables, bundle)
             async with self._lock:
@@ -125,6 +121,13 @@ class PackageOffice:
                     self._dirty.set()
         return bundle, contents
 
+    async def _inspect(self, user: str, incoming: Incoming) -> Contents:
+        try:
+            async with self._turns.turn(user):
+                return await incoming.inspect()
+        except CrowdedError:
+            raise Busy("too many packages are pushed at the same time; try again in a moment") from None
+
     def _check_early(self, wish: Wish, size: int) -> None:
         """Refuse what is to be refused anyway before all of it has come."""
         tables, settings = self._realm.tables, self._realm.state.settings
@@ -132,18 +135,6 @@ class PackageOffice:
             raise Forbidden("the key is not registered with your account; run: rce package key register")
         if bundle_key(wish.user, wish.name, wish.version) not in tables.bundles:
             packages.check_room(tables, settings, wish.user, size)
-
-    @contextlib.contextmanager
-    def _turn(self, user: str) -> Iterator[None]:
-        if user in self._uploading:
-            raise Busy("you are pushing another package just now; try again when it is done")
-        if len(self._uploading) >= MAX_UPLOADS:
-            raise Busy("too many packages are pushed at the same time; try again in a moment")
-        self._uploading.add(user)
-        try:
-            yield
-        finally:
-            self._uploading.discard(user)
 
     def _bundle(self, wish: Wish, incoming: Incoming, contents: Contents) -> Bundle:
         if contents.name != wish.name:

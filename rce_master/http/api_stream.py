@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 from collections.abc import Mapping
 from enum import Enum
@@ -69,7 +70,9 @@ async def _read_log(call: Call, node: str) -> models.LogOut:
     if not 0 < limit <= MAX_LOG:
         raise Invalid(f"query parameter 'limit' must be 1 to {MAX_LOG}")
     id_ = f"{call.owner}/{call.path('container')}"
-    chunk = await call.services.reconciler.read_log(id_, node, offset, limit, _wish(call.request.query))
+    wish = _wish(call.request.query)
+    async with call.services.quotas.log_read(call.caller):
+        chunk = await call.services.reconciler.read_log(id_, node, offset, limit, wish)
     return models.LogOut(
         text=chunk.text,
         offset=chunk.offset,
@@ -108,7 +111,11 @@ def _one_of(words: type[E], name: str, word: str) -> E:
 )
 async def stream_events(call: Call) -> web.StreamResponse:
     """Stream events until the client or the server ends it, or the token is worth nothing any more."""
-    scope, last = call.scope, _start(call)
+    with call.services.quotas.stream(call.caller):
+        return await _stream(call, call.scope, _start(call))
+
+
+async def _stream(call: Call, scope: str | None, last: int) -> web.StreamResponse:
     owner = call.services.realm.tables.users.get(scope or "")
     born = owner.created if owner is not None else 0.0  # what happened before was another one's of that name
     response = web.StreamResponse(
@@ -117,16 +124,19 @@ async def stream_events(call: Call) -> web.StreamResponse:
     await response.prepare(call.request)
     await response.write(b": hello\n\n")
     events = call.services.events
+    clock = asyncio.get_running_loop().time
+    written = clock()
     try:
         while True:
-            news = await events.wait(last, HEARTBEAT_S)
+            news = await events.wait(last, max(0.0, written + HEARTBEAT_S - clock()), scope)
             if not call.is_still_valid:
                 await response.write(_frame(_farewell(call, last)))
                 return response
             # A comment now and then keeps proxies from giving up, and finds out that a client is gone.
-            mine = [event for event in news if scope in (None, event.user) and event.time >= born]
-            frames = [_frame(event) for event in mine]
-            await response.write(b"".join(frames) or b":\n\n")
+            frames = [_frame(event) for event in news if event.time >= born]
+            if frames or clock() >= written + HEARTBEAT_S:
+                await response.write(b"".join(frames) or b":\n\n")
+                written = clock()
             last = news[-1].id if news else last
     except ConnectionResetError:
         # The client went away: the only way in which a stream ends from its side.

@@ -42,7 +42,11 @@ async def stream_usage(call: Call) -> web.StreamResponse:
     interval = call.number("interval", 2)
     if not LEAST_INTERVAL_S <= interval <= MOST_INTERVAL_S:
         raise Invalid(f"query parameter 'interval' must be {LEAST_INTERVAL_S} to {MOST_INTERVAL_S}")
-    scope = call.scope
+    with call.services.quotas.stream(call.caller):
+        return await _stream(call, call.scope, interval)
+
+
+async def _stream(call: Call, scope: str | None, interval: int) -> web.StreamResponse:
     response = web.StreamResponse(
         headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     )

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from rce_master.auth import Authenticator
     from rce_master.bundles.office import PackageOffice
     from rce_master.events import EventLog
+    from rce_master.quotas import Quotas
     from rce_master.realm import Realm
     from rce_master.reconciler import Reconciler
     from rce_master.state.records import User
@@ -51,6 +52,7 @@ class Services:
     """Seconds."""
     packages: PackageOffice
     tokens: Tokens
+    quotas: Quotas
     proxies: TrustedProxies = field(default_factory=TrustedProxies)
 
 

@@ -24,6 +24,7 @@ from rce_master.exceptions import (
     TaskSetAway,
     TooManyFailures,
     TooManyLogins,
+    TooMuch,
     WrongCredentials,
 )
 from rce_master.http import (
@@ -37,6 +38,7 @@ from rce_master.http import (
     api_usage,
 )
 from rce_master.http.entry import Entry
+from rce_master.http.health import Health
 from rce_master.http.metrics import make_registry
 from rce_master.http.models import Error
 from rce_master.http.routes import Call, Route, Services, read_body
@@ -78,7 +80,7 @@ def make_app(services: Services, *, allowed_origins: Iterable[str] = ()) -> web.
     )
     entry = Entry(services.realm.tables, asyncio.get_running_loop().time)
     app.router.add_get("/", entry.handle)
-    app.router.add_get("/healthz", _health(services))
+    app.router.add_get("/healthz", Health(services.realm).handle)
     app.router.add_get("/metrics", _metrics(services))
     app.router.add_get(f"{PREFIX}/openapi.json", _document())
     for route in ROUTES:
@@ -96,6 +98,8 @@ def _adapt(route: Route, services: Services) -> Handler:
             raise WrongCredentials("a bearer token is needed; get one at /api/v1/login")
         if route.admin and (user is None or user.role is not UserRole.ADMIN):
             raise Forbidden("only an administrator may do this")
+        if user is not None:
+            services.quotas.request(user)
         body = read_body(route.body, await _read(request)) if route.body else None
         reply = await route.handler(Call(request, services, user, token, body))
         if isinstance(reply, web.StreamResponse):
@@ -130,19 +134,6 @@ def _bearer(request: web.Request, services: Services) -> tuple[str, User | None]
     if record.scope:
         raise Forbidden(f"this token is good for {record.scope} only; log in for another one: rce login")
     return token.strip(), user
-
-
-def _health(services: Services) -> Handler:
-    async def handle(_: web.Request) -> web.Response:
-        tables = services.realm.tables
-        connected = sum(tables.is_connected(task_set.process) for task_set in tables.task_sets)
-        try:
-            await services.realm.check_store()
-        except StoreError as error:
-            return web.json_response({"status": str(error), "task_sets": connected}, status=503)
-        return web.json_response({"status": "ok", "task_sets": connected})
-
-    return handle
 
 
 def _metrics(services: Services) -> Handler:
@@ -227,7 +218,7 @@ def _status(error: MasterError) -> int:
 
 def _headers(error: MasterError) -> dict[str, str]:
     match error:
-        case TooManyFailures():
+        case TooManyFailures() | TooMuch():
             return {hdrs.RETRY_AFTER: str(math.ceil(error.retry_after))}
         case TooManyLogins():
             return {hdrs.RETRY_AFTER: "1"}

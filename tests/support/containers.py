@@ -145,6 +145,7 @@ class Machine:
         self.contents: dict[str, bytes] = {}
         """What its master hands out, by hash."""
         self.told: list[ToMaster] = []
+        self._chunk: asyncio.Future[LogChunk] | None = None
         self.manager: Manager
         self.marks: set[str] = set()
         self.pids: dict[int, int] = {}
@@ -210,7 +211,10 @@ class Machine:
         self.check_clean()
 
     def _tell(self, message: ToMaster) -> None:
-        self.told.append(message)
+        if isinstance(message, LogChunk) and self._chunk is not None and not self._chunk.done():
+            self._chunk.set_result(message)
+        else:
+            self.told.append(message)
 
     # What it says
 
@@ -250,10 +254,15 @@ class Machine:
         return await until(found, what=f"{id_}/{tag} is {state.value} (faults: {self.faults})")
 
     async def log(self, id_: str, node: str, offset: int = 0) -> str:
-        await self.manager.handle(ReadLog(request=1, id=id_, node=node, offset=offset, limit=1 << 20))
-        chunk = self.told.pop()
-        assert isinstance(chunk, LogChunk)
-        return chunk.text
+        request = ReadLog(request=1, id=id_, node=node, offset=offset, limit=1 << 20)
+        return (await self.read_log(request)).text
+
+    async def read_log(self, request: ReadLog) -> LogChunk:
+        """Ask for a piece of a log and wait for the answer, which other messages may come before."""
+        self._chunk = asyncio.get_running_loop().create_future()
+        await self.manager.handle(request)
+        async with asyncio.timeout(20):
+            return await self._chunk
 
     async def log_holds(self, id_: str, node: str, text: str) -> str:
         deadline = time.monotonic() + 20

@@ -81,10 +81,7 @@ def own(exe: str, args: str = "", tag: str = "node", **options: Any) -> NodeSpec
 
 async def read(machine: Machine, node: str, *streams: LogStream, id_: str = BOX, **wish: Any) -> LogChunk:
     request = ReadLog(request=1, id=id_, node=node, limit=1 << 20, wish=LogWish(streams=streams, **wish))
-    await machine.manager.handle(request)
-    chunk = machine.told.pop()
-    assert isinstance(chunk, LogChunk)
-    return chunk
+    return await machine.read_log(request)
 
 
 async def holds(machine: Machine, node: str, text: str, *streams: LogStream, **wish: Any) -> str:

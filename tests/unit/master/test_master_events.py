@@ -36,3 +36,15 @@ async def test_followers_wait_for_news() -> None:
     for found in await asyncio.gather(*waiting):
         assert [e.text for e in found] == ["news"]
     assert await log.wait(log.last_id, 0.01) == []
+
+
+def test_one_users_flood_costs_nobody_else_their_events() -> None:
+    log = EventLog(0.0, capacity=10)
+    for text in ("first", "second"):
+        log.add(Happening("kind", "bert", "bert/c", text), 0.0)
+    for number in range(100):
+        log.add(happening(str(number)), 0.0)
+    assert [e.text for e in log.since(-1, user="bert")] == ["first", "second"]
+    assert [e.text for e in log.since(-1, user="anna")] == [str(number) for number in range(92, 100)]
+    assert [e.text for e in log.since(-1, limit=3)] == ["first", "second", "92"]
+    assert log.since(-1, user="nobody") == []

@@ -1,0 +1,91 @@
+"""Who is sending an archive just now: one of each user, and so many that slow ones keep nobody out."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from rce_master.exceptions import Busy, TooMuch
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+UPLOAD_S = 1800.0
+"""How long an archive may take to come in."""
+MAX_UPLOADS = 64
+"""At the same time; of one user one."""
+FIRST_S = 10.0
+"""So long an upload is not asked to make room: it may only have begun."""
+
+
+@dataclass(eq=False, slots=True)
+class Upload:
+    """An archive that is on its way."""
+
+    user: str
+    begun: float
+    deadline: asyncio.Timeout
+    received: int = 0
+    """Bytes."""
+    gave_way: bool = field(default=False)
+
+    async def counted(self, chunks: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+        """Pass on what comes, and count it."""
+        async for chunk in chunks:
+            self.received += len(chunk)
+            yield chunk
+
+    def rate(self, now: float) -> float:
+        """Tell how many bytes came each second."""
+        return self.received / (now - self.begun)
+
+
+class Uploads:
+    """The archives that are on their way. When there are too many, the slowest gives way to a new one.
+
+    Args:
+        clock: Seconds that never go back.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._uploads: dict[str, Upload] = {}
+        """By user."""
+
+    @contextlib.asynccontextmanager
+    async def one(self, user: str) -> AsyncIterator[Upload]:
+        """Have a place for as long as the context lasts.
+
+        Raises:
+            TooMuch: The user is sending another one.
+            Busy: There is no room, or it took too long, or gave way to another one.
+        """
+        if user in self._uploads:
+            raise TooMuch("you are pushing another package just now; try again when it is done", 5)
+        if len(self._uploads) >= MAX_UPLOADS:
+            self._make_room()
+        upload: Upload | None = None
+        try:
+            async with asyncio.timeout(UPLOAD_S) as deadline:
+                upload = self._uploads[user] = Upload(user, self._clock(), deadline)
+                yield upload
+        except TimeoutError:
+            if upload is not None and upload.gave_way:
+                raise Busy("the archive came too slowly and gave way to others; try again later") from None
+            raise Busy(f"the archive did not come in within {UPLOAD_S:.0f} s") from None
+        finally:
+            if upload is not None and self._uploads.get(user) is upload:
+                del self._uploads[user]
+
+    def _make_room(self) -> None:
+        now = self._clock()
+        older = [one for one in self._uploads.values() if now - one.begun >= FIRST_S]
+        if not older:
+            raise Busy("too many packages are pushed at the same time; try again in a moment")
+        slowest = min(older, key=lambda one: one.rate(now))
+        slowest.gave_way = True
+        slowest.deadline.reschedule(asyncio.get_running_loop().time())
+        del self._uploads[slowest.user]

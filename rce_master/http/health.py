@@ -1,0 +1,45 @@
+"""``GET /healthz``: whether the master works. Open to everybody; many who ask cost one look at the store."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+from aiohttp import web
+
+from rce_master.exceptions import StoreError
+
+if TYPE_CHECKING:
+    from rce_master.realm import Realm
+
+
+class Health:
+    """Answers whether the store can be used, and how many task sets are connected.
+
+    Args:
+        realm: Whose store it is.
+    """
+
+    def __init__(self, realm: Realm) -> None:
+        self._realm = realm
+        self._look: asyncio.Task[str] | None = None
+        """Whoever asks while it runs waits for the same answer."""
+
+    async def handle(self, _: web.Request) -> web.Response:
+        """Answer 200, or 503 with what is wrong."""
+        if self._look is None:
+            self._look = asyncio.create_task(self._check())
+        fault = await asyncio.shield(self._look)
+        tables = self._realm.tables
+        connected = sum(tables.is_connected(task_set.process) for task_set in tables.task_sets)
+        body = {"status": fault or "ok", "task_sets": connected}
+        return web.json_response(body, status=503 if fault else 200)
+
+    async def _check(self) -> str:
+        try:
+            await self._realm.check_store()
+        except StoreError as error:
+            return str(error)
+        finally:
+            self._look = None
+        return ""

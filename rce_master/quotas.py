@@ -1,0 +1,138 @@
+"""How much of the master one user may have at a time: requests, streams, reads of logs.
+
+One user's use costs another nothing but their own share: all of it is counted by user. Administrators have no
+quotas.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rce.guard.rates import Rates
+from rce.guard.turns import CrowdedError, Turns
+from rce_master.exceptions import TooMuch
+from rce_master.state.records import UserRole
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Iterator
+
+    from rce_master.state.records import User
+
+READS_AT_ONCE = 32
+READS_WAITING = 512
+"""Reads of logs of all users that wait; when there are more, the user with the most is told to try later."""
+ITEMS_PER_REQUEST = 20
+"""So many nodes, interfaces, parameters, ... in one request count as one more request."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QuotaSettings:
+    """What one user may have."""
+
+    requests: float = 100.0
+    """Requests over REST each second, and as many over all WebSockets of their robots; 0 for no limit."""
+    request_burst: int = 2000
+    """Requests that may come at once, after a rest."""
+    streams: int = 64
+    """Streams of events and of usage at the same time; 0 for no limit."""
+    log_reads: int = 4
+    """Reads of logs at the same time; others wait for them."""
+
+
+class Quotas:
+    """Counts what users do.
+
+    Args:
+        settings: What one user may have.
+        clock: Seconds that never go back.
+    """
+
+    def __init__(
+        self, settings: QuotaSettings | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._settings = settings or QuotaSettings()
+        self._clock = clock
+        self._rest, self._robots = (self._rates() for _ in range(2))
+        self._streams: Counter[str] = Counter()
+        self._reads = Turns(READS_AT_ONCE, waiting=READS_WAITING, each=self._settings.log_reads)
+
+    def request(self, user: User) -> None:
+        """Count a request over REST.
+
+        Raises:
+            TooMuch: There were too many.
+        """
+        self._take(self._rest, user, 1)
+
+    def robot_request(self, user: User, items: int) -> None:
+        """Count a request of a robot.
+
+        Args:
+            user: Whose robot.
+            items: How many nodes, interfaces, ... it is about.
+
+        Raises:
+            TooMuch: There were too many.
+        """
+        self._take(self._robots, user, 1 + items // ITEMS_PER_REQUEST)
+
+    @contextlib.contextmanager
+    def stream(self, user: User) -> Iterator[None]:
+        """Count a stream for as long as the context lasts.
+
+        Raises:
+            TooMuch: There are too many.
+        """
+        most = self._settings.streams
+        if most and user.role is not UserRole.ADMIN and self._streams[user.name] >= most:
+            raise TooMuch(
+                f"you follow {most} streams of events or usage already, and may not follow more; end one", 1
+            )
+        self._streams[user.name] += 1
+        try:
+            yield
+        finally:
+            self._streams[user.name] -= 1
+            if not self._streams[user.name]:
+                del self._streams[user.name]
+
+    @contextlib.asynccontextmanager
+    async def log_read(self, user: User) -> AsyncIterator[None]:
+        """Wait until a user may read of a log.
+
+        Raises:
+            TooMuch: Too many of the user's reads wait.
+        """
+        turn = self._reads.turn(user.name)
+        try:
+            await turn.__aenter__()
+        except CrowdedError:
+            raise TooMuch(
+                "too many of your reads of logs wait already; read one after the other", 1
+            ) from None
+        try:
+            yield
+        finally:
+            await turn.__aexit__(None, None, None)
+
+    def _rates(self) -> Rates | None:
+        settings = self._settings
+        if not settings.requests:
+            return None
+        return Rates(per_second=settings.requests, burst=max(1, settings.request_burst))
+
+    def _take(self, rates: Rates | None, user: User, cost: int) -> None:
+        if rates is None or user.role is UserRole.ADMIN:
+            return
+        wait = rates.take(user.name, self._clock(), cost)
+        if wait:
+            raise TooMuch(
+                f"too many requests: you may make {self._settings.requests:g} a second; "
+                f"try again in {math.ceil(wait)} s",
+                wait,
+            )

@@ -1,0 +1,136 @@
+"""One user asks for as much as they can of each kind; another one's requests are answered all the same."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import AsyncExitStack, asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import aiohttp
+
+from rce.control.messages import LogChunk, ReadLog
+from rce_master.auth import client_digest
+from rce_master.quotas import QuotaSettings
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+    from contextlib import AbstractAsyncContextManager
+
+    from conftest import Site, TaskSet
+
+    RunSite = Callable[..., AbstractAsyncContextManager[Site]]
+
+SMALL = QuotaSettings(requests=1, request_burst=20, streams=3, log_reads=2)
+HEADERS = {"Content-Type": "application/gzip"}
+
+
+@asynccontextmanager
+async def two_users(run_site: RunSite) -> AsyncIterator[tuple[Site, str, str]]:
+    """A master, and the tokens of two users."""
+    async with run_site(quotas=SMALL) as site:
+        for name in ("anna", "bert"):
+            body = {"name": name, "password": name, "role": "user"}
+            await site.api("POST", "/users", body, status=201)
+        yield site, await site.login("anna", "anna"), await site.login("bert", "bert")
+
+
+async def ask(site: Site, token: str, path: str = "/robots") -> tuple[int, str | None]:
+    headers = {"Authorization": f"Bearer {token}"}
+    async with site.session.get(f"{site.url}api/v1{path}", headers=headers) as reply:
+        await reply.read()
+        return reply.status, reply.headers.get("Retry-After")
+
+
+async def test_requests_over_rest(run_site: RunSite) -> None:
+    async with two_users(run_site) as (site, anna, bert):
+        answers = await asyncio.gather(*(ask(site, anna) for _ in range(60)))
+        assert {status for status, _ in answers} == {200, 429}
+        assert all(wait is not None and int(wait) >= 1 for status, wait in answers if status == 429)
+        reply = await site.api("GET", "/robots", token=anna, status=429)
+        assert "too many requests: you may make 1 a second; try again in 1 s" in reply["error"]
+        await site.api("GET", "/robots", token=bert)
+        for _ in range(60):  # administrators have no quotas
+            await site.api("GET", "/robots")
+
+
+async def test_requests_of_robots(run_site: RunSite) -> None:
+    async with two_users(run_site) as (site, _, _), site.robots() as robots, site.containers():
+        for name in ("anna", "bert"):
+            assert (await robots.channel.login(name, "rob", client_digest(name))).status == 200
+
+        async def create(user: str, tag: str) -> tuple[str, ...]:
+            reply = await robots.channel.client_request(f"{user}/rob", "CC", {"containerTag": tag})
+            return reply.errors
+
+        answers = await asyncio.gather(*(create("anna", f"c{number}") for number in range(60)))
+        refused = [error for errors in answers for error in errors]
+        assert 30 <= len(refused) < 60
+        assert all("CC: too many requests" in error and "try again in" in error for error in refused)
+        assert await create("bert", "c") == ()
+
+
+async def test_streams(run_site: RunSite) -> None:
+    async with two_users(run_site) as (site, anna, bert), AsyncExitStack() as stack:
+
+        async def follow(token: str, path: str) -> aiohttp.ClientResponse:
+            headers = {"Authorization": f"Bearer {token}"}
+            return await stack.enter_async_context(
+                site.session.get(f"{site.url}api/v1{path}", headers=headers)
+            )
+
+        first = await follow(anna, "/events")
+        for path in ("/usage/live", "/events"):
+            assert (await follow(anna, path)).status == 200
+        for path in ("/usage/live", "/events"):
+            refused = await follow(anna, path)
+            assert (refused.status, refused.headers["Retry-After"]) == (429, "1")
+        assert (await follow(bert, "/events")).status == 200
+        first.close()
+        async with asyncio.timeout(20):
+            while (await follow(anna, "/usage/live")).status != 200:
+                await asyncio.sleep(0.5)
+
+
+async def test_reads_of_logs(run_site: RunSite) -> None:
+    """The machine answers none of the first user's reads, and is asked for no more than it may be."""
+    async with two_users(run_site) as (site, anna, bert), site.containers() as machine:
+        silent(machine, "anna")
+        for token in (anna, bert):
+            await site.api("POST", "/containers", {"tag": "c"}, token=token, status=204)
+        waiting = [asyncio.create_task(ask(site, anna, "/containers/c/log")) for _ in range(10)]
+        while len(machine.asked) < SMALL.log_reads:
+            await asyncio.sleep(0.01)
+        reply = await site.api("GET", "/containers/c/log", token=bert)
+        assert reply["text"] == "said bert"
+        assert [message.id for message in machine.asked] == ["anna/c", "anna/c", "bert/c"]
+        for task in waiting:
+            task.cancel()
+        await asyncio.gather(*waiting, return_exceptions=True)
+
+
+def silent(machine: TaskSet, user: str) -> None:
+    """Have a machine keep its answers to one user's reads of logs to itself."""
+
+    async def handle(message: Any) -> None:
+        if not isinstance(message, ReadLog):
+            machine.inbox.put_nowait(message)
+            return
+        machine.asked.append(message)
+        owner = message.id.partition("/")[0]
+        if owner != user:
+            machine.channel.send(LogChunk(request=message.request, offset=0, text=f"said {owner}"))
+
+    machine.channel._handler = handle
+
+
+async def test_events_of_a_flood_leave_others_theirs(run_site: RunSite) -> None:
+    async with two_users(run_site) as (site, anna, bert):
+        await site.api("POST", "/containers", {"tag": "mine"}, token=bert, status=204)
+        headers = {"Authorization": f"Bearer {bert}"}
+        for number in range(15):
+            await site.api("POST", "/containers", {"tag": f"c{number}"}, token=anna, status=204)
+        async with site.session.get(f"{site.url}api/v1/events?since=0", headers=headers) as stream:
+            async with asyncio.timeout(20):
+                lines = [await stream.content.readline() for _ in range(5)]
+        assert b'"subject":"bert/mine"' in b"".join(lines)
+        assert b"anna" not in b"".join(lines)
