@@ -135,6 +135,10 @@ _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
         lambda: data_folder() is not None,
         "the folder of public maps and logs is absent (set RCE_DATA)",
     ),
+    "systemd": (
+        lambda: shutil.which("systemd-analyze") is not None,
+        "systemd-analyze is missing (Debian: systemd)",
+    ),
     "root": (lambda: os.geteuid() == 0, "needs root"),
     "cgroups": (_can_limit, "no cgroup can be made here (needs root, or a delegated subtree)"),
     "podman": (

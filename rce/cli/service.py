@@ -1,0 +1,178 @@
+"""``rce install-service`` and ``rce uninstall-service``: the engine's programs as services of systemd."""
+
+from __future__ import annotations
+
+import json
+import os
+import pwd
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import platformdirs
+import typer
+from msgspec.structs import replace
+
+from rce.config.exceptions import ConfigError
+from rce.config.loading import load_settings
+from rce.config.secret import default_secret_file
+from rce.config.settings import EngineSettings
+from rce.services.units import SYSTEM_STATE, Role, Service, unit
+
+SYSTEM_UNITS = Path("/etc/systemd/system")
+SYSTEM_CONFIG = Path("/etc/rce")
+USER = "rce"
+_PROGRAMS = {
+    Role.ENGINE: ("rce", "up"),
+    Role.MASTER: ("rce-master",),
+    Role.ROBOT: ("rce-robot",),
+    Role.CONTAINER: ("rce-container",),
+}
+
+UserUnit = Annotated[
+    bool | None,
+    typer.Option("--user/--system", help="A unit of this user, or of the machine (default: as root)"),
+]
+
+
+def install_service(
+    role: Annotated[Role, typer.Argument(help="engine is all in one, by rce up.")],
+    arguments: Annotated[
+        list[str] | None,
+        typer.Argument(help="More arguments of the program, after --, such as: -- 10.0.0.1"),
+    ] = None,
+    *,
+    user_unit: UserUnit = None,
+    config: Annotated[
+        Path | None, typer.Option(help="Settings file (default: engine.yaml in /etc/rce or ~/.config/rce)")
+    ] = None,
+    run_as: Annotated[
+        str, typer.Option(help="User of master and robot units of the machine; made if there is none.")
+    ] = USER,
+    show: Annotated[bool, typer.Option("--print", help="Only print the unit.")] = False,
+) -> None:
+    """Install a unit of systemd, and start it."""
+    system = _is_system(user_unit)
+    service = make_service(role, tuple(arguments or ()), system=system, config=config, run_as=run_as)
+    text = unit(service)
+    if show:
+        typer.echo(text, nl=False)
+        return
+    _check(service)
+    if service.user:
+        _make_user(service.user)
+    folder = _units(system=system)
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / service.name
+    path.write_text(text, encoding="utf-8")
+    typer.echo(f"made {path}")
+    _systemctl(system, ["daemon-reload"], ["enable", "--now", service.name])
+
+
+def uninstall_service(role: Role, *, user_unit: UserUnit = None) -> None:
+    """Stop a unit that install-service made, and remove it; state and settings stay."""
+    system = _is_system(user_unit)
+    path = _units(system=system) / f"rce-{role}.service"
+    if not path.exists():
+        _fail(f"there is no {path}")
+    _systemctl(system, ["disable", "--now", path.name])
+    path.unlink()
+    _systemctl(system, ["daemon-reload"])
+    typer.echo(f"removed {path}")
+
+
+def make_service(
+    role: Role, arguments: tuple[str, ...], *, system: bool, config: Path | None, run_as: str
+) -> Service:
+    """Put a service together from the settings file that it will have."""
+    folder = SYSTEM_CONFIG if system else platformdirs.user_config_path("rce")
+    default = folder / "engine.yaml"
+    file = default if config is None and default.exists() else config
+    settings = _load(file)
+    program = Path(sys.executable).parent / _PROGRAMS[role][0]
+    words = [*_PROGRAMS[role][1:]]
+    if file is not None:
+        words += ["--config", str(file.absolute())]
+    if system and settings.state_dir == EngineSettings().state_dir:
+        settings = replace(settings, state_dir=SYSTEM_STATE)
+        words += ["--settings", json.dumps({"state_dir": str(SYSTEM_STATE)})]
+    states = {
+        Role.ENGINE: settings.state_dir,
+        Role.MASTER: settings.master_state,
+        Role.CONTAINER: settings.container_state,
+    }
+    user = run_as if system and role in (Role.MASTER, Role.ROBOT) and run_as != "root" else ""
+    homes = (Path("/home"), Path("/root"))
+    return Service(
+        role=role,
+        program=program,
+        arguments=(*words, *arguments),
+        system=system,
+        user=user,
+        secret=(settings.secret_file or SYSTEM_CONFIG / "secret") if system and not settings.dev else None,
+        state=states.get(role),
+        hide_homes=not any(program.is_relative_to(home) for home in homes),
+    )
+
+
+def _load(file: Path | None) -> EngineSettings:
+    try:
+        return load_settings(file)
+    except ConfigError as error:
+        typer.echo(error, err=True)
+        raise typer.Exit(2) from None
+
+
+def _is_system(user_unit: bool | None) -> bool:
+    return os.geteuid() == 0 if user_unit is None else not user_unit
+
+
+def _units(*, system: bool) -> Path:
+    return SYSTEM_UNITS if system else platformdirs.user_config_path("systemd") / "user"
+
+
+def _check(service: Service) -> None:
+    """Refuse what would not start."""
+    if not service.program.exists():
+        _fail(f"{service.program} is not installed; install RCE with the extra 'server'")
+    if service.user and not service.hide_homes:
+        _fail(
+            f"{service.program} is in a home folder, where user {service.user} cannot go: install RCE"
+            " elsewhere, such as in /opt/rce (python3 -m venv /opt/rce), or give --run-as root"
+        )
+    if service.secret is not None and not service.secret.exists():
+        _fail(
+            f"there is no secret: make it with `rce secret new {service.secret}`, or copy it from the master"
+        )
+    if not service.system and not default_secret_file().exists():
+        typer.echo(f"note: there is no secret in {default_secret_file()} yet (rce secret new)")
+
+
+def _make_user(name: str) -> None:
+    try:
+        pwd.getpwnam(name)
+    except KeyError:
+        argv = ["useradd", "--system", "--no-create-home", "--shell", "/usr/sbin/nologin", name]
+        done = subprocess.run(argv, check=False, capture_output=True, text=True)  # noqa: S603 - fixed words
+        if done.returncode:
+            _fail(f"cannot make the user {name}: {done.stderr.strip()}")
+        typer.echo(f"made the user {name}")
+
+
+def _systemctl(system: bool, *commands: list[str]) -> None:
+    """Tell systemd, or say what to tell it where it does not run."""
+    scope = [] if system else ["--user"]
+    runs = Path("/run/systemd/system").is_dir() and shutil.which("systemctl")
+    for command in commands:
+        argv = ["systemctl", *scope, *command]
+        if not runs:
+            typer.echo(f"systemd does not run here; on the machine: {' '.join(argv)}")
+        elif subprocess.run(argv, check=False).returncode:  # noqa: S603 - fixed words and a unit's name
+            _fail(f"{' '.join(argv)} failed")
+
+
+def _fail(text: str) -> None:
+    typer.echo(f"rce: {text}", err=True)
+    raise typer.Exit(1)

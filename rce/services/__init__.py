@@ -1,0 +1,1 @@
+"""The engine's programs as services of systemd."""

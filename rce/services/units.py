@@ -1,0 +1,144 @@
+"""Writes systemd units of the engine's programs. Pure: texts from settings.
+
+What a unit forbids is what its program never needs. `rce-container` makes namespaces, mounts and cgroups for
+its containers, so its unit forbids little; it has its cgroup's subtree delegated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+SYSTEM_STATE = Path("/var/lib/rce")
+_CREDENTIAL = "secret"
+
+
+class Role(StrEnum):
+    """What a service runs."""
+
+    ENGINE = "engine"
+    """All programs, by ``rce up``."""
+    MASTER = "master"
+    ROBOT = "robot"
+    CONTAINER = "container"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Service:
+    """A service that is to be installed.
+
+    Attributes:
+        role: What it runs.
+        program: Path of the program.
+        arguments: Its command line, without the program.
+        system: A unit of the machine; else one of a user.
+        user: As whom it runs; empty for root, or the user whose unit it is.
+        secret: File with the engine's secret, handed over as a credential; None: the program finds it itself.
+        state: Folder that it may write; None for none.
+        hide_homes: Nothing that it needs is in a home folder.
+    """
+
+    role: Role
+    program: Path
+    arguments: tuple[str, ...] = ()
+    system: bool = True
+    user: str = ""
+    secret: Path | None = None
+    state: Path | None = None
+    hide_homes: bool = True
+
+    @property
+    def name(self) -> str:
+        """Name of the unit's file."""
+        return f"rce-{self.role}.service"
+
+
+_TITLES = {
+    Role.ENGINE: "RCE, a cloud robotics engine: all programs",
+    Role.MASTER: "RCE master: clients, users, desired state",
+    Role.ROBOT: "RCE robot endpoint: robots' connections",
+    Role.CONTAINER: "RCE container task set: makes containers",
+}
+
+_NO_RIGHTS = """\
+NoNewPrivileges=yes
+CapabilityBoundingSet=
+ProtectSystem=strict
+PrivateTmp=yes
+PrivateDevices=yes
+ProtectClock=yes
+ProtectControlGroups=yes
+ProtectHostname=yes
+ProtectKernelLogs=yes
+ProtectKernelModules=yes
+ProtectKernelTunables=yes
+RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK
+RestrictNamespaces=yes
+RestrictRealtime=yes
+RestrictSUIDSGID=yes
+LockPersonality=yes
+SystemCallArchitectures=native
+SystemCallFilter=@system-service
+UMask=0077
+"""
+
+_OF_CONTAINERS = """\
+# Containers are made with namespaces, mounts and cgroups of their own: nothing of that may be taken away.
+Delegate=yes
+TasksMax=infinity
+OOMPolicy=continue
+ProtectKernelModules=yes
+"""
+
+
+def unit(service: Service) -> str:
+    """Return the text of a service's unit."""
+    command = " ".join(map(quoted, (str(service.program), *service.arguments)))
+    if service.secret is not None:
+        command += f" --secret-file %d/{_CREDENTIAL}"
+    wanted_by = "multi-user.target" if service.system else "default.target"
+    parts = [
+        f"# Made by `rce install-service {service.role}`.\n",
+        f"[Unit]\nDescription={_TITLES[service.role]}\n",
+        "Wants=network-online.target\nAfter=network-online.target\n" if service.system else "",
+        f"\n[Service]\nType=exec\nExecStart={command}\n",
+        "Environment=PYTHONUNBUFFERED=1\nRestart=always\nRestartSec=2\nTimeoutStopSec=60\nKillMode=mixed\n",
+        f"SyslogIdentifier=rce-{service.role}\n",
+        "LimitNOFILE=524288\n" if service.system else "",
+        *_place(service),
+        f"\n[Install]\nWantedBy={wanted_by}\n",
+    ]
+    return "".join(parts)
+
+
+def quoted(text: str) -> str:
+    """Write a word of a command line as systemd reads it back."""
+    if any(ord(character) < ord(" ") for character in text):
+        raise ValueError(f"{text!r} has a control character, which a unit cannot hold")
+    escaped = text.replace("%", "%%").replace("$", "$$").replace("\\", "\\\\").replace('"', '\\"')
+    plain = escaped == text and text and not set(text) & set(" ';#")
+    return text if plain else f'"{escaped}"'
+
+
+def _place(service: Service) -> list[str]:
+    """Return who runs it, and what it may reach."""
+    lines = [f"User={service.user}\n"] if service.user else []
+    if service.secret is not None:
+        lines.append(f"LoadCredential={_CREDENTIAL}:{service.secret}\n")
+    holds_containers = service.role in (Role.CONTAINER, Role.ENGINE)
+    if service.system:
+        run = f"rce-{service.role}"
+        lines.append(
+            f"RuntimeDirectory={run}\nRuntimeDirectoryMode=0700\nEnvironment=XDG_RUNTIME_DIR=/run/{run}\n"
+        )
+        if service.state is not None and service.state.is_relative_to(SYSTEM_STATE):
+            folder = service.state.relative_to(SYSTEM_STATE.parent)
+            lines.append(f"StateDirectory={folder}\nStateDirectoryMode=0700\n")
+        elif service.state is not None and not holds_containers:
+            lines.append(f"ReadWritePaths={quoted(str(service.state))}\n")
+    if holds_containers:
+        lines.append(_OF_CONTAINERS if service.system else "Delegate=yes\n")
+    elif service.system:
+        lines.append(_NO_RIGHTS + ("ProtectHome=yes\n" if service.hide_homes else ""))
+    return lines
