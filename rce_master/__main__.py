@@ -61,6 +61,7 @@ def _settings(engine: EngineSettings) -> MasterSettings:
         dev=engine.dev,
         tls=TlsChoice.of(engine),
         allowed_origins=own.origins,
+        public_names=own.public_names,
         trusted_proxies=own.trusted_proxies,
         token_lifetime=own.token_lifetime,
         state=StateSettings(

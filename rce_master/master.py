@@ -13,6 +13,7 @@ from rce.control.server import ControlServer
 from rce.guard.proxies import TrustedProxies
 from rce.tls.choice import plain_warning
 from rce.tls.expiry import watch_expiry
+from rce.web.origin import ServerNames
 from rce.web.server import HttpServer
 from rce_master.auth import Authenticator, client_digest
 from rce_master.bundles.contents import ContentStore
@@ -117,6 +118,7 @@ class Master:
             packages,
             tokens,
             quotas,
+            self._settings.dev,
             TrustedProxies(self._settings.trusted_proxies),
         )
         try:
@@ -145,7 +147,8 @@ class Master:
         if settings.dev:
             await make_dev_user(services)
         for_clients, for_task_sets = settings.tls.for_clients(), settings.tls.for_task_sets()
-        app = make_app(services, allowed_origins=settings.allowed_origins)
+        names = ServerNames(settings.bind, settings.public_names)
+        app = make_app(services, allowed_origins=settings.allowed_origins, names=names)
         control = ControlServer(
             self._secret,
             on_hello=desk.on_hello,

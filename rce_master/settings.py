@@ -31,6 +31,8 @@ class MasterSettings:
     """Make the user testUser with the password testUser, an administrator."""
     tls: TlsChoice = field(default_factory=TlsChoice)
     allowed_origins: tuple[str, ...] = ()
+    public_names: tuple[str, ...] = ()
+    """Names by which the server may be asked for, beside its address, its host name and ``localhost``."""
     trusted_proxies: tuple[str, ...] = ()
     """Addresses or networks of proxies whose ``X-Forwarded-For`` is believed."""
     token_lifetime: float = TOKEN_LIFETIME_S

@@ -56,6 +56,13 @@ class MasterSettings(Section, frozen=True, kw_only=True):
         tuple[str, ...],
         Setting("Origins whose web pages may use the server.", option="allow-origin"),
     ] = ()
+    public_names: Annotated[
+        tuple[str, ...],
+        Setting(
+            "Names by which the server may be asked for, beside its addresses, host name and `localhost`.",
+            option="public-name",
+        ),
+    ] = ()
     robot_grace: Annotated[
         Seconds, Setting("How long a robot that is away keeps its interfaces and connections.")
     ] = 60.0

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import ipaddress
+import re
+import socket
+from collections.abc import Collection, Iterable
 
 from yarl import URL
 
+_HOST = re.compile(r"(?:\[(?P<v6>[0-9A-Fa-f:.]+)\]|(?P<name>[^:@\[\]\s/]+))(?::[0-9]{1,5})?")
+
 
 def is_foreign(origin: str | None, host: str, allowed: Collection[str] = ()) -> bool:
-    """Tell whether a request comes from a page of another site.
+    """Return whether a request comes from a page of another site.
 
     Args:
         origin: The request's ``Origin``; programs that are no browser send none.
@@ -21,3 +26,50 @@ def is_foreign(origin: str | None, host: str, allowed: Collection[str] = ()) -> 
         return URL(origin).authority != host
     except ValueError:
         return True
+
+
+class ServerNames:
+    """The names by which a server may be asked for.
+
+    A page whose own name is made to lead to this server (DNS rebinding) is of the same origin as the server,
+    as far as its browser can tell: ``Origin`` fits ``Host``, or is left out. But ``Host`` holds the page's
+    name, which no server here has. An address as ``Host`` is always accepted: nothing can make an address
+    lead elsewhere, and a server behind address translation does not know its own.
+
+    Example::
+
+        names = ServerNames("0.0.0.0", ["cloud.example.org"])
+        names.refusal("evil.example:9000")  # a text that says what to do
+        names.refusal("cloud.example.org")  # None
+
+    Args:
+        bind: The address or name that the server listens on.
+        public: Further names that its operator gave it.
+    """
+
+    def __init__(self, bind: str = "", public: Iterable[str] = ()) -> None:
+        machine = socket.gethostname().lower()
+        own = ("localhost", machine, machine.partition(".")[0], bind, *public)
+        self._names = frozenset(name.lower().rstrip(".") for name in own if name)
+
+    def __contains__(self, host: str) -> bool:
+        """Return whether a ``Host`` header, with or without a port, names this server."""
+        found = _HOST.fullmatch(host)
+        if found is None:
+            return False
+        text = found["v6"] or found["name"]
+        try:
+            ipaddress.ip_address(text)
+        except ValueError:
+            return found["v6"] is None and text.lower().rstrip(".") in self._names
+        return True
+
+    def refusal(self, host: str) -> str | None:
+        """Return why a request for ``host`` is not served, and what to do; None if it is."""
+        if host in self:
+            return None
+        name = host[:100] or "(empty)"
+        return (
+            f"this server does not know the name {name!r}; use its address or host name, or let its operator"
+            " add the name (--public-name)"
+        )

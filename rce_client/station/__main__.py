@@ -24,6 +24,7 @@ from rce.ros.types import TypeRegistry
 from rce.tls.choice import ENGINE, TlsChoice, default_folder, plain_warning
 from rce.tls.exceptions import CertificateError
 from rce.tls.identity import Context
+from rce.web.origin import ServerNames
 from rce.web.server import HttpServer
 from rce_client.exceptions import RefusedError
 from rce_client.station.engine_watch import EngineWatch
@@ -48,6 +49,10 @@ def ui(
     ] = "",
     port: Annotated[int, typer.Option(help="Port of the page and the API; 0 takes a free one.")] = PORT,
     bind: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    public_name: Annotated[
+        list[str] | None,
+        typer.Option(help="Further name by which the station may be asked for; may be repeated."),
+    ] = None,
     token: Annotated[
         str,
         typer.Option(envvar="RCE_STATION_TOKEN", help="Callers must show it; needed beyond loopback."),
@@ -81,7 +86,8 @@ def ui(
     if not token and not _is_loopback(bind):
         raise typer.BadParameter(f"--bind {bind} opens the station to others: give it a --token")
     try:
-        uvloop.run(serve(way, bind, port, token, identity.server if identity else None))
+        names = ServerNames(bind, public_name or ())
+        uvloop.run(serve(way, bind, port, token, names, identity.server if identity else None))
     except* RefusedError as group:
         typer.echo(f"rce ui: {group.exceptions[0]}", err=True)
         raise typer.Exit(1) from None
@@ -175,7 +181,9 @@ class RosWay:
         await GraphWatch(self._master_uri, on_state=on_state).run()
 
 
-async def serve(way: Way, bind: str, port: int, token: str, tls: Context | None = None) -> None:
+async def serve(
+    way: Way, bind: str, port: int, token: str, names: ServerNames, tls: Context | None = None
+) -> None:
     """Serve until SIGINT or SIGTERM."""
     view, pages = FleetView(), Broadcast()
     feed = Feed(view, pages)
@@ -183,7 +191,8 @@ async def serve(way: Way, bind: str, port: int, token: str, tls: Context | None 
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    async with HttpServer(Station(view, fleet, pages, token=token).make_app(), bind, port, tls) as server:
+    station = Station(view, fleet, pages, token=token, names=names)
+    async with HttpServer(station.make_app(), bind, port, tls) as server:
 
         async def announce() -> None:
             typer.echo(f"rce ui ready: {server.url}")

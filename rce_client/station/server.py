@@ -12,7 +12,7 @@ from aiohttp import WSMsgType, hdrs, web
 from pydantic import BaseModel, ValidationError
 
 from rce.web.openapi import PREFIX, Operation, build_document
-from rce.web.origin import is_foreign
+from rce.web.origin import ServerNames, is_foreign
 from rce_client.station.api import (
     Answer,
     CellRequest,
@@ -43,9 +43,19 @@ class Station:
         fleet: Carries wishes to the planner.
         pages: The open pages.
         token: If not empty, callers must show it as a bearer token; pages as ``?token=`` of the page's URL.
+        names: By which the station may be asked for.
     """
 
-    def __init__(self, view: FleetView, fleet: FleetLink, pages: Broadcast, *, token: str = "") -> None:
+    def __init__(
+        self,
+        view: FleetView,
+        fleet: FleetLink,
+        pages: Broadcast,
+        *,
+        token: str = "",
+        names: ServerNames | None = None,
+    ) -> None:
+        self._names = names or ServerNames()
         self._view = view
         self._fleet = fleet
         self._pages = pages
@@ -185,6 +195,9 @@ class Station:
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        refusal = self._names.refusal(request.headers.get(hdrs.HOST, ""))
+        if refusal is not None:
+            return _problem(421, refusal)
         if is_foreign(request.headers.get(hdrs.ORIGIN), request.host):
             return _problem(403, "a page of another site may not use the station")
         if not self._token:

@@ -53,6 +53,8 @@ class Services:
     packages: PackageOffice
     tokens: Tokens
     quotas: Quotas
+    dev: bool
+    """Whether this is development mode."""
     proxies: TrustedProxies = field(default_factory=TrustedProxies)
 
 

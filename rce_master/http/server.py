@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import ipaddress
 import json
 import logging
 import math
@@ -13,7 +12,7 @@ from aiohttp import hdrs, web
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
 from rce.web.openapi import PREFIX, build_document
-from rce.web.origin import is_foreign
+from rce.web.origin import ServerNames, is_foreign
 from rce.web.server import IDLE_S
 from rce_master.exceptions import (
     AuthError,
@@ -37,6 +36,7 @@ from rce_master.http import (
     api_tokens,
     api_usage,
 )
+from rce_master.http.access import bearer, check_metrics
 from rce_master.http.entry import Entry
 from rce_master.http.health import Health
 from rce_master.http.metrics import make_registry
@@ -46,8 +46,6 @@ from rce_master.state.records import UserRole
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
-
-    from rce_master.state.records import User
 
     Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -67,17 +65,19 @@ ROUTES: list[Route] = [
 ]
 
 
-def make_app(services: Services, *, allowed_origins: Iterable[str] = ()) -> web.Application:
+def make_app(
+    services: Services, *, allowed_origins: Iterable[str] = (), names: ServerNames | None = None
+) -> web.Application:
     """Make the application.
 
     Args:
         services: What the handlers work with.
         allowed_origins: Origins whose pages may use the server from a browser, such as
             ``https://fleet.example.org``; pages of the server itself always may.
+        names: By which the server may be asked for.
     """
-    app = web.Application(
-        middlewares=[_origin_guard(frozenset(allowed_origins)), _errors], client_max_size=MAX_BODY
-    )
+    guard = _origin_guard(frozenset(allowed_origins), names or ServerNames())
+    app = web.Application(middlewares=[guard, _errors], client_max_size=MAX_BODY)
     entry = Entry(services.realm.tables, asyncio.get_running_loop().time)
     app.router.add_get("/", entry.handle)
     app.router.add_get("/healthz", Health(services.realm).handle)
@@ -93,7 +93,7 @@ def make_app(services: Services, *, allowed_origins: Iterable[str] = ()) -> web.
 
 def _adapt(route: Route, services: Services) -> Handler:
     async def handle(request: web.Request) -> web.StreamResponse:
-        token, user = _bearer(request, services)
+        token, user = bearer(request, services)
         if user is None and not route.open:
             raise WrongCredentials("a bearer token is needed; get one at /api/v1/login")
         if route.admin and (user is None or user.role is not UserRole.ADMIN):
@@ -122,41 +122,14 @@ async def _read(request: web.Request) -> bytes:
         raise web.HTTPRequestTimeout from None
 
 
-def _bearer(request: web.Request, services: Services) -> tuple[str, User | None]:
-    kind, _, token = request.headers.get(hdrs.AUTHORIZATION, "").partition(" ")
-    if kind.lower() != "bearer" or not token:
-        return "", None
-    user, record = services.tokens.find(token.strip())
-    if record.robot:
-        raise Forbidden(
-            f"this token is good for robot {record.robot!r} only, not for the API; log in for one: rce login"
-        )
-    if record.scope:
-        raise Forbidden(f"this token is good for {record.scope} only; log in for another one: rce login")
-    return token.strip(), user
-
-
 def _metrics(services: Services) -> Handler:
     registry = make_registry(services.realm.tables, services.reconciler.book)
 
     async def handle(request: web.Request) -> web.Response:
-        # The labels name everybody's robots and containers.
-        if not _is_local(request):
-            _, user = _bearer(request, services)
-            if user is None or user.role is not UserRole.ADMIN:
-                raise Forbidden(
-                    "metrics are for administrators (bearer token) and for programs on this machine"
-                )
+        check_metrics(request, services)
         return web.Response(body=generate_latest(registry), headers={"Content-Type": CONTENT_TYPE_LATEST})
 
     return handle
-
-
-def _is_local(request: web.Request) -> bool:
-    if "X-Forwarded-For" in request.headers or "Forwarded" in request.headers:
-        return False
-    peer = request.transport.get_extra_info("peername") if request.transport else None
-    return peer is not None and ipaddress.ip_address(peer[0].partition("%")[0]).is_loopback
 
 
 def _document() -> Handler:
@@ -177,12 +150,16 @@ def _document() -> Handler:
 # What applies to all
 
 
-def _origin_guard(allowed: frozenset[str]) -> Any:
+def _origin_guard(allowed: frozenset[str], names: ServerNames) -> Any:
     @web.middleware
     async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
         """Refuse pages of other sites: a browser would send them with the user's network position."""
-        origin = request.headers.get(hdrs.ORIGIN)
-        if is_foreign(origin, request.headers.get(hdrs.HOST, ""), allowed):
+        origin, host = request.headers.get(hdrs.ORIGIN), request.headers.get(hdrs.HOST, "")
+        # Robots ask for their endpoint by any name that leads here: the answer is no secret.
+        refusal = None if origin is None and request.path == "/" else names.refusal(host)
+        if refusal is not None and origin not in allowed:
+            return _error(421, refusal)
+        if is_foreign(origin, host, allowed):
             return _error(403, f"origin {origin} may not use this server")
         response = await handler(request)
         if origin in allowed and not response.prepared:

@@ -136,9 +136,8 @@ async def running_site(
     store: Store | None = None, state_dir: Path = Path("unused"), *, log_in: bool = True, **options: Any
 ) -> AsyncIterator[Site]:
     """Run a master in development mode on free ports, and log in."""
-    settings = MasterSettings(
-        bind=LOOPBACK, http_port=0, control_port=0, state_dir=state_dir, dev=True, **options
-    )
+    options.setdefault("dev", True)
+    settings = MasterSettings(bind=LOOPBACK, http_port=0, control_port=0, state_dir=state_dir, **options)
     ready: asyncio.Future[RunningMaster] = asyncio.get_running_loop().create_future()
     master = Master(settings, SECRET, store or MemoryStore(), hasher=HASHER)
     task = asyncio.create_task(master.run(ready.set_result))

@@ -12,6 +12,7 @@ import pytest
 from rce.control.messages import Usage
 from rce.control.model import EndpointUsage, InterfaceUsage
 from rce.protocol.http import CURRENT_VERSION
+from rce_master.store import MemoryStore
 
 if TYPE_CHECKING:
     from conftest import Site
@@ -109,13 +110,62 @@ async def test_health_and_metrics(site: Site) -> None:
         assert "process_resident_memory_bytes" in text
 
 
-async def test_metrics_through_a_proxy_need_an_administrator(site: Site) -> None:
-    headers = {"X-Forwarded-For": "10.0.0.1"}
-    async with site.session.get(f"{site.url}metrics", headers=headers) as reply:
-        assert reply.status == 403
-    headers["Authorization"] = f"Bearer {site.token}"
-    async with site.session.get(f"{site.url}metrics", headers=headers) as reply:
-        assert reply.status == 200
+async def test_metrics_through_a_proxy_need_a_token(site: Site) -> None:
+    """A token of an administrator, or one that is good for metrics and nothing else."""
+
+    async def status(token: str = "", **headers: str) -> int:
+        if token:
+            headers["Authorization"] = f"Bearer {token}"
+        async with site.session.get(f"{site.url}metrics", headers=headers) as reply:
+            return reply.status
+
+    await site.api("POST", "/users", {"name": "anna", "password": "one"}, status=201)
+    robot = await site.api("POST", "/robot-tokens", {"robot": "R1"}, status=201)
+    scoped = await site.api("POST", "/tokens", {"scope": "metrics"}, status=201)
+    for name in ("X-Forwarded-For", "Forwarded", "X-Real-IP", "Via"):
+        assert await status(**{name: "10.0.0.1"}) == 401
+    assert await status(site.token, Via="1.1 proxy") == 200
+    assert await status(scoped["token"], Via="1.1 proxy") == 200
+    assert await status(robot["token"]) == 403
+    assert await status(await site.login("anna", "one")) == 403
+    assert await status("rce_guess") == 401
+    await site.api("GET", "/user", token=scoped["token"], status=403)
+
+
+async def test_metrics_outside_of_development_need_a_token(
+    run_site: Callable[..., AbstractAsyncContextManager[Site]],
+) -> None:
+    """A proxy on the same machine need not say that it is one."""
+    store = MemoryStore()
+    async with run_site(store):
+        pass  # made the user
+    async with (
+        run_site(store, dev=False) as site,
+        site.session.get(f"{site.url}metrics") as reply,
+    ):
+        assert reply.status == 401
+
+
+async def test_names_that_the_server_has_not_are_refused(
+    run_site: Callable[..., AbstractAsyncContextManager[Site]],
+) -> None:
+    """DNS rebinding: the page's name leads here, and its Origin fits its Host."""
+    async with run_site(public_names=("fleet.example",)) as site:
+        port = site.url.rstrip("/").rpartition(":")[2]
+        evil = f"evil.example:{port}"
+
+        async def status(path: str, host: str, **headers: str) -> int:
+            headers["Host"] = host
+            async with site.session.get(f"{site.url}{path}", headers=headers) as reply:
+                return reply.status
+
+        assert await status("healthz", evil) == 421
+        assert await status("metrics", evil) == 421
+        assert await status("healthz", evil, Origin=f"http://{evil}") == 421
+        assert await status(f"?{GOOD}", evil, Origin=f"http://{evil}") == 421
+        assert await status(f"?{GOOD}", evil) == 503, "a robot finds its endpoint by any name"
+        assert await status("healthz", f"fleet.example:{port}", Origin=f"http://fleet.example:{port}") == 200
+        assert await status("healthz", f"localhost:{port}") == 200
 
 
 async def test_pages_of_other_sites_are_refused(

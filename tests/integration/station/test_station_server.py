@@ -135,6 +135,18 @@ async def test_pages_of_other_sites_are_refused(house: House) -> None:
     assert (await house.client.put("/api/v1/cells/7", json={"blocked": True}, headers=own)).status == 200
 
 
+async def test_names_that_the_station_has_not_are_refused(house: House) -> None:
+    """A page whose name was made to lead here (DNS rebinding) steers nothing."""
+    await house.start()
+    evil = {"Host": "evil.example:9080", "Origin": "http://evil.example:9080"}
+    reply = await house.client.put("/api/v1/cells/7", json={"blocked": True}, headers=evil)
+    assert reply.status == 421
+    assert "--public-name" in (await reply.json())["error"]
+    for path in ("/", "/api/v1/fleet", "/api/v1/live"):
+        assert (await house.client.get(path, headers={"Host": "evil.example"})).status == 421
+    assert house.fleet.wishes == []
+
+
 async def test_a_token_is_asked_for_where_one_is_set(house: House) -> None:
     await house.start(token="open sesame")
     assert (await house.client.get("/api/v1/fleet")).status == 401

@@ -1,0 +1,71 @@
+"""Who a request is of, and from where."""
+
+from __future__ import annotations
+
+import ipaddress
+from typing import TYPE_CHECKING
+
+from aiohttp import hdrs, web
+
+from rce_master.exceptions import Forbidden, WrongCredentials
+from rce_master.state.records import METRICS_SCOPE, UserRole
+
+if TYPE_CHECKING:
+    from rce_master.http.routes import Services
+    from rce_master.state.records import Token, User
+
+
+def bearer(request: web.Request, services: Services) -> tuple[str, User | None]:
+    """Return the token that a request carries, and whose it is; without one, nothing and None.
+
+    Raises:
+        WrongCredentials: It is unknown or expired.
+        Forbidden: It is not for the API.
+    """
+    token = _token(request)
+    if not token:
+        return "", None
+    user, record = services.tokens.find(token)
+    if record.scope:
+        what = f"robot {record.robot!r}" if record.robot else record.scope
+        raise Forbidden(f"this token is good for {what} only; log in for one for the API: rce login")
+    return token, user
+
+
+def check_metrics(request: web.Request, services: Services) -> None:
+    """Check that a request may read the metrics, whose labels name everybody's robots and containers.
+
+    A token is needed everywhere, because a request that a proxy on this machine passes on need not look
+    different from one of a program here. In development mode, programs of this machine need none.
+
+    Raises:
+        WrongCredentials: There is no token, or it is unknown or expired.
+        Forbidden: It is not one for this.
+    """
+    token = _token(request)
+    if not token:
+        if services.dev and _is_local(request):
+            return
+        raise WrongCredentials(
+            "metrics need a bearer token: of an administrator, or one that is good for nothing else"
+            " (rce token new --metrics)"
+        )
+    user, record = services.tokens.find(token)
+    if not _may_read_metrics(user, record):
+        raise Forbidden("metrics are for administrators, and for tokens of: rce token new --metrics")
+
+
+def _may_read_metrics(user: User, record: Token) -> bool:
+    return user.role is UserRole.ADMIN and record.scope in ("", METRICS_SCOPE)
+
+
+def _token(request: web.Request) -> str:
+    kind, _, token = request.headers.get(hdrs.AUTHORIZATION, "").partition(" ")
+    return token.strip() if kind.lower() == "bearer" else ""
+
+
+def _is_local(request: web.Request) -> bool:
+    if any(name in request.headers for name in ("X-Forwarded-For", "X-Real-IP", "Forwarded", "Via")):
+        return False
+    peer = request.transport.get_extra_info("peername") if request.transport else None
+    return peer is not None and ipaddress.ip_address(peer[0].partition("%")[0]).is_loopback
