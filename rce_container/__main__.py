@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import socket
+from typing import Annotated
 
 import typer
 import uvloop
@@ -18,6 +19,7 @@ from rce.tls.choice import TlsChoice
 from rce.tls.exceptions import CertificateError
 from rce_container.app import App, package_path
 from rce_container.bundles.requirements import InstallerSettings
+from rce_container.ending import end_containers
 from rce_container.exceptions import ContainerError
 from rce_container.settings import ContainerSettings
 
@@ -28,7 +30,14 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 @app.command()
 @OPTIONS.given("rce-container")
-def container(engine: EngineSettings, *, verbose: Verbose = False) -> None:
+def container(
+    engine: EngineSettings,
+    *,
+    end: Annotated[
+        bool, typer.Option("--end", help="End the containers that a killed rce-container left, and stop.")
+    ] = False,
+    verbose: Verbose = False,
+) -> None:
     """Run a container task set: makes the containers of the master at MASTER_IP on this machine."""
     start_logging(engine, verbose=verbose)
     raise_file_limit()
@@ -52,6 +61,9 @@ def container(engine: EngineSettings, *, verbose: Verbose = False) -> None:
         requirements=pip if own.allow_requirements else None,
     )
     try:
+        if end:
+            uvloop.run(end_containers(settings, engine.container_state))
+            return
         program = App(
             master=engine.master_host,
             control_port=engine.master.control_port,

@@ -8,7 +8,6 @@ import contextlib
 import logging
 import math
 import os
-import signal
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +26,7 @@ from rce.link.address import in_url, is_any, own_address
 from rce.link.handover import Doorman
 from rce.link.listening import listen_on
 from rce.ros.packages import PackageIndex, installed_shares
+from rce.supervision.signals import end_signals
 from rce.tls.choice import TlsChoice
 from rce.tls.identity import Context
 from rce_container.bundles.cache import BundleCache
@@ -83,6 +83,7 @@ class App:
         """
         identity = self.tls.for_task_sets()
         tls = None if identity is None else identity.client
+        quitting = Quitting()
         uids = UidPool(self.settings.first_uid, self.settings.uids)
         namespace = NamespaceRuntime(home_bytes=self.settings.home_bytes, uids=uids)
         podman = PodmanRuntime(self.settings.images, home_bytes=self.settings.home_bytes, uids=uids)
@@ -119,7 +120,7 @@ class App:
                     limiter=limiter,
                     library=library,
                 )
-                await self._manage(manager, tls, lambda: ready(name, runtime.name))
+                await self._manage(manager, tls, quitting.of(manager), lambda: ready(name, runtime.name))
 
     def _library(self, state: StateFolder, tls: Context | None) -> Library:
         """Where packages that users bring come from. Blocks."""
@@ -130,7 +131,9 @@ class App:
         library.open()
         return library
 
-    async def _manage(self, manager: Manager, tls: Context | None, ready: Callable[[], None]) -> None:
+    async def _manage(
+        self, manager: Manager, tls: Context | None, quit_: asyncio.Event, ready: Callable[[], None]
+    ) -> None:
         url = f"{'ws' if tls is None else 'wss'}://{in_url(self.master)}:{self.control_port}"
         channel = TaskSetChannel(url, self.secret, manager.hello, manager.handle, tls=tls)
         manager.send = channel.send
@@ -141,7 +144,7 @@ class App:
                 dialing.append(tasks.create_task(channel.run(), name="control channel"))
                 ready()
 
-            await manager.run(go, _quit_by_signal(manager))
+            await manager.run(go, quit_)
             for task in dialing:
                 task.cancel()
 
@@ -191,17 +194,24 @@ def package_path(given: Sequence[Path]) -> tuple[Path, ...]:
     return tuple(dict.fromkeys(path.absolute() for path in paths))
 
 
-def _quit_by_signal(manager: Manager) -> asyncio.Event:
-    quit_ = asyncio.Event()
+class Quitting:
+    """Hears signals from now on; a manager that comes later ends at once what an earlier one left."""
 
-    def stop() -> None:
-        if quit_.is_set():
-            manager.kill_all()
-        quit_.set()
+    def __init__(self) -> None:
+        self._event = asyncio.Event()
+        self._manager: Manager | None = None
+        for number in end_signals():
+            asyncio.get_running_loop().add_signal_handler(number, self._on_signal)
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stop)
-    return quit_
+    def of(self, manager: Manager) -> asyncio.Event:
+        """Return what tells a manager to end; a second signal makes it kill its containers."""
+        self._manager = manager
+        return self._event
+
+    def _on_signal(self) -> None:
+        if self._event.is_set() and self._manager is not None:
+            self._manager.kill_all()
+        self._event.set()
 
 
 def _machine(settings: ContainerSettings, offers: Offers, limiter: Limiter, detail: str) -> MachineInfo:

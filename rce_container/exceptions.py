@@ -51,3 +51,7 @@ class LimitsUnavailableError(ContainerError):
 
 class StateError(ContainerError):
     """The state directory cannot be used; the text says why."""
+
+
+class StateBusyError(StateError):
+    """Another task set uses the state directory."""

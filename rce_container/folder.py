@@ -22,7 +22,7 @@ import msgspec
 from msgspec import Struct
 
 from rce_container.archive import LOG_DAYS, LOG_SPACE, LogArchive
-from rce_container.exceptions import StateError
+from rce_container.exceptions import StateBusyError, StateError
 from rce_container.trees import remove
 from rce_container.writing import write_whole
 
@@ -193,7 +193,7 @@ class StateFolder:
             self._run = self._run_base / f"c-{self.token}"
             self._run.mkdir(mode=0o700, parents=True, exist_ok=True)
         except BlockingIOError as error:
-            raise StateError(
+            raise StateBusyError(
                 f"another rce-container uses {self._state}; give this one its own --state-dir"
             ) from error
         except OSError as error:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import signal
 from typing import TYPE_CHECKING
 
 import typer
@@ -16,6 +15,7 @@ from rce.config.exceptions import RunDirError, SecretError
 from rce.config.secret import load_secret
 from rce.config.settings import EngineSettings
 from rce.guard.files import raise_file_limit
+from rce.supervision.signals import end_signals
 from rce.tls.choice import TlsChoice
 from rce.tls.exceptions import CertificateError
 from rce_master.exceptions import MasterError
@@ -78,9 +78,13 @@ async def _run(settings: MasterSettings, secret: Secret) -> None:
     """Run until SIGINT or SIGTERM."""
     task = asyncio.current_task()
     assert task is not None
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, task.cancel)
+
+    def stop() -> None:
+        if not task.cancelling():  # a second time would cut short how it ends
+            task.cancel()
+
+    for number in end_signals():
+        asyncio.get_running_loop().add_signal_handler(number, stop)
     store = await SqliteStore.open(settings.state_dir)
     try:
         with contextlib.suppress(asyncio.CancelledError):

@@ -7,7 +7,6 @@ import contextlib
 import logging
 import os
 import secrets
-import signal
 import socket
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -25,9 +24,10 @@ from rce.guard.proxies import TrustedProxies
 from rce.link import LinkHub
 from rce.link.address import in_url, is_any, own_address
 from rce.link.listening import listen_on
-from rce.link.unix import remove_stale_sockets
+from rce.link.unix import remove_stale_sockets, socket_name
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
+from rce.supervision.signals import end_signals
 from rce.tls.choice import TlsChoice, plain_warning
 from rce.tls.expiry import name_warning
 from rce_robot.conversion import ConversionPool
@@ -70,7 +70,7 @@ class App:
         """
         stop = asyncio.Event()
         loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in end_signals():
             loop.add_signal_handler(number, stop.set)
         async with self.started(ready):
             await stop.wait()
@@ -161,7 +161,7 @@ async def _announce(channel: TaskSetChannel, url: str, ready: Callable[[str], No
 async def _listen(hub: LinkHub, machine: str, name: str, reach: str, settings: RobotSettings) -> LinkAddress:
     """Accept links on a unix socket and on TCP; return where."""
     remove_stale_sockets(run_dir(), "robot_*.sock")
-    path = run_dir() / f"{name}.sock"
+    path = run_dir() / socket_name(name)
     await hub.listen_unix(path)
     port = await listen_on(hub.listen_tcp, settings.host, settings.link_port)
     return LinkAddress(machine=machine, unix=str(path), host=reach, port=port)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import json
-import signal
 import sys
 from collections.abc import Iterable
 from typing import Annotated, Any
@@ -18,6 +18,7 @@ from rce.cli.settings import SettingsOptions
 from rce.config.fields import SettingError, fields_of
 from rce.config.loading import as_document
 from rce.config.settings import LOOPBACK, EngineSettings, MasterSettings
+from rce.supervision.signals import end_signals
 from rce.supervision.supervisor import Program, StartError, Supervisor
 from rce.tls.choice import WARNED_VARIABLE, plain_warning
 from rce.tls.exceptions import CertificateError
@@ -59,12 +60,19 @@ def bound_to(bind: str, settings: EngineSettings) -> EngineSettings:
 
 
 async def run(settings: EngineSettings) -> int:
-    """Run an engine until SIGINT or SIGTERM; returns the exit code."""
+    """Run an engine until SIGINT, SIGTERM or SIGHUP; returns the exit code.
+
+    A second signal ends containers without waiting for their nodes. Whatever ends this, nothing is left.
+    """
     task = asyncio.current_task()
     assert task is not None
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, task.cancel)
+    supervisor = Supervisor(list(programs(settings)), typer.echo)
+
+    def stop() -> None:
+        supervisor.hurry() if task.cancelling() else task.cancel()
+
+    for number in end_signals():
+        asyncio.get_running_loop().add_signal_handler(number, stop)
 
     def announce() -> None:
         typer.echo(f"RCE ready: {settings.http_url}")
@@ -73,7 +81,6 @@ async def run(settings: EngineSettings) -> int:
 
     if text := warning(settings):
         typer.echo(f"[up] {text}", err=True)
-    supervisor = Supervisor(list(programs(settings)), typer.echo)
     faults: tuple[BaseException, ...] = ()
     with contextlib.suppress(asyncio.CancelledError):
         try:
@@ -110,13 +117,14 @@ def programs(settings: EngineSettings) -> Iterable[Program]:
         yield _program(f"robot{index + 1}" if robot.count > 1 else "robot", "rce_robot", own)
     if settings.container.link_port is None:
         document["container"] = document.get("container", {}) | {"link_port": CONTAINER_LINK_PORT}
-    yield _program("container", "rce_container", document)
+    final = _program("container", "rce_container", document, "--end").argv
+    yield dataclasses.replace(_program("container", "rce_container", document), final=final)
 
 
 def _next(port: int, offset: int) -> int:
     return port + offset if port else 0
 
 
-def _program(name: str, module: str, document: dict[str, Any]) -> Program:
-    argv = [sys.executable, "-m", module, "--settings", json.dumps(document)]
+def _program(name: str, module: str, document: dict[str, Any], *options: str) -> Program:
+    argv = [sys.executable, "-m", module, "--settings", json.dumps(document), *options]
     return Program(name, argv, {WARNED_VARIABLE: "1"})

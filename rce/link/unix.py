@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import os
 import socket
 import stat
 import time
@@ -61,9 +62,30 @@ def _remove_stale_socket(path: Path) -> None:
     raise OSError(errno.EADDRINUSE, "another process listens here", str(path))
 
 
+def socket_name(name: str) -> str:
+    """Name a socket file of this process, so that it can be told later whether the process still runs."""
+    return f"{name}.{os.getpid()}.sock"
+
+
 def remove_stale_sockets(folder: Path, pattern: str) -> None:
-    """Remove socket files that killed processes left behind; young ones may just be about to listen."""
+    """Remove socket files that killed processes left behind.
+
+    Young ones may just be about to listen, unless their names say that their process has ended.
+    """
     for path in folder.glob(pattern):
         with contextlib.suppress(OSError):  # somebody listens, or another one was quicker
-            if time.time() - path.stat().st_mtime > _YOUNG_S:
+            if _owner_ended(path) or time.time() - path.stat().st_mtime > _YOUNG_S:
                 _remove_stale_socket(path)
+
+
+def _owner_ended(path: Path) -> bool:
+    pid = path.stem.rpartition(".")[2]
+    if not pid.isdecimal():
+        return False
+    try:
+        os.kill(int(pid), 0)
+    except ProcessLookupError:
+        return True
+    except (PermissionError, OverflowError):
+        pass
+    return False

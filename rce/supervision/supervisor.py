@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
+from rce.supervision.final import FinalCommand
 from rce.supervision.process import Child, relay
 
 RESTART_DELAY_S = 0.2
 RESTART_DELAY_MAX_S = 5.0
 STABLE_AFTER_S = 10.0
-READY_TIMEOUT_S = 30.0
+READY_TIMEOUT_S = 60.0
 OUTPUT_TIMEOUT_S = 1.0
 """How long the output of an ended program is read on; something that it started may hold it open."""
 
@@ -27,6 +29,9 @@ class Program:
     name: str
     argv: Sequence[str]
     env: Mapping[str, str] = field(default_factory=dict)
+    final: Sequence[str] = ()
+    """A command that removes what the program leaves if it is killed. It runs after the program's last end if
+    that was not a proper one, and also when the supervisor itself is killed."""
 
 
 class Supervisor:
@@ -35,6 +40,14 @@ class Supervisor:
     def __init__(self, programs: Sequence[Program], show: Callable[[str], None]) -> None:
         self._programs = programs
         self._show = show
+        self._children: dict[str, Child] = {}
+        """The last process of each program, by name."""
+        self._finals: dict[str, FinalCommand] = {}
+
+    def hurry(self) -> None:
+        """Pass on to the programs that the user wants the end at once."""
+        for child in self._children.values():
+            child.hurry()
 
     async def run(self, on_ready: Callable[[], None]) -> None:
         """Start all programs, call ``on_ready`` once all are up, and keep them up until cancelled.
@@ -42,20 +55,22 @@ class Supervisor:
         Raises:
             StartError: A program ended, or was not ready in time, at the first start.
         """
-        async with asyncio.TaskGroup() as group:
-            keepers: list[tuple[asyncio.Task[None], asyncio.Event]] = []
-            try:
-                for program in self._programs:
-                    ready = asyncio.Event()
-                    keepers.append((group.create_task(self._keep(program, ready), name=program.name), ready))
-                    await self._until_ready(program, ready)
-                on_ready()
-                await asyncio.Event().wait()
-            finally:
-                for task, _ in reversed(keepers):
-                    if not task.cancelling():  # a second time would cut short how it ends its program
-                        task.cancel()
-                    await asyncio.wait([task])
+        try:
+            async with asyncio.TaskGroup() as group:
+                keepers: list[tuple[asyncio.Task[None], asyncio.Event]] = []
+                try:
+                    for program in self._programs:
+                        ready = asyncio.Event()
+                        task = group.create_task(self._keep(program, ready), name=program.name)
+                        keepers.append((task, ready))
+                        await self._until_ready(program, ready)
+                        await self._arm(program)
+                    on_ready()
+                    await asyncio.Event().wait()
+                finally:
+                    await _to_its_end(_end([task for task, _ in keepers]))
+        finally:
+            await _to_its_end(self._end_finally())
 
     async def _until_ready(self, program: Program, ready: asyncio.Event) -> None:
         try:
@@ -63,6 +78,18 @@ class Supervisor:
                 await ready.wait()
         except TimeoutError:
             raise StartError(f"{program.name} was not ready within {READY_TIMEOUT_S:.0f} s") from None
+
+    async def _arm(self, program: Program) -> None:
+        if program.final:
+            self._finals[program.name] = await FinalCommand.arm(program.final)
+
+    async def _end_finally(self) -> None:
+        """Remove what programs left that did not end properly."""
+        for name, final in self._finals.items():
+            if self._children[name].returncode == 0:
+                await final.disarm()
+            elif code := await final.run():
+                self._show(f"[up] what {name} left could not be removed: exit code {code}")
 
     async def _keep(self, program: Program, ready: asyncio.Event) -> None:
         loop = asyncio.get_running_loop()
@@ -80,6 +107,7 @@ class Supervisor:
 
     async def _run_once(self, program: Program, ready: asyncio.Event) -> int:
         child = await Child.start(program.name, program.argv, env=program.env)
+        self._children[program.name] = child
         reader = asyncio.create_task(relay(child, self._show, ready))
         try:
             return await child.wait()
@@ -88,3 +116,25 @@ class Supervisor:
             await asyncio.wait([reader], timeout=OUTPUT_TIMEOUT_S)
             reader.cancel()
             await asyncio.gather(reader, return_exceptions=True)
+
+
+async def _end(tasks: Sequence[asyncio.Task[None]]) -> None:
+    """Cancel tasks one after the other, the last one first."""
+    for task in reversed(tasks):
+        if not task.cancelling():  # a second time would cut short how it ends its program
+            task.cancel()
+        await asyncio.wait([task])
+
+
+async def _to_its_end(work: Coroutine[Any, Any, None]) -> None:
+    """Do something whole, however often this is cancelled meanwhile."""
+    task = asyncio.create_task(work)
+    cancelled = False
+    while not task.done():
+        try:
+            await asyncio.shield(task)
+        except asyncio.CancelledError:
+            cancelled = True
+    task.result()
+    if cancelled:
+        raise asyncio.CancelledError

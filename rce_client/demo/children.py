@@ -15,7 +15,7 @@ from rce_client.demo.exceptions import ChildDiedError, NotReadyError, end_of
 TAIL = 25
 """How many of the last lines of a program are kept to be shown."""
 STOP_TIMEOUT = 15.0
-NEEDED_STOP_TIMEOUT = 25.0
+NEEDED_STOP_TIMEOUT = 90.0
 DRAIN_TIMEOUT = 1.0
 """How long the output of an ended program is read on; something that it started may hold it open."""
 

@@ -15,6 +15,7 @@ import typer
 import uvloop
 
 from rce.config.settings import Runtime
+from rce.supervision.signals import end_signals
 from rce_client.demo.exceptions import DemoError
 from rce_client.demo.floor import draw
 from rce_client.demo.folder import run_folder
@@ -164,7 +165,7 @@ def _run(work: Coroutine[Any, Any, int], *, stopped: int) -> int:
             signal.signal(number, signal.SIG_DFL)
             task.cancel()
 
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in end_signals():
             loop.add_signal_handler(number, on_signal, number)
         try:
             return await work

@@ -6,7 +6,6 @@ import asyncio
 import ipaddress
 import json
 import logging
-import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Protocol
@@ -21,6 +20,7 @@ from rce.config.logs import start_logging
 from rce.config.resources import examples_dir
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
+from rce.supervision.signals import end_signals
 from rce.tls.choice import ENGINE, TlsChoice, default_folder, plain_warning
 from rce.tls.exceptions import CertificateError
 from rce.tls.identity import Context
@@ -189,7 +189,7 @@ async def serve(
     feed = Feed(view, pages)
     fleet = FleetLink(way.wire, view, on_change=feed.on_change, on_event=feed.on_event)
     stop = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in end_signals():
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     station = Station(view, fleet, pages, token=token, names=names)
     async with HttpServer(station.make_app(), bind, port, tls) as server:

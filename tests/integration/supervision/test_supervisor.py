@@ -12,6 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from rce.supervision.final import FinalCommand
 from rce.supervision.process import Child
 from rce.supervision.supervisor import Program, StartError, Supervisor
 
@@ -84,6 +85,7 @@ async def test_children_end_with_a_supervisor_that_is_killed(tmp_path: Path) -> 
     pid_file = tmp_path / "pid"
     code = f"""
 import asyncio, sys
+from rce.supervision.final import FinalCommand
 from rce.supervision.process import Child
 async def main():
     child = await Child.start("c", [sys.executable, "-c", "import time; time.sleep(1000)"])
@@ -102,3 +104,87 @@ asyncio.run(main())
         while child.is_running() and child.status() != psutil.STATUS_ZOMBIE:
             await asyncio.sleep(0.02)
     await supervisor.stop()
+
+
+async def test_what_a_killed_program_leaves_is_removed_at_the_end(tmp_path: Path) -> None:
+    note, killed = tmp_path / "note", asyncio.Event()
+
+    def show(line: str) -> None:
+        if line.startswith("[a] pid"):
+            os.kill(int(line.split()[2]), signal.SIGKILL)
+        killed.set() if "exit code -9" in line else None
+
+    code = (
+        "import os, time; print('x ready: y', flush=True);"
+        "print('pid', os.getpid(), flush=True); time.sleep(1000)"
+    )
+    program = Program("a", [sys.executable, "-c", code], final=["sh", "-c", f"echo once >> {note}"])
+    async with asyncio.timeout(60):
+        await run_until(Supervisor([program], show), killed)
+    assert note.read_text() == "once\n"
+
+
+async def test_a_program_that_ended_properly_needs_no_more(tmp_path: Path) -> None:
+    note, done = tmp_path / "note", asyncio.Event()
+    code = (
+        "import signal, sys, time; signal.signal(signal.SIGTERM, lambda *_: sys.exit());"
+        "print('x ready: y', flush=True); time.sleep(1000)"
+    )
+    program = Program("a", [sys.executable, "-c", code], final=["touch", str(note)])
+    async with asyncio.timeout(60):
+        done.set()
+        await run_until(Supervisor([program], print), done)
+    assert not note.exists()
+
+
+async def test_a_second_cancellation_does_not_cut_the_end_short(tmp_path: Path) -> None:
+    note, ending = tmp_path / "note", asyncio.Event()
+    code = (
+        "import pathlib, signal, sys, time\n"
+        "def end(*_):\n"
+        f"    print('ending', flush=True); time.sleep(1); pathlib.Path({str(note)!r}).touch(); sys.exit()\n"
+        "signal.signal(signal.SIGTERM, end); print('x ready: y', flush=True); time.sleep(1000)"
+    )
+    ready = asyncio.Event()
+    supervisor = Supervisor([python("a", code)], lambda line: ending.set() if "ending" in line else None)
+    task = asyncio.create_task(supervisor.run(ready.set))
+    async with asyncio.timeout(60):
+        await ready.wait()
+        task.cancel()
+        await ending.wait()
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+    assert note.exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP, signal.SIGTERM, signal.SIGKILL])
+async def test_a_final_command_runs_however_its_process_ends(tmp_path: Path, number: signal.Signals) -> None:
+    note = tmp_path / "note"
+    code = f"""
+import asyncio
+from rce.supervision.final import FinalCommand
+async def main():
+    await FinalCommand.arm(["touch", {str(note)!r}])
+    print("ready: x", flush=True)
+    await asyncio.sleep(1000)
+asyncio.run(main())
+"""
+    child = await Child.start("c", [sys.executable, "-c", code])
+    assert [line async for line in _first(child)] == ["ready: x"]
+    os.kill(child.pid, number)
+    await child.wait()
+    async with asyncio.timeout(60):
+        while not note.exists():
+            await asyncio.sleep(0.02)
+    await child.stop()
+
+
+async def test_a_final_command_runs_though_what_waits_for_it_was_killed(tmp_path: Path) -> None:
+    final = await FinalCommand.arm(["touch", str(tmp_path / "note")])
+    (shell,) = psutil.Process().children()
+    shell.kill()
+    await asyncio.to_thread(psutil.wait_procs, [shell], 20)
+    async with asyncio.timeout(60):
+        assert await final.run() == 0
+    assert (tmp_path / "note").exists()

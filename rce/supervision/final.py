@@ -1,0 +1,60 @@
+"""A command that runs when this process has ended, however it ended: also by SIGKILL."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from typing import Self
+
+_DISARM = b"done\n"
+_SHELL = 'trap "" HUP INT TERM; read -r word; [ "$word" = done ] || exec "$@"'
+"""Reads a pipe of which this process has the only other end. It costs half a megabyte while it waits."""
+
+
+class FinalCommand:
+    """Waits in a process of its own for the end of this one, then runs a command.
+
+    No signal that is meant for this process reaches it, neither from a terminal nor from its end.
+
+    Example:
+        >>> final = await FinalCommand.arm(["rm", "-rf", folder])
+        >>> await final.disarm()
+    """
+
+    def __init__(self, argv: Sequence[str], process: asyncio.subprocess.Process) -> None:
+        self._argv = argv
+        self._process = process
+
+    @classmethod
+    async def arm(cls, argv: Sequence[str]) -> Self:
+        """Have ``argv`` run as soon as this process has ended. Its output goes where this one's goes.
+
+        Raises:
+            OSError: No shell can be started.
+        """
+        process = await asyncio.create_subprocess_exec(
+            *("sh", "-c", _SHELL, "sh", *argv), stdin=asyncio.subprocess.PIPE, start_new_session=True
+        )
+        return cls(argv, process)
+
+    async def run(self) -> int:
+        """Run the command now, even if what waits for it was killed; return its exit code.
+
+        Raises:
+            OSError: It was killed, and no other shell can be started.
+        """
+        if self._process.returncode is None:
+            return await self._close()
+        return await (await self.arm(self._argv)).run()
+
+    async def disarm(self) -> None:
+        """Let the command not be run."""
+        assert self._process.stdin is not None
+        if self._process.returncode is None:
+            self._process.stdin.write(_DISARM)
+        await self._close()
+
+    async def _close(self) -> int:
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        return await self._process.wait()

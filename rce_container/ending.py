@@ -1,0 +1,92 @@
+"""Ends what a container task set left that was killed, without a master."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+from rce.config.folders import run_dir
+from rce.control.contents import Piece
+from rce.control.exceptions import ContentError
+from rce.control.messages import MachineInfo
+from rce.link.handover import Doorman
+from rce.link.unix import remove_stale_sockets
+from rce_container.bundles.cache import BundleCache
+from rce_container.bundles.supply import Library
+from rce_container.exceptions import StateBusyError
+from rce_container.folder import StateFolder
+from rce_container.limits import choose_limiter
+from rce_container.manager import Manager
+from rce_container.runtimes.base import Runtime
+from rce_container.runtimes.namespace import NamespaceRuntime
+from rce_container.runtimes.podman import PodmanRuntime
+from rce_container.runtimes.process import ProcessRuntime
+from rce_container.settings import ContainerSettings
+
+BUSY_PATIENCE_S = 60.0
+"""Longer than a task set that was told to end takes for it."""
+_BUSY_PAUSE_S = 0.05
+
+
+async def end_containers(settings: ContainerSettings, state_dir: Path) -> None:
+    """End the containers of a state directory as their task set would, and remove all that is left of them.
+
+    A task set that still uses the directory is waited for: it may be about to end.
+
+    Args:
+        settings: How long nodes are given.
+        state_dir: The task set's state directory.
+
+    Raises:
+        ContainerError: The directory cannot be used, or a task set uses it and does not end.
+    """
+    remove_stale_sockets(run_dir(), "robot_*.sock")
+    async with _taken(state_dir) as state, contextlib.AsyncExitStack() as stack:
+        limiter = await asyncio.to_thread(choose_limiter, state.token, state.cgroups)
+        stack.callback(limiter.close)
+        runtimes: dict[str, Runtime] = {
+            one.name: one for one in (NamespaceRuntime(), PodmanRuntime(), ProcessRuntime())
+        }
+        for one in runtimes.values():
+            stack.callback(one.close)
+        manager = Manager(
+            name=state.name(""),
+            info=MachineInfo(name=settings.machine),
+            settings=settings,
+            runtimes=runtimes,
+            runtime=runtimes[ProcessRuntime.name],
+            state=state,
+            doorman=Doorman(),
+            links=("", 0),
+            limiter=limiter,
+            library=Library(cache=BundleCache(state.library, _no_master, space=settings.bundle_space)),
+        )
+        quit_ = asyncio.Event()
+        quit_.set()
+        await manager.run(lambda: None, quit_)
+
+
+@contextlib.asynccontextmanager
+async def _taken(state_dir: Path) -> AsyncIterator[StateFolder]:
+    """Take a state directory as soon as nobody else has it."""
+    deadline = asyncio.get_running_loop().time() + BUSY_PATIENCE_S
+    folder = StateFolder(state_dir, run_dir())
+    while True:
+        try:
+            state = folder.__enter__()
+        except StateBusyError:
+            if asyncio.get_running_loop().time() > deadline:
+                raise
+            await asyncio.sleep(_BUSY_PAUSE_S)
+            continue
+        break
+    try:
+        yield state
+    finally:
+        folder.__exit__()
+
+
+async def _no_master(sha256: str, offset: int) -> Piece:  # noqa: ARG001 - as a cache asks
+    raise ContentError("containers that end get no packages")
