@@ -38,14 +38,16 @@ class FinalCommand:
         return cls(argv, process)
 
     async def run(self) -> int:
-        """Run the command now, even if what waits for it was killed; return its exit code.
+        """Run the command now, once more if it or what waits for it was killed; return its exit code.
 
         Raises:
             OSError: It was killed, and no other shell can be started.
         """
-        if self._process.returncode is None:
-            return await self._close()
-        return await (await self.arm(self._argv)).run()
+        code = await self._close()
+        if code >= 0:
+            return code
+        again = await self.arm(self._argv)
+        return await again._close()  # noqa: SLF001 - of the same class
 
     async def disarm(self) -> None:
         """Let the command not be run."""
