@@ -39,7 +39,7 @@ def container(
     verbose: Verbose = False,
 ) -> None:
     """Run a container task set: makes the containers of the master at MASTER_IP on this machine."""
-    start_logging(engine, verbose=verbose)
+    start_logging(engine, "rce-container", verbose=verbose)
     raise_file_limit()
     own = engine.container
     pip = InstallerSettings(pip_args=tuple(shlex.split(own.pip_args)))

@@ -35,7 +35,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 @OPTIONS.given("rce-master")
 def command(engine: EngineSettings, *, verbose: Verbose = False) -> None:
     """Run the Master Task Set: HTTP for clients on 9000, control of task sets on 8080."""
-    start_logging(engine, verbose=verbose)
+    start_logging(engine, "rce-master", verbose=verbose)
     raise_file_limit()
     faults: tuple[BaseException, ...] = ()
     try:

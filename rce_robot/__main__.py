@@ -27,7 +27,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 @OPTIONS.given("rce-robot")
 def robot(engine: EngineSettings, *, verbose: Verbose = False) -> None:
     """Run a robot task set: the WebSocket endpoint of robots, next to the master at MASTER_IP."""
-    start_logging(engine, verbose=verbose)
+    start_logging(engine, "rce-robot", verbose=verbose)
     own = engine.robot
     settings = RobotSettings(
         host=own.bind,

@@ -27,7 +27,7 @@ from rce.config.fields import Field, SettingError, fields_of, sections_of
 from rce.config.loading import load_settings, read_document
 from rce.config.settings import EngineSettings
 
-COMMON = ("dev", "secret_file", "machine", "log_level")
+COMMON = ("dev", "secret_file", "machine", "log_level", "log_dir", "log_size", "log_count")
 """Settings that every program of the engine has as options."""
 MASTER_IP = "MASTER_IP"
 

@@ -25,7 +25,7 @@ from rce.tls.exceptions import CertificateError
 from rce.tls.keeping import keep_certificates
 
 OPTIONS = SettingsOptions(
-    "dev", "state_dir", "secret_file", "log_level", "master", "robot", "container", "tls", up=True
+    "dev", "state_dir", "secret_file", "log_level", "log_dir", "master", "robot", "container", "tls", up=True
 )
 ROBOT_LINK_PORT, CONTAINER_LINK_PORT = 10030, 10031
 
@@ -114,6 +114,8 @@ def programs(settings: EngineSettings) -> Iterable[Program]:
     for index in range(robot.count):
         ports = {"ws_port": _next(robot.ws_port, index), "link_port": _next(link_port, 2 * index)}
         own = document | {"robot": document.get("robot", {}) | ports}
+        if index and settings.log_dir is not None:  # two programs cannot rotate one file
+            own["log_dir"] = str(settings.log_dir.absolute() / f"robot{index + 1}")
         yield _program(f"robot{index + 1}" if robot.count > 1 else "robot", "rce_robot", own)
     if settings.container.link_port is None:
         document["container"] = document.get("container", {}) | {"link_port": CONTAINER_LINK_PORT}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import re
+from logging.handlers import RotatingFileHandler
+from pathlib import Path
 
 FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
@@ -33,15 +35,33 @@ def redact(text: str) -> str:
     return _CREDENTIALS.sub(lambda found: f"{found[found.lastgroup or 0]}***", text)
 
 
-def start_logging(level: int | str, *, line: str = FORMAT) -> None:
-    """Log to the standard error stream.
+def start_logging(level: int | str, *, line: str = FORMAT, handler: logging.Handler | None = None) -> None:
+    """Log to the standard error stream, or elsewhere.
 
     Args:
         line: How a line looks, as :mod:`logging` writes formats.
         level: The least level that is written. Libraries that would tell credentials stay at warnings.
+        handler: Where to; None for the standard error stream.
     """
-    handler = logging.StreamHandler()
+    handler = handler or logging.StreamHandler()
     handler.setFormatter(RedactingFormatter(line))
     logging.basicConfig(level=level, handlers=[handler])
     for name in _TALKATIVE:
         logging.getLogger(name).setLevel(logging.WARNING)
+
+
+def rotating_file(path: Path, *, size: int, count: int) -> logging.Handler:
+    """Return a handler that writes a file and puts it aside when it is large.
+
+    Args:
+        path: The file; its folder is made.
+        size: Bytes at which it is put aside as ``NAME.1``, that as ``NAME.2``, and so on.
+        count: How many of these are kept.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return RotatingFileHandler(
+        path, maxBytes=size, backupCount=count, encoding="utf-8", errors="backslashreplace"
+    )

@@ -311,6 +311,21 @@ class EngineSettings(Section, frozen=True, kw_only=True):
     log_level: Annotated[
         LogLevel, choice(LogLevel), Setting("What the programs tell in their logs.", up="log-level")
     ] = LogLevel.INFO
+    log_dir: Annotated[
+        Path | None,
+        Setting(
+            "Folder for the programs' logs, `PROGRAM.log`, which are rotated.",
+            up="log-dir",
+            unset="standard error",
+            example="/var/log/rce",
+        ),
+    ] = None
+    log_size: Annotated[
+        Memory, Meta(ge=1 << 10), Setting("Size at which a log in `log_dir` is put aside as `.1`.")
+    ] = 10 << 20
+    log_count: Annotated[
+        int, Meta(ge=1, le=1000), Setting("How many logs that were put aside are kept of each program.")
+    ] = 5
     master: MasterSettings = MasterSettings()
     robot: RobotSettings = RobotSettings()
     container: ContainerSettings = ContainerSettings()

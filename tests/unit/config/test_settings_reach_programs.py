@@ -42,6 +42,7 @@ SETTINGS = EngineSettings(
     secret_file=Path("/secret"),
     master_host="127.0.0.2",
     log_level=LogLevel.DEBUG,
+    log_dir=Path("/log"),
     master=MasterSettings(
         bind="127.0.0.2",
         http_port=1,
@@ -87,6 +88,7 @@ def test_what_is_set_arrives() -> None:
     assert found["container"] == SETTINGS
     assert found["robot1"].robot == replace(SETTINGS.robot, link_port=10030)
     assert found["robot2"].robot == replace(SETTINGS.robot, ws_port=9011, link_port=10032)
+    assert (str(found["robot1"].log_dir), str(found["robot2"].log_dir)) == ("/log", "/log/robot2")
 
 
 def test_defaults_arrive() -> None:

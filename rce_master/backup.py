@@ -1,0 +1,326 @@
+"""Copies of a master's state: made while it runs, and put back where no master runs. Blocks.
+
+A copy is a tar file: ``master/`` (the store, users' packages, what else is in the master's folder),
+``certificates/`` if the engine has some, and, last, ``manifest.json`` with the hash of each file. The store
+is copied by SQLite in one step, so the copy is a state that the master was in. A copy holds password hashes
+and keys: its file is its owner's only.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import shutil
+import sqlite3
+import tarfile
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import IO, Any
+
+import msgspec
+
+from rce import __version__
+from rce_master.exceptions import StoreError
+from rce_master.state.records import Bundle
+from rce_master.state.tables import Tables
+from rce_master.store.lock import FolderLock
+from rce_master.store.sqlite import FILE_NAME, SCHEMA_VERSION
+
+FORMAT = 1
+MASTER, CERTIFICATES, BUNDLES = "master", "certificates", "bundles"
+MANIFEST = "manifest.json"
+
+_ATTEMPTS = 5
+_LEFT_OUT = {"lock", FILE_NAME, f"{FILE_NAME}-wal", f"{FILE_NAME}-shm", f"{FILE_NAME}-journal", BUNDLES}
+_PIECE = 1 << 20
+
+
+class BackupError(StoreError):
+    """A copy cannot be made, or not be put back."""
+
+
+@dataclass(frozen=True, slots=True)
+class Copy:
+    """What a copy holds."""
+
+    created: float
+    """Seconds since 1970."""
+    version: str
+    """Of the program that made it."""
+    files: int
+    size: int
+    """Bytes of all files."""
+
+
+def back_up(folders: Mapping[str, Path], out: Path) -> Copy:
+    """Copy a master's state, also while it runs.
+
+    Args:
+        folders: Its parts: the master's folder, and that of certificates.
+        out: The file to make. It appears whole or not at all.
+
+    Raises:
+        BackupError: There is no state, or it cannot be copied; or the file is there already.
+    """
+    store = folders[MASTER] / FILE_NAME
+    if not store.exists():
+        raise BackupError(f"{folders[MASTER]} is not a master's state folder: it has no {FILE_NAME}")
+    if out.exists():
+        raise BackupError(f"{out} is there already; name another file, or remove it")
+    try:
+        descriptor, name = tempfile.mkstemp(dir=out.parent, prefix=f".{out.name}-")
+        try:
+            with os.fdopen(descriptor, "wb") as aside:
+                made = _write_again(folders, aside)
+            Path(name).rename(out)
+        except BaseException:
+            Path(name).unlink()
+            raise
+    except OSError as error:
+        raise BackupError(f"cannot make {out}: {error}") from error
+    return made
+
+
+def restore(file: Path, folders: Mapping[str, Path], *, replace: bool = False) -> tuple[Copy, list[Path]]:
+    """Put a copy's state into folders.
+
+    Everything is read and checked before anything changes.
+
+    Args:
+        file: The copy.
+        folders: Where its parts go.
+        replace: Move state that is there aside, to ``FOLDER.before-DATE``.
+
+    Returns:
+        What the copy held, and the folders in which former state is now.
+
+    Raises:
+        StoreBusy: A master runs on the folder.
+        BackupError: It is not a whole copy, a newer program made it, or there is state already.
+    """
+    master = folders[MASTER]
+    lock = FolderLock(master)
+    try:
+        there = [folder for folder in folders.values() if _holds_state(folder)]
+        if there and not replace:
+            raise BackupError(f"there is state in {there[0]}; to move it aside, give --replace")
+        with tempfile.TemporaryDirectory(dir=master.parent, prefix=".rce-restore-") as name:
+            found = _extract(file, Path(name))
+            _check_store(Path(name) / MASTER / FILE_NAME)
+            stamp = time.strftime("%Y%m%d-%H%M%S")
+            aside = [_move_aside(folder, stamp) for folder in there]
+            for part, folder in folders.items():
+                _move(Path(name) / part, folder)
+    except (OSError, tarfile.TarError) as error:
+        raise BackupError(f"cannot restore {file}: {error}") from error
+    finally:
+        lock.close()
+    return found, aside
+
+
+class _PackageRemovedError(BackupError):
+    """A package was removed after the store was copied: the copy would lack what its store names."""
+
+
+def _write_again(folders: Mapping[str, Path], out: IO[bytes]) -> Copy:
+    """Write a copy, once more if packages were removed meanwhile."""
+    for _ in range(_ATTEMPTS - 1):
+        try:
+            return _write(folders, out)
+        except _PackageRemovedError:
+            out.seek(0)
+            out.truncate()
+    return _write(folders, out)
+
+
+def _write(folders: Mapping[str, Path], out: IO[bytes]) -> Copy:
+    hashes: dict[str, str] = {}
+    size = 0
+    with (
+        _snapshot(folders[MASTER] / FILE_NAME) as store,
+        tarfile.open(fileobj=out, mode="w", format=tarfile.PAX_FORMAT) as tar,
+    ):
+        for name, path in _files(folders, store):
+            try:
+                with path.open("rb") as source:
+                    size += _add(tar, name, source, hashes)
+            except FileNotFoundError as error:
+                if path.parent.name == BUNDLES:
+                    raise _PackageRemovedError(f"{path} was removed while it was copied") from error
+                # A file of the folder that went in the meantime: the master does without it.
+        created = time.time()
+        manifest = {
+            "format": FORMAT,
+            "rce": __version__,
+            "schema": SCHEMA_VERSION,
+            "created": created,
+            "size": size,
+            "files": hashes,
+        }
+        data = json.dumps(manifest, indent=1).encode()
+        info = tarfile.TarInfo(MANIFEST)
+        info.size, info.mode, info.mtime = len(data), 0o600, int(created)
+        tar.addfile(info, io.BytesIO(data))
+    out.flush()
+    os.fsync(out.fileno())
+    return Copy(created, __version__, len(hashes), size)
+
+
+def _add(tar: tarfile.TarFile, name: str, source: IO[bytes], hashes: dict[str, str]) -> int:
+    """Add what a file holds now; it may grow meanwhile."""
+    status = os.fstat(source.fileno())
+    info = tarfile.TarInfo(name)
+    info.size, info.mode, info.mtime = status.st_size, status.st_mode & 0o700, int(status.st_mtime)
+    reader = _Hashing(source)
+    tar.addfile(info, reader)
+    hashes[name] = reader.hash.hexdigest()
+    return info.size
+
+
+class _Hashing:
+    """Hashes what is read of a file."""
+
+    def __init__(self, source: IO[bytes]) -> None:
+        self._source = source
+        self.hash = hashlib.sha256()
+
+    def read(self, size: int = -1) -> bytes:
+        """Read a piece."""
+        piece = self._source.read(size)
+        self.hash.update(piece)
+        return piece
+
+
+@contextmanager
+def _snapshot(store: Path) -> Iterator[Path]:
+    """Copy the store in one step of SQLite; the copy is removed at the end."""
+    with tempfile.TemporaryDirectory(prefix="rce-backup-") as name:
+        path = Path(name) / FILE_NAME
+        os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+        try:
+            with (
+                closing(sqlite3.connect(f"{store.absolute().as_uri()}?mode=ro", uri=True)) as source,
+                closing(sqlite3.connect(path)) as copy,
+            ):
+                source.backup(copy)
+                copy.execute("PRAGMA journal_mode = DELETE")
+        except sqlite3.Error as error:
+            raise BackupError(f"cannot copy the store {store}: {error}") from error
+        _check_store(path)
+        yield path
+
+
+def _files(folders: Mapping[str, Path], store: Path) -> Iterator[tuple[str, Path]]:
+    """Name the files of a copy: the store, the packages that it names, and the rest of the folders."""
+    yield f"{MASTER}/{FILE_NAME}", store
+    master = folders[MASTER]
+    for sha256 in sorted({bundle.sha256 for bundle in _bundles(store)}):
+        yield f"{MASTER}/{BUNDLES}/{sha256}", master / BUNDLES / sha256
+    for part, folder in folders.items():
+        for path in sorted(folder.rglob("*")):
+            inside = path.relative_to(folder)
+            left_out = part == MASTER and inside.parts[0] in _LEFT_OUT
+            if path.is_file() and not path.is_symlink() and not left_out:
+                yield f"{part}/{inside.as_posix()}", path
+
+
+def _bundles(store: Path) -> Iterator[Bundle]:
+    with closing(sqlite3.connect(f"{store.as_uri()}?mode=ro", uri=True)) as database:
+        rows = database.execute("SELECT key, body FROM record WHERE kind = ?", (Tables().bundles.name,))
+        for _, body in rows:
+            yield msgspec.json.decode(body, type=Bundle)
+
+
+def _check_store(path: Path) -> None:
+    """Check that a store is sound, and of a version that this program knows."""
+    try:
+        with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as database:
+            (version,) = database.execute("PRAGMA user_version").fetchone()
+            (sound,) = database.execute("PRAGMA quick_check").fetchone()
+    except sqlite3.Error as error:
+        raise BackupError(f"the store in it cannot be read: {error}") from error
+    if sound != "ok":
+        raise BackupError(f"the store in it is damaged: {sound}")
+    if version > SCHEMA_VERSION:
+        raise BackupError(
+            f"its store has version {version}, this program knows versions up to {SCHEMA_VERSION}: install"
+            " the program that made it, or a newer one"
+        )
+
+
+def _extract(file: Path, target: Path) -> Copy:
+    """Write a copy's files below a folder, and check them all."""
+    hashes: dict[str, str] = {}
+    manifest: dict[str, Any] | None = None
+    with file.open("rb") as source, tarfile.open(fileobj=source, mode="r:") as tar:
+        for member in tar:
+            content = tar.extractfile(member) if member.isreg() else None
+            place = PurePosixPath(member.name)
+            if content is None or place.is_absolute() or ".." in place.parts:
+                raise BackupError(f"{file} holds {member.name!r}, which no backup does")
+            if member.name == MANIFEST:
+                manifest = _read_manifest(file, content.read())
+            elif place.parts[0] in (MASTER, CERTIFICATES):
+                hashes[member.name] = _write_file(target / place, content, member.mode)
+    if manifest is None:
+        raise BackupError(f"{file} is not a whole backup: it has no {MANIFEST} at its end")
+    differing = sorted(set(hashes.items()) ^ set(manifest["files"].items()))
+    if differing or f"{MASTER}/{FILE_NAME}" not in hashes:
+        name = differing[0][0] if differing else FILE_NAME
+        raise BackupError(f"{file} is damaged: {name} is not what was saved")
+    return Copy(manifest["created"], manifest["rce"], len(hashes), manifest["size"])
+
+
+def _read_manifest(file: Path, data: bytes) -> dict[str, Any]:
+    try:
+        manifest = json.loads(data)
+        version = manifest["format"]
+        if version > FORMAT or manifest["schema"] > SCHEMA_VERSION:
+            raise BackupError(
+                f"{file} was made by rce {manifest['rce']}, which is newer than this program ({__version__})"
+            )
+        dict(manifest["files"]), float(manifest["created"]), int(manifest["size"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise BackupError(f"{file} is damaged: its {MANIFEST} cannot be read") from error
+    return dict(manifest)
+
+
+def _write_file(path: Path, content: IO[bytes], mode: int) -> str:
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    made = hashlib.sha256()
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode & 0o700)
+    with os.fdopen(descriptor, "wb") as out:
+        while piece := content.read(_PIECE):
+            made.update(piece)
+            out.write(piece)
+        out.flush()
+        os.fsync(out.fileno())
+    return made.hexdigest()
+
+
+def _holds_state(folder: Path) -> bool:
+    return folder.is_dir() and any(path.name != "lock" for path in folder.iterdir())
+
+
+def _move_aside(folder: Path, stamp: str) -> Path:
+    aside = folder.with_name(f"{folder.name}.before-{stamp}")
+    aside.mkdir(mode=0o700)
+    for path in folder.iterdir():
+        if path.name != "lock":  # which is held
+            path.rename(aside / path.name)
+    return aside
+
+
+def _move(source: Path, folder: Path) -> None:
+    """Move what was extracted to its place; the store comes last, so that it is there only with all else."""
+    if not source.is_dir():
+        return
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    for path in sorted(source.iterdir(), key=lambda path: path.name == FILE_NAME):
+        shutil.move(path, folder / path.name)

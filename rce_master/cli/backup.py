@@ -1,0 +1,75 @@
+"""``rce backup`` and ``rce restore``."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from msgspec.structs import replace
+
+from rce.config.exceptions import ConfigError
+from rce.config.loading import load_settings
+from rce.protocol.quantities import about
+from rce_master.backup import CERTIFICATES, MASTER, Copy, back_up, restore
+from rce_master.exceptions import StoreError
+from rce_master.store.sqlite import FILE_NAME
+
+Config = Annotated[Path | None, typer.Option(metavar="FILE", help="Settings file: says where the state is.")]
+StateDir = Annotated[
+    Path | None, typer.Option(metavar="PATH", help="State folder of the engine, or of rce-master.")
+]
+
+
+def backup(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The file to make (tar).")],
+    config: Config = None,
+    state_dir: StateDir = None,
+) -> None:
+    """Copy the master's state to a file, also while it runs."""
+    try:
+        made = back_up(_folders(config, state_dir), file)
+    except StoreError as error:
+        typer.echo(f"rce backup: {error}", err=True)
+        raise typer.Exit(1) from None
+    typer.echo(f"made {file}: {_about(made)}; keep it safe, it holds keys and password hashes")
+
+
+def restore_(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A file that rce backup made.")],
+    config: Config = None,
+    state_dir: StateDir = None,
+    replace_: Annotated[
+        bool, typer.Option("--replace", help="Move state that is there aside, and take its place.")
+    ] = False,
+) -> None:
+    """Put a backup back, while no master runs on the folder."""
+    folders = _folders(config, state_dir)
+    try:
+        found, aside = restore(file, folders, replace=replace_)
+    except StoreError as error:
+        typer.echo(f"rce restore: {error}", err=True)
+        raise typer.Exit(1) from None
+    made = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(found.created))
+    typer.echo(f"restored {folders[MASTER]} as of {made}: {_about(found)}")
+    for folder in aside:
+        typer.echo(f"the former state is in {folder}")
+
+
+def _about(copy: Copy) -> str:
+    return f"{copy.files} files, {about(copy.size)}"
+
+
+def _folders(config: Path | None, state_dir: Path | None) -> dict[str, Path]:
+    """Find the folders of the state."""
+    try:
+        settings = load_settings(config)
+    except ConfigError as error:
+        typer.echo(error, err=True)
+        raise typer.Exit(2) from None
+    if state_dir is not None and (state_dir / FILE_NAME).exists():
+        return {MASTER: state_dir.absolute()}  # a folder that `rce-master --state-dir` was given
+    if state_dir is not None:
+        settings = replace(settings, state_dir=state_dir.absolute())
+    return {MASTER: settings.master_state, CERTIFICATES: settings.certificates}
