@@ -47,6 +47,7 @@ def container(
         machine=engine.machine or socket.gethostname(),
         packages=package_path(own.package_path),
         labels=own.labels,
+        tls=engine.tls.enabled,
         grace=own.grace,
         images=own.images,
         slots=own.slots,

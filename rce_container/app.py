@@ -98,7 +98,7 @@ class App:
         keep = self.settings.log_days, self.settings.log_space
         with StateFolder(state_dir, run_dir(), log_days=keep[0], log_space=keep[1]) as state:
             name = state.name(self.name)
-            doorman = Doorman()
+            doorman = Doorman(tls=self.settings.tls)
             async with contextlib.AsyncExitStack() as stack:
                 stack.push_async_callback(doorman.close)
                 port = await listen_on(doorman.listen, self.host, self.link_port)

@@ -9,11 +9,16 @@ from rce.control.model import LinkAddress
 from rce.dialing import open_socket
 
 
-async def dial(address: LinkAddress, machine: str) -> socket.socket:
+async def dial(address: LinkAddress, machine: str, *, tls: bool = False) -> socket.socket:
     """Connect by the unix socket if it is on this machine, else by TCP.
 
+    Args:
+        address: Of the peer.
+        machine: Name of this machine.
+        tls: Refuse peers that take links by TCP without TLS.
+
     Raises:
-        OSError: Nobody answers there.
+        OSError: Nobody answers there, or without TLS only.
     """
     if address.unix and address.machine == machine:
         try:
@@ -23,6 +28,8 @@ async def dial(address: LinkAddress, machine: str) -> socket.socket:
                 raise
     if not address.port:
         raise ConnectionError("the peer has no address that can be reached from here")
+    if tls and not address.tls:
+        raise ConnectionError("the peer takes links without TLS only; start its program with --tls")
     return await open_socket(address.host, address.port)
 
 

@@ -159,6 +159,7 @@ class Launcher:
             id=id_,
             mark=folder.mark,
             machine=settings.machine,
+            tls=settings.tls,
             home="",
             logs="",
             ros_port=ROS_PORT if own_network else 0,

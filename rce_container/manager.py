@@ -327,7 +327,13 @@ class Manager:
 
     def _address(self, folder: ContainerFolder) -> LinkAddress:
         host, port = self._links
-        return LinkAddress(machine=self._settings.machine, unix=str(folder.link_socket), host=host, port=port)
+        return LinkAddress(
+            machine=self._settings.machine,
+            unix=str(folder.link_socket),
+            host=host,
+            port=port,
+            tls=self._settings.tls,
+        )
 
     # Reading
 

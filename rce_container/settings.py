@@ -50,6 +50,8 @@ class ContainerSettings:
     """How many bytes of packages that users brought are kept, unless more are in use."""
     requirements: InstallerSettings | None = None
     """How what these packages ask for in a ``requirements.txt`` is installed; None: it is not."""
+    tls: bool = False
+    """Whether links by TCP must be in TLS."""
     images: tuple[str, ...] = ()
     """See :class:`rce_container.runtimes.podman.PodmanRuntime`."""
     home_bytes: int = 256 * MEGABYTE

@@ -310,7 +310,8 @@ class Unit:
             if request.address not in allowed:
                 raise ConnectionError("the container has no link to there")
             async with asyncio.timeout(_DIAL_TIMEOUT_S):
-                sock = await dial(request.address, self._office.settings.machine)
+                settings = self._office.settings
+                sock = await dial(request.address, settings.machine, tls=settings.tls)
         except OSError as error:
             text = str(error) or type(error).__name__
             channel.send(m.encode(m.Dialed(request=request.request, error=text)))

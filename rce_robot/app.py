@@ -88,9 +88,9 @@ class App:
         packages = _package_index(self.packages)
         types = TypeRegistry(packages)
         pool = ConversionPool(packages.path, settings.conversion)
-        hub = LinkHub(machine)
+        hub = LinkHub(machine, tls=self.tls.enabled)
         try:
-            address = await _listen(hub, machine, name, reach, settings)
+            address = await _listen(hub, machine, name, reach, settings, tls=self.tls.enabled)
             listener = await _bind(settings.host, settings.ws_port)
             port: int = listener.getsockname()[1]
             scheme = "ws" if for_robots is None else "wss"
@@ -158,13 +158,15 @@ async def _announce(channel: TaskSetChannel, url: str, ready: Callable[[str], No
     ready(url)
 
 
-async def _listen(hub: LinkHub, machine: str, name: str, reach: str, settings: RobotSettings) -> LinkAddress:
+async def _listen(
+    hub: LinkHub, machine: str, name: str, reach: str, settings: RobotSettings, *, tls: bool
+) -> LinkAddress:
     """Accept links on a unix socket and on TCP; return where."""
     remove_stale_sockets(run_dir(), "robot_*.sock")
     path = run_dir() / socket_name(name)
     await hub.listen_unix(path)
-    port = await listen_on(hub.listen_tcp, settings.host, settings.link_port)
-    return LinkAddress(machine=machine, unix=str(path), host=reach, port=port)
+    port = await listen_on(hub.listen_secure if tls else hub.listen_tcp, settings.host, settings.link_port)
+    return LinkAddress(machine=machine, unix=str(path), host=reach, port=port, tls=tls)
 
 
 async def _bind(host: str, port: int) -> socket.socket:

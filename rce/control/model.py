@@ -101,6 +101,8 @@ class LinkAddress(Struct, frozen=True, kw_only=True, omit_defaults=True):
     unix: str = ""
     host: str = ""
     port: int = 0
+    tls: bool = False
+    """Whether links by TCP must be in TLS (:mod:`rce.link.encryption`)."""
 
 
 class LinkSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):

@@ -64,6 +64,8 @@ class FrameType(IntEnum):
     """Accepting end's answer: a text why not; it hangs up."""
     PING = 4
     PONG = 5
+    SECURE = 7
+    """Dialing end's first frame on TCP, where the peer's address wants TLS: the link; TLS begins after it."""
     GRANT = 6
     """How far the peer may send bulk: an offset of 8 bytes in the stream; see :mod:`rce.link.valve`."""
     OPEN = 8
@@ -144,6 +146,28 @@ def parse_hello(frame: Frame) -> Hello:
     if hello.version != VERSION:
         raise ProtocolError(f"link version {hello.version} is not spoken here, {VERSION} is")
     return hello
+
+
+def encode_secure(link: str) -> bytes:
+    """Write the frame that announces TLS for a link."""
+    return encode(Frame(FrameType.SECURE, payload=link.encode()))
+
+
+def parse_opening(frame: Frame) -> tuple[str, bool]:
+    """Read the first frame of a link's dialing end.
+
+    Returns:
+        The link, and whether TLS follows.
+
+    Raises:
+        ProtocolError: It begins no link.
+    """
+    if frame.type is not FrameType.SECURE:
+        return parse_hello(frame).link, False
+    try:
+        return bytes(frame.payload).decode(), True
+    except UnicodeDecodeError as error:
+        raise ProtocolError(f"bad SECURE: {error}") from error
 
 
 def check_answer(frame: Frame) -> None:

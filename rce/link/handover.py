@@ -20,8 +20,9 @@ import socket
 from typing import TYPE_CHECKING
 
 from rce.guard.lobby import Lobby, address_of
-from rce.link.exceptions import LinkError, LinkLost, LinkRefused, ProtocolError
-from rce.link.frames import HANDSHAKE_SIZE, HEADER_SIZE, Frame, FrameReader, FrameType, encode, parse_hello
+from rce.link.exceptions import LinkError, LinkRefused
+from rce.link.frames import HANDSHAKE_SIZE, HEADER_SIZE, Frame, FrameType, encode
+from rce.link.opening import LinkSender, PlainLinkRefused, read_hello
 from rce.link.settings import LinkLimits, LinkTimeouts
 from rce.link.tasks import TaskScope
 
@@ -160,11 +161,26 @@ def _receive(sock: socket.socket) -> tuple[bytes, list[int]]:
 class Doorman:
     """Accepts TCP links for the endpoints of other processes and hands each to the right one.
 
+    Args:
+        timeouts: Of links.
+        limits: Of links.
+        tls: Refuse links without TLS.
+        everything: Takes the links that nobody was assigned to, in place of refusing them.
+
     Attributes:
         lobby: Accepted connections that have not been handed over yet.
     """
 
-    def __init__(self, timeouts: LinkTimeouts | None = None, limits: LinkLimits | None = None) -> None:
+    def __init__(
+        self,
+        timeouts: LinkTimeouts | None = None,
+        limits: LinkLimits | None = None,
+        *,
+        tls: bool = False,
+        everything: LinkSender | None = None,
+    ) -> None:
+        self._tls = tls
+        self._everything = everything
         self._timeouts = timeouts or LinkTimeouts()
         self._limits = limits or LinkLimits()
         self.lobby = Lobby(
@@ -243,59 +259,25 @@ class Doorman:
         try:
             async with asyncio.timeout(self._timeouts.handshake):
                 received = await read_hello(connection, self._limits)
+                if self._tls and not received.secure:
+                    raise PlainLinkRefused(received.link)
                 sender = await self._find(received.link)
                 await sender.send(connection, received.data)
         except LinkRefused as error:
             log.warning("link refused: %s", error)
+            why = error.for_peer if isinstance(error, PlainLinkRefused) else b"unknown link or wrong token"
             with contextlib.suppress(OSError):
-                connection.send(encode(Frame(FrameType.REFUSE, payload=b"unknown link or wrong token")))
+                connection.send(encode(Frame(FrameType.REFUSE, payload=why)))
         except (LinkError, OSError) as error:
             log.info("a link was not handed over: %s", str(error) or type(error).__name__)
 
-    async def _find(self, link: str) -> HandoverSender:
+    async def _find(self, link: str) -> LinkSender:
         """Return who takes a link; the news of it may still be on its way."""
+        if self._everything is not None:
+            return self._everything
         try:
             async with asyncio.timeout(self._timeouts.unknown_link), self._assigned:
                 await self._assigned.wait_for(lambda: link in self._routes)
                 return self._routes[link]
         except TimeoutError as error:
             raise LinkRefused(f"unknown link {link!r}") from error
-
-
-class ReceivedHello:
-    """The first frame of a connection.
-
-    Attributes:
-        link: Id of the link that the peer asks for.
-        data: All that was read.
-    """
-
-    def __init__(self, link: str, data: bytes) -> None:
-        self.link = link
-        self.data = data
-
-
-async def read_hello(connection: socket.socket, limits: LinkLimits) -> ReceivedHello:
-    """Read the first frame of a connection and not a byte more.
-
-    Raises:
-        ProtocolError: It is no HELLO.
-        LinkLost: The connection ended.
-        OSError: The connection failed.
-    """
-    loop = asyncio.get_running_loop()
-    connection.setblocking(False)
-    reader = FrameReader(limits, max_message=HANDSHAKE_SIZE)
-    data = bytearray()
-    missing = HEADER_SIZE
-    while True:
-        part = await loop.sock_recv(connection, missing)
-        if not part:
-            raise LinkLost("the peer hung up")
-        data += part
-        frames = reader.feed(part)
-        if frames:
-            return ReceivedHello(parse_hello(frames[0]).link, bytes(data))
-        missing = reader.missing
-        if len(data) + missing > HEADER_SIZE + HANDSHAKE_SIZE:
-            raise ProtocolError("HELLO is too long")

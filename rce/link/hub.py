@@ -15,6 +15,9 @@ from rce.guard.lobby import Lobby, address_of
 from rce.link.carrier import Carrier, LocalCarrier
 from rce.link.exceptions import LinkError, LinkLost, LinkRefused
 from rce.link.frames import Frame, FrameType, check_answer, encode, encode_hello, parse_hello
+from rce.link.handover import Doorman
+from rce.link.opening import secured_link
+from rce.link.secure import Adopter, accept_secure, dial_secure
 from rce.link.settings import LinkLimits, LinkTimeouts
 from rce.link.socket_carrier import SocketCarrier
 from rce.link.tasks import TaskScope
@@ -40,6 +43,7 @@ class LinkHub:
         limits: Of all links; both ends of a link need the same.
         dial: Connects a stream socket to a peer's address, or raises :class:`OSError`; for a process that
             cannot do that itself, because it has no network for example.
+        tls: Refuse to dial peers by TCP without TLS.
 
     Attributes:
         machine: As given.
@@ -55,7 +59,10 @@ class LinkHub:
         limits: LinkLimits | None = None,
         *,
         dial: Callable[[LinkAddress], Awaitable[socket.socket]] | None = None,
+        tls: bool = False,
     ) -> None:
+        self._tls = tls
+        self._doormen: list[Doorman] = []
         self.machine = machine
         self.timeouts = timeouts or LinkTimeouts()
         self.limits = limits or LinkLimits()
@@ -121,8 +128,14 @@ class LinkHub:
         taken: int = server.sockets[0].getsockname()[1]
         return taken
 
+    async def listen_secure(self, host: str, port: int) -> int:
+        """Accept links on TCP, in TLS only. Arguments and result are those of :meth:`listen_tcp`."""
+        doorman = Doorman(self.timeouts, self.limits, tls=True, everything=Adopter(self.adopt))
+        self._doormen.append(doorman)
+        return await doorman.listen(host, port)
+
     async def adopt(self, sock: socket.socket, received: bytes) -> None:
-        """Take over a connection that another process accepted, with what it has read from it.
+        """Take over a connection that was accepted elsewhere, with what was read from it.
 
         The socket belongs to the hub from now on, also if this raises.
 
@@ -131,7 +144,10 @@ class LinkHub:
         """
         try:
             sock.setblocking(False)
-            await self.loop.connect_accepted_socket(lambda: self._accept(received), sock)
+            if secured := secured_link(received, self.limits):
+                await self._adopt_secure(sock, secured)
+            else:
+                await self.loop.connect_accepted_socket(lambda: self._accept(received), sock)
         except BaseException:
             sock.close()
             raise
@@ -143,6 +159,8 @@ class LinkHub:
             server.close()
         for path, inode in self._unix_sockets.items():
             unlink_own(path, inode)
+        for doorman in self._doormen:
+            await doorman.close()
         await self._greetings.close()
         await asyncio.sleep(0)  # connections that were just being accepted come into view
         carriers = list(self._carriers)
@@ -211,7 +229,7 @@ class LinkHub:
             return ours
         address = spec.address
         if self._dial is not None:
-            return await self._introduce(await self._carry(await self._dial(address)), spec)
+            return await self._introduce(await self._carry(await self._dial(address), spec), spec)
         if self._is_near(address):
             try:
                 return await self._dial_unix(spec)
@@ -233,14 +251,17 @@ class LinkHub:
         address = spec.address
         async with asyncio.timeout(self.timeouts.connect):
             sock = await open_socket(address.host, address.port)
-            _, carrier = await self.loop.create_connection(self._new_carrier, sock=sock)
-        return await self._introduce(carrier, spec)
+        return await self._introduce(await self._carry(sock, spec), spec)
 
-    async def _carry(self, sock: socket.socket) -> SocketCarrier:
-        """Make a carrier of a connected socket."""
+    async def _carry(self, sock: socket.socket, spec: LinkSpec) -> SocketCarrier:
+        """Make a carrier of a connected socket, in TLS if the peer wants that on TCP."""
         try:
             sock.setblocking(False)
-            _, carrier = await self.loop.connect_accepted_socket(self._new_carrier, sock)
+            if sock.family == socket.AF_UNIX or not (spec.address.tls or self._tls):
+                _, carrier = await self.loop.connect_accepted_socket(self._new_carrier, sock)
+            else:
+                async with asyncio.timeout(self.timeouts.handshake):
+                    carrier = await dial_secure(sock, spec, self._new_carrier)
         except BaseException:
             sock.close()
             raise
@@ -308,14 +329,28 @@ class LinkHub:
         finally:
             guest.leave()
 
+    async def _adopt_secure(self, sock: socket.socket, link_id: str) -> None:
+        """Begin TLS as the accepting end; what comes then is a connection like others."""
+        try:
+            async with asyncio.timeout(self.timeouts.handshake):
+                await accept_secure(sock, (await self._wait_for(link_id)).spec, self._accept)
+        except (LinkRefused, OSError) as error:
+            sock.close()
+            log.warning("link refused: no TLS with the peer: %s", str(error) or "it took too long")
+
     async def _find(self, hello: Hello) -> Link:
-        """Return the link that a peer asks for; its spec may still be on its way."""
-        if hello.link not in self._accepting:
-            await self.wait_registered(hello.link, self.timeouts.unknown_link)
-        link = self._accepting.get(hello.link)
-        if link is None:
-            raise LinkRefused(f"unknown link {hello.link!r}")
+        """Return the link that a peer asks for."""
+        link = await self._wait_for(hello.link)
         _check_token(link, hello.token)
+        return link
+
+    async def _wait_for(self, link_id: str) -> Link:
+        """Return a link whose spec may still be on its way."""
+        if link_id not in self._accepting:
+            await self.wait_registered(link_id, self.timeouts.unknown_link)
+        link = self._accepting.get(link_id)
+        if link is None:
+            raise LinkRefused(f"unknown link {link_id!r}")
         return link
 
 

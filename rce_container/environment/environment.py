@@ -99,7 +99,7 @@ class Environment:
                 Node(OWN_NODE, argv=[f"__ip:={self._boot.address}"], master_uri=self._core.uri, types=types)
             )
             dial = self._operator.connect if self._boot.isolated else None
-            hub = LinkHub(self._boot.machine, dial=dial)
+            hub = LinkHub(self._boot.machine, dial=dial, tls=self._boot.tls)
             stack.push_async_callback(hub.close)
             await hub.listen_socket(self._links)
             self._hub = hub

@@ -26,6 +26,8 @@ class Boot(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """See :class:`rce.control.model.LinkAddress`."""
     home: str
     logs: str
+    tls: bool = False
+    """Whether links by TCP must be in TLS."""
     ros_port: int
     """Port of the container's ROS core on 127.0.0.1; 0 takes a free one."""
     isolated: bool

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from rce.link import Buffer, Port
 
-WAYS = ("local", "unix", "tcp", "handed-over")
+WAYS = ("local", "unix", "tcp", "handed-over", "secure", "handed-over-secure")
 TIMEOUTS = LinkTimeouts(redial_first=0.005, redial_last=0.05, unknown_link=0.5, flush=0.2, close=1.0)
 
 
@@ -182,17 +182,21 @@ class Rig:
         elif way == "tcp":
             port = await hub.listen_tcp("127.0.0.1", 0)
             party.address = LinkAddress(machine="", host="127.0.0.1", port=port)
-        elif way == "handed-over":
-            port = await self.doorman(hub, ["L"])
-            party.address = LinkAddress(machine="", host="127.0.0.1", port=port)
+        elif way == "secure":
+            port = await hub.listen_secure("127.0.0.1", 0)
+            party.address = LinkAddress(machine="", host="127.0.0.1", port=port, tls=True)
+        elif way in ("handed-over", "handed-over-secure"):
+            tls = way == "handed-over-secure"
+            port = await self.doorman(hub, ["L"], tls=tls)
+            party.address = LinkAddress(machine="", host="127.0.0.1", port=port, tls=tls)
 
-    async def doorman(self, hub: LinkHub, links: list[str]) -> int:
+    async def doorman(self, hub: LinkHub, links: list[str], *, tls: bool = False) -> int:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         sender = HandoverSender(ours)
         self.stack.callback(sender.close)
         receiver = HandoverReceiver(theirs, hub.adopt)
         self.stack.push_async_callback(receiver.close)
-        doorman = Doorman(TIMEOUTS)
+        doorman = Doorman(TIMEOUTS, tls=tls)
         self.stack.push_async_callback(doorman.close)
         await doorman.assign(sender, links)
         return await doorman.listen("127.0.0.1", 0)
