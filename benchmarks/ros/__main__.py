@@ -17,6 +17,7 @@ import uvloop
 from benchmarks.figures import RESULTS, plot_round_trips, save, show
 from benchmarks.ros import suites
 from benchmarks.ros.sides import sides
+from benchmarks.ros.tools import tools
 
 PORT = 21311
 
@@ -63,6 +64,10 @@ def measure(names: list[str], *, quick: bool, scratch: Path) -> None:
                 "Nodes in one process",
                 lambda: uvloop.run(suites.joining(uri, nodes=50 if quick else 500)),
             ),
+            "tools": (
+                "Command line tools at either master",
+                lambda: tools(masters, passes=2 if quick else 7),
+            ),
             "memory": ("An idle node's process", lambda: suites.memory(uri, found)),
         }
         for name in names or chosen:
@@ -79,7 +84,7 @@ def main() -> None:
     """Read the command line and measure."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.ros", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer sizes, nodes and seconds")
-    words = ("echo", "rate", "fanout", "services", "registration", "joining", "memory")
+    words = ("echo", "rate", "fanout", "services", "registration", "joining", "tools", "memory")
     parser.add_argument("--only", nargs="+", choices=words, default=[], metavar="NAME")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
