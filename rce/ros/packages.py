@@ -1,7 +1,8 @@
 """Packages: folders that hold nodes and message definitions.
 
-A package is a folder with a ``package.yaml`` (ours) or a ``package.xml`` (ROS's), or one that holds ``msg``
-or ``srv`` folders only, as distributions install them. Its executables are files in the folder itself or in
+A package is a folder with a ``package.yaml`` (ours) or a ``package.xml`` (ROS's), at any depth below a folder
+of the package path (:mod:`rce.ros.package_tree`), or one directly below that holds ``msg`` or ``srv`` folders
+only, as distributions install them. Its executables are files in the folder itself or in
 ``nodes``, ``scripts``, ``bin`` or ``lib`` below it; those of a package that is installed as
 ``PREFIX/share/PKG`` are also in ``PREFIX/lib/PKG``. An installed Python distribution adds nodes by entry
 points of the group ``rce.nodes``, named ``PKG:EXE``; a file of the same name goes before.
@@ -23,6 +24,8 @@ import sys
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from rce.ros.package_tree import PackageTree
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
@@ -37,6 +40,9 @@ FOLDERS = ("", "nodes", "scripts", "bin", "lib")
 
 MANIFESTS = ("package.yaml", "package.xml")
 """What a manifest may be called, the more important first."""
+
+ROSBUILD_MANIFEST = "manifest.xml"
+"""The manifest of packages from before catkin, which gives no name: the folder's counts."""
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _PYTHONS = ("engine", "system")
@@ -108,10 +114,11 @@ class Package(NamedTuple):
 
 
 class PackageIndex:
-    """Finds packages by name. Nothing is remembered: a package that is added later is found.
+    """Finds packages by name, as rospack does. A package that is added later is found.
 
     Args:
-        path: Folders that hold package folders, or are packages themselves; the first hit counts.
+        path: Folders that are searched in depth, or are packages themselves; the first hit counts. In one
+            called ``share``, packages are direct subfolders, as distributions install them.
     """
 
     def __init__(self, path: Iterable[Path | str]) -> None:
@@ -148,7 +155,7 @@ class PackageIndex:
         if _NAME.fullmatch(name) is None:
             return None
         for root in self.path:
-            found = _child(root, name) or _itself(root, name) or _renamed(root, name)
+            found = _find_below(root, name)
             if found is not None:
                 return found
         return None
@@ -164,46 +171,55 @@ def installed_shares() -> list[Path]:
     return [share for share in candidates if (share / "std_msgs").is_dir()]
 
 
-def _child(root: Path, name: str) -> Path | None:
-    folder = root / name
-    if _is_package(folder):
-        return folder if _manifest(folder) is None or _declared_name(folder) in ("", name) else None
+def _find_below(root: Path, name: str) -> Path | None:
+    """Return the folder of a package that is on or below one folder of the path."""
     if root.name == "share":
-        programs = root.parent / "lib" / name
-        if programs.is_dir():
-            return folder if folder.is_dir() else programs
-    return None
+        return _installed(root, name)
+    found = _tree(root).packages().get(name)
+    if found is not None:
+        return found
+    child = root / name
+    return child if _manifest(child) is None and _holds_definitions(child) else None
 
 
-def _itself(root: Path, name: str) -> Path | None:
-    if _manifest(root) is None:
-        return None
-    return root if (_declared_name(root) or root.resolve().name) == name else None
-
-
-def _renamed(root: Path, name: str) -> Path | None:
-    """Find a package whose manifest gives it another name than its folder has.
-
-    Distributions install no such packages, but hundreds of others.
-    """
-    if root.name == "share":
-        return None
-    try:
-        folders = sorted(entry for entry in root.iterdir() if _manifest(entry) is not None)
-    except OSError:
-        return None
-    return next((folder for folder in folders if _declared_name(folder) == name), None)
-
-
-def _is_package(folder: Path) -> bool:
+def _installed(share: Path, name: str) -> Path | None:
+    """Find a package of a distribution: ``PREFIX/share/NAME``, with programs in ``PREFIX/lib/NAME``."""
+    folder = share / name
     if _manifest(folder) is not None:
-        return True
+        return folder if _declared_name(folder) in ("", name) else None
+    if _holds_definitions(folder):
+        return folder
+    programs = share.parent / "lib" / name
+    if programs.is_dir():
+        return folder if folder.is_dir() else programs
+    return share if _manifest(share) is not None and (_declared_name(share) or share.name) == name else None
+
+
+def _holds_definitions(folder: Path) -> bool:
     # Not pathlib's question: it raises where a folder may not be entered, and the other folders are to count.
     return any(os.path.isdir(folder / kind) for kind in ("msg", "srv", "action"))  # noqa: PTH112
 
 
+_trees: dict[Path, PackageTree] = {}
+MAX_TREES = 64
+"""How many folders' searches are remembered."""
+
+
+def _tree(root: Path) -> PackageTree:
+    found = _trees.get(root)
+    if found is None:
+        while len(_trees) >= MAX_TREES:
+            _trees.pop(next(iter(_trees)), None)
+        found = _trees[root] = PackageTree(root, (*MANIFESTS, ROSBUILD_MANIFEST), _name_in)
+    return found
+
+
+def _name_in(folder: Path) -> str:
+    return _declared_name(folder) or folder.resolve().name
+
+
 def _manifest(folder: Path) -> Path | None:
-    for name in MANIFESTS:
+    for name in (*MANIFESTS, ROSBUILD_MANIFEST):
         file = folder / name
         if os.path.isfile(file):  # noqa: PTH113 - see above
             return file

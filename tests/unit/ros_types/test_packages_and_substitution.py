@@ -102,7 +102,8 @@ def test_python_files_run_with_the_engine_or_by_their_first_line(tmp_path: Path)
 )
 def test_what_is_not_inside_the_package_is_refused(tmp_path: Path, exe: str) -> None:
     make(tmp_path / "pkg", nodes__n=0o755)
-    make(tmp_path, outside=0o755)
+    (tmp_path / "outside").write_text("#!/bin/sh\n")
+    (tmp_path / "outside").chmod(0o755)
     with pytest.raises(ExecutableNotFound):
         PackageIndex([tmp_path]).find("pkg").executable(exe)
 
