@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from rce.control.messages import ClientReply, ClientRequest, Left, Login, LoginReply
 from rce_master import requests
+from rce_master.audit_words import describe
 from rce_master.exceptions import (
     Forbidden,
     MasterError,
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Coroutine
 
     from rce.control.messages import Hello, ToMaster
+    from rce_master.audit import AuditLog
     from rce_master.auth import Authenticator
     from rce_master.realm import Outcome, Realm
     from rce_master.reconciler import Peer, Reconciler
@@ -66,7 +68,9 @@ class Desk:
         authenticator: Authenticator,
         tokens: Tokens | None = None,
         quotas: Quotas | None = None,
+        audit: AuditLog | None = None,
     ) -> None:
+        self._audit = audit
         self._tokens = Tokens(realm.tables) if tokens is None else tokens
         self._realm = realm
         self._reconciler = reconciler
@@ -135,6 +139,18 @@ class Desk:
             await self._realm.enqueue([gone])
 
     async def _answer_login(self, process: str, id_: str, login: Login) -> LoginReply:
+        reply = await self._try_login(process, id_, login)
+        if self._audit is not None:
+            user = login.user if login.user in self._realm.tables.users else ""
+            if reply.endpoint is not None:
+                by = "its own token" if login.token else "the password"
+                self._audit.add(user, "connect_robot", id_, detail=f"by {by}", address=login.address)
+            elif reply.status in (_UNAUTHORIZED, _FORBIDDEN, _TOO_MANY):
+                detail = f"{reply.status} {login.robot if user else ''}".rstrip()
+                self._audit.refuse(user, "connect_robot", detail=detail, address=login.address)
+        return reply
+
+    async def _try_login(self, process: str, id_: str, login: Login) -> LoginReply:
         try:
             await self._realm.submit(await self._admission(process, id_, login))
             return LoginReply(request=login.request, endpoint=self._realm.spec(id_))
@@ -204,6 +220,8 @@ class Desk:
         wanted, faults = requests.read(user, request.type, request.data)
         parts = [wanted[first : first + MAX_TOGETHER] for first in range(0, len(wanted), MAX_TOGETHER)]
         outcomes = [await self._realm.enqueue(part) for part in parts]
+        if self._audit is not None and wanted:
+            self._audit.add(user, f"request_{request.type.lower()}", detail=describe(wanted), via=request.id)
         await self._spawn(self._answer(peer, request, outcomes, faults))
 
     async def _answer(

@@ -15,6 +15,7 @@ from rce.tls.choice import plain_warning
 from rce.tls.expiry import watch_expiry
 from rce.web.origin import ServerNames
 from rce.web.server import HttpServer
+from rce_master.audit import AuditLog
 from rce_master.auth import Authenticator, client_digest
 from rce_master.bundles.contents import ContentStore
 from rce_master.bundles.office import PackageOffice
@@ -104,7 +105,8 @@ class Master:
         )
         tokens = Tokens(realm.tables)
         quotas = Quotas(self._settings.quotas)
-        desk = Desk(realm, reconciler, authenticator, tokens, quotas)
+        audit = AuditLog(self._settings.state_dir / "audit", time.time)
+        desk = Desk(realm, reconciler, authenticator, tokens, quotas, audit)
         lifetime = self._settings.token_lifetime
         self._contents = ContentStore(self._settings.state_dir / "bundles")
         packages = PackageOffice(realm, self._contents)
@@ -118,6 +120,7 @@ class Master:
             packages,
             tokens,
             quotas,
+            audit,
             self._settings.dev,
             TrustedProxies(self._settings.trusted_proxies),
         )
@@ -130,7 +133,7 @@ class Master:
                         desk.run(),
                         packages.run(),
                         services.tokens.run(realm),
-                        _tick(realm),
+                        _tick(realm, audit),
                     )
                 ]
                 try:
@@ -141,6 +144,7 @@ class Master:
                         worker.cancel()
         finally:
             authenticator.close()
+            audit.close()
 
     async def _serve(self, services: Services, desk: Desk, on_ready: Callable[[RunningMaster], None]) -> None:
         settings = self._settings
@@ -188,9 +192,10 @@ async def make_dev_user(services: Services) -> None:
     await services.realm.submit(commands.AddUser(user=user))
 
 
-async def _tick(realm: Realm) -> None:
+async def _tick(realm: Realm, audit: AuditLog) -> None:
     while True:
         await asyncio.sleep(TICK_S)
+        audit.flush()
         (outcome,) = await realm.submit_all([commands.Tick()])
         if outcome is not None:
             logger.error("grace times were not looked at: %s", outcome)

@@ -40,17 +40,25 @@ PasswordStdin = Annotated[bool, typer.Option(help="Read the password from standa
 @app.command("add")
 def add(
     name: str,
-    admin: Annotated[bool, typer.Option("--admin", help="May control everything of everybody.")] = False,
+    role: Annotated[UserRole, typer.Option(help="What the user may do.")] = UserRole.USER,
+    admin: Annotated[bool, typer.Option("--admin", help="The same as --role admin.")] = False,
     password_stdin: PasswordStdin = False,
     state_dir: StateDir = None,
 ) -> None:
     """Add a user."""
-    run(_add(name, admin, read_password(from_stdin=password_stdin, confirm=True), state_dir))
+    run(
+        _add(
+            name,
+            "admin" if admin else role.value,
+            read_password(from_stdin=password_stdin, confirm=True),
+            state_dir,
+        )
+    )
 
 
-async def _add(name: str, admin: bool, password: str, state_dir: Path | None) -> None:
+async def _add(name: str, role: str, password: str, state_dir: Path | None) -> None:
     async with _directory(state_dir) as users:
-        await users.add(name, "admin" if admin else "user", password)
+        await users.add(name, role, password)
     typer.echo(f"added {name}")
 
 
@@ -102,10 +110,23 @@ async def _remove(name: str, state_dir: Path | None) -> None:
     typer.echo(f"removed {name}")
 
 
+@app.command("role")
+def set_role(name: str, role: UserRole, state_dir: StateDir = None) -> None:
+    """Change what a user may do."""
+    run(_set_role(name, role.value, state_dir))
+
+
+async def _set_role(name: str, role: str, state_dir: Path | None) -> None:
+    async with _directory(state_dir) as users:
+        await users.set_role(name, role)
+    typer.echo(f"{name} has the role {role} now")
+
+
 class _Directory(Protocol):
     async def add(self, name: str, role: str, password: str) -> None: ...
     async def list(self) -> list[dict[str, Any]]: ...
     async def set_password(self, name: str, password: str, old: str) -> None: ...
+    async def set_role(self, name: str, role: str) -> None: ...
     async def remove(self, name: str) -> None: ...
 
 
@@ -124,6 +145,9 @@ class _ApiDirectory:
     async def set_password(self, name: str, password: str, old: str) -> None:
         body = {"password": password, "old_password": old}
         await self._client.call("PUT", f"/users/{name}/password", body)
+
+    async def set_role(self, name: str, role: str) -> None:
+        await self._client.call("PUT", f"/users/{name}/role", {"role": role})
 
     async def remove(self, name: str) -> None:
         await self._client.call("DELETE", f"/users/{name}")
@@ -152,6 +176,9 @@ class _StoreDirectory:
         del old  # whoever may write the folder may do everything
         hashed = await self._authenticator.hash(client_digest(password))
         await self._do(commands.SetPassword(name=name, password=hashed))
+
+    async def set_role(self, name: str, role: str) -> None:
+        await self._do(commands.SetRole(name=name, role=UserRole(role)))
 
     async def remove(self, name: str) -> None:
         await self._do(commands.RemoveUser(name=name))

@@ -11,7 +11,7 @@ from rce_master.exceptions import Forbidden, WrongCredentials
 from rce_master.state.records import METRICS_SCOPE, UserRole
 
 if TYPE_CHECKING:
-    from rce_master.http.routes import Services
+    from rce_master.http.routes import Route, Services
     from rce_master.state.records import Token, User
 
 
@@ -30,6 +30,22 @@ def bearer(request: web.Request, services: Services) -> tuple[str, User | None]:
         what = f"robot {record.robot!r}" if record.robot else record.scope
         raise Forbidden(f"this token is good for {what} only; log in for one for the API: rce login")
     return token, user
+
+
+def admit(route: Route, user: User | None) -> None:
+    """Check that a user may use a route.
+
+    Raises:
+        WrongCredentials: Nobody is known, and the route is not open to everybody.
+        Forbidden: The user's role is not enough.
+    """
+    if user is None and not route.open:
+        raise WrongCredentials("a bearer token is needed; get one at /api/v1/login")
+    if route.admin and (user is None or user.role is not UserRole.ADMIN):
+        raise Forbidden("only an administrator may do this")
+    looks = route.method == "GET" or route.everybody or route.open
+    if user is not None and not user.role.changes and not looks:
+        raise Forbidden(f"the role {user.role.value} changes nothing; ask an administrator for another one")
 
 
 def check_metrics(request: web.Request, services: Services) -> None:

@@ -34,7 +34,7 @@ async def log_in(call: Call) -> models.TokenOut:
     )
 
 
-@routes.route("DELETE", "/login", "Forget the token that this request carries", status=204)
+@routes.route("DELETE", "/login", "Forget the token that this request carries", status=204, everybody=True)
 async def log_out(call: Call) -> None:
     """Forget the token."""
     await call.services.realm.submit(commands.RemoveToken(digest=token_digest(call.token)))
@@ -82,6 +82,7 @@ async def remove_user(call: Call) -> None:
     "Change a password (your own, or anybody's as administrator); ends the user's tokens and sessions",
     body=models.PasswordIn,
     status=204,
+    everybody=True,
 )
 async def set_password(call: Call) -> None:
     """Change a password."""
@@ -97,6 +98,15 @@ async def set_password(call: Call) -> None:
     digest = client_digest(body.password)
     hashed = await services.authenticator.hash(digest, call.caller.name)
     await services.realm.submit(commands.SetPassword(name=name, password=hashed))
+
+
+@routes.route(
+    "PUT", "/users/{name}/role", "Change what a user may do", body=models.RoleIn, status=204, admin=True
+)
+async def set_role(call: Call) -> None:
+    """Change a role."""
+    role = UserRole(call.read(models.RoleIn).role)
+    await call.services.realm.submit(commands.SetRole(name=call.path("name"), role=role))
 
 
 async def _check_old(call: Call, password: str) -> None:

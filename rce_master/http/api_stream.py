@@ -133,7 +133,7 @@ async def _stream(call: Call, scope: str | None, last: int) -> web.StreamRespons
                 await response.write(_frame(_farewell(call, last)))
                 return response
             # A comment now and then keeps proxies from giving up, and finds out that a client is gone.
-            frames = [_frame(event) for event in news if event.time >= born]
+            frames = [_frame(event) for event in news if event.time >= born and _concerns(call, event)]
             if frames or clock() >= written + HEARTBEAT_S:
                 await response.write(b"".join(frames) or b":\n\n")
                 written = clock()
@@ -148,6 +148,11 @@ def _start(call: Call) -> int:
     if _EVENT_ID.fullmatch(resumed):
         return int(resumed)
     return call.number("since", call.services.events.last_id)
+
+
+def _concerns(call: Call, event: Event) -> bool:
+    """Return whether an event is for a caller's eyes: what is of no user is for administrators."""
+    return bool(event.user) or call.is_admin
 
 
 def _farewell(call: Call, last: int) -> Event:

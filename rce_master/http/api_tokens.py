@@ -37,7 +37,12 @@ async def add_token(call: Call) -> models.TokenOut:
 
 
 @routes.route(
-    "DELETE", "/tokens/{id}", "Revoke a token; ends what was opened by it", status=204, query=(OF_USER,)
+    "DELETE",
+    "/tokens/{id}",
+    "Revoke a token; ends what was opened by it",
+    status=204,
+    everybody=True,
+    query=(OF_USER,),
 )
 async def revoke_token(call: Call) -> None:
     """Revoke a token."""
@@ -100,6 +105,8 @@ async def _make(
 
 
 def _of(call: Call) -> list[Token]:
+    if call.owner != call.caller.name and not call.is_admin:
+        raise Forbidden("only an administrator sees the tokens of others")
     now = call.services.clock()
     found = call.services.realm.tables.tokens.by("user", call.owner)
     return sorted((token for token in found if not token.is_expired(now)), key=lambda token: token.created)

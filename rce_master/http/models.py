@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 Scalar = bool | int | float | str
 Value = Scalar | list[Scalar]
+ROLES = "^(viewer|user|operator|admin)$"
 Amount = int | float | str
 """An amount as :mod:`rce.protocol.quantities` reads it."""
 
@@ -63,7 +64,24 @@ class UserIn(_In):
 
     name: str
     password: Annotated[str, Field(repr=False, min_length=1)]
-    role: Annotated[str, Field(pattern="^(user|admin)$")] = "user"
+    role: Annotated[str, Field(pattern=ROLES)] = "user"
+
+
+class RoleIn(_In):
+    """What a user may do from now on."""
+
+    role: Annotated[str, Field(pattern=ROLES)]
+
+
+class AuditIn(_In):
+    """What somebody did at a station."""
+
+    action: Annotated[str, Field(pattern="^[a-z_]{1,64}$")]
+    subject: Annotated[str, Field(max_length=300)] = ""
+    detail: Annotated[str, Field(max_length=300)] = ""
+    address: Annotated[str, Field(max_length=64)] = ""
+    """Where it came from."""
+    outcome: Annotated[str, Field(pattern="^(done|refused)$")] = "done"
 
 
 class PasswordIn(_In):
@@ -185,6 +203,32 @@ class TokenListed(BaseModel):
     """When it was last used, in seconds since 1970; 0: never."""
     current: bool
     """Whether this request carries it."""
+
+
+class AuditRecord(BaseModel):
+    """Something that somebody did, or was refused."""
+
+    id: int
+    time: float
+    """Seconds since 1970."""
+    user: str
+    """Who; empty: nobody that is known."""
+    action: str
+    subject: str
+    outcome: str
+    """``done`` or ``refused``."""
+    detail: str
+    address: str
+    via: str
+    """What passed it on: a robot or a station; else empty."""
+    times: int
+    """How often, for refusals that repeat."""
+
+
+class AuditOut(BaseModel):
+    """Records of the audit log."""
+
+    records: list[AuditRecord]
 
 
 class TokensOut(BaseModel):

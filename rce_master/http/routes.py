@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from aiohttp import web
     from aiohttp.web import StreamResponse
 
+    from rce_master.audit import AuditLog
     from rce_master.auth import Authenticator
     from rce_master.bundles.office import PackageOffice
     from rce_master.events import EventLog
@@ -53,6 +54,7 @@ class Services:
     packages: PackageOffice
     tokens: Tokens
     quotas: Quotas
+    audit: AuditLog
     dev: bool
     """Whether this is development mode."""
     proxies: TrustedProxies = field(default_factory=TrustedProxies)
@@ -116,16 +118,17 @@ class Call:
             NotFound: There is no such user.
         """
         name = self.request.query.get("user", self.caller.name)
-        if name != self.caller.name and not self.is_admin:
-            raise Forbidden("only an administrator sees what belongs to others")
+        looks = self.request.method == "GET" and self.caller.role.sees_all
+        if name != self.caller.name and not self.is_admin and not looks:
+            raise Forbidden("only an administrator controls, and only roles above user see, what others have")
         if name not in self.services.realm.tables.users:
             raise NotFound(f"there is no user {name!r}")
         return name
 
     @property
     def scope(self) -> str | None:
-        """Whose things are to be listed; None: everybody's, which administrators get by default."""
-        return None if self.is_admin and "user" not in self.request.query else self.owner
+        """Whose things are to be listed; None: everybody's, the default of those who may see them."""
+        return None if self.caller.role.sees_all and "user" not in self.request.query else self.owner
 
     def path(self, name: str) -> str:
         """A part of the path."""
@@ -178,6 +181,8 @@ class Route:
     media: str = "application/json"
     status: int = 200
     admin: bool = False
+    everybody: bool = False
+    """Whether who may only look may use it all the same."""
     open: bool = False
     """Whether it can be used without a token."""
     query: tuple[Query, ...] = ()

@@ -6,6 +6,7 @@ import asyncio
 import json
 import logging
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from aiohttp import hdrs, web
@@ -16,7 +17,6 @@ from rce.web.origin import ServerNames, is_foreign
 from rce.web.server import IDLE_S
 from rce_master.exceptions import (
     AuthError,
-    Forbidden,
     MasterError,
     Refused,
     StoreError,
@@ -24,10 +24,10 @@ from rce_master.exceptions import (
     TooManyFailures,
     TooManyLogins,
     TooMuch,
-    WrongCredentials,
 )
 from rce_master.http import (
     api_account,
+    api_audit,
     api_control,
     api_machines,
     api_packages,
@@ -36,13 +36,13 @@ from rce_master.http import (
     api_tokens,
     api_usage,
 )
-from rce_master.http.access import bearer, check_metrics
+from rce_master.http.access import admit, bearer, check_metrics
+from rce_master.http.auditing import note_done, note_refused
 from rce_master.http.entry import Entry
 from rce_master.http.health import Health
 from rce_master.http.metrics import make_registry
 from rce_master.http.models import Error
 from rce_master.http.routes import Call, Route, Services, read_body
-from rce_master.state.records import UserRole
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
@@ -56,6 +56,7 @@ MAX_BODY = 1 << 20
 ROUTES: list[Route] = [
     *api_account.routes,
     *api_tokens.routes,
+    *api_audit.routes,
     *api_read.routes,
     *api_control.routes,
     *api_machines.routes,
@@ -94,14 +95,18 @@ def make_app(
 def _adapt(route: Route, services: Services) -> Handler:
     async def handle(request: web.Request) -> web.StreamResponse:
         token, user = bearer(request, services)
-        if user is None and not route.open:
-            raise WrongCredentials("a bearer token is needed; get one at /api/v1/login")
-        if route.admin and (user is None or user.role is not UserRole.ADMIN):
-            raise Forbidden("only an administrator may do this")
         if user is not None:
             services.quotas.request(user)
-        body = read_body(route.body, await _read(request)) if route.body else None
-        reply = await route.handler(Call(request, services, user, token, body))
+        call = Call(request, services, user, token, None)
+        try:
+            admit(route, user)
+            if route.body:
+                call = replace(call, body=read_body(route.body, await _read(request)))
+            reply = await route.handler(call)
+        except MasterError as error:
+            note_refused(route, call, error)
+            raise
+        note_done(route, call)
         if isinstance(reply, web.StreamResponse):
             return reply
         if reply is None:

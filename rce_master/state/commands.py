@@ -14,7 +14,7 @@ from rce.control.model import Resources
 if TYPE_CHECKING:
     from rce.control.messages import Hello
     from rce.control.model import EndpointStatus, InterfaceSpec, NodeSpec, ParameterValue
-    from rce_master.state.records import Bundle, KnownLogin, PackageKey, Token, User
+    from rce_master.state.records import Bundle, KnownLogin, PackageKey, Token, User, UserRole
 
 
 _NO_WISHES = Resources()
@@ -36,6 +36,14 @@ class SetPassword:
     name: str
     password: str
     """argon2 hash."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetRole:
+    """Change what a user may do."""
+
+    name: str
+    role: UserRole
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -337,6 +345,7 @@ Request: TypeAlias = (
 Command: TypeAlias = (
     AddUser
     | SetPassword
+    | SetRole
     | RemoveUser
     | AddToken
     | RemoveToken

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 _HANDLERS: dict[type, Callable[[Transaction, Any], None]] = {
     commands.AddUser: users.add_user,
     commands.SetPassword: users.set_password,
+    commands.SetRole: users.set_role,
     commands.RemoveUser: users.remove_user,
     commands.RememberLogin: users.remember_login,
     commands.AddToken: tokens.add,

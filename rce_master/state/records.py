@@ -26,10 +26,24 @@ from rce_master.state.lifecycle import ContainerPhase, RobotSession
 class UserRole(Enum):
     """What a user may do."""
 
+    VIEWER = "viewer"
+    """Sees everything of everybody, and changes nothing."""
     USER = "user"
     """Their own robots and containers."""
+    OPERATOR = "operator"
+    """The same; sees everything of everybody, and steers every fleet at its station."""
     ADMIN = "admin"
     """Everything of everybody."""
+
+    @property
+    def sees_all(self) -> bool:
+        """Whether what belongs to others may be looked at."""
+        return self is not UserRole.USER
+
+    @property
+    def changes(self) -> bool:
+        """Whether there is anything that may be changed."""
+        return self is not UserRole.VIEWER
 
 
 class User(Struct, frozen=True, kw_only=True):

@@ -28,6 +28,8 @@ def login(tx: Transaction, command: RobotLogin) -> None:
     user = tx.tables.users.get(name.user)
     if user is None:
         raise NotFound(f"there is no user {name.user!r}")
+    if not user.role.changes:
+        raise Forbidden(f"user {user.name!r} has the role {user.role.value}, which connects no robots")
     if command.credential and command.credential not in tx.tables.tokens:
         raise Forbidden("the robot's token was revoked")
     if command.password and command.password != user.password:

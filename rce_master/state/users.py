@@ -13,7 +13,7 @@ from rce_master.state.records import User, UserRole
 
 if TYPE_CHECKING:
     from rce_master.state.changes import Transaction
-    from rce_master.state.commands import AddUser, RememberLogin, RemoveUser, SetPassword
+    from rce_master.state.commands import AddUser, RememberLogin, RemoveUser, SetPassword, SetRole
 
 
 def add_user(tx: Transaction, command: AddUser) -> None:
@@ -44,12 +44,23 @@ def set_password(tx: Transaction, command: SetPassword) -> None:
     tx.happen("user_password_changed", user.name, user=user.name)
 
 
+def set_role(tx: Transaction, command: SetRole) -> None:
+    """Change what a user may do. Robots of one who may change nothing any more are sent away."""
+    user = _find(tx, command.name)
+    if user.role is command.role:
+        return
+    _keep_an_admin(tx, user)
+    tx.put(replace(user, role=command.role))
+    if not command.role.changes:
+        for robot in tx.tables.robots(user.name):
+            robots.send_away(tx, robot, f"the user's role is {command.role.value} now")
+    tx.happen("user_role_changed", user.name, command.role.value, user=user.name)
+
+
 def remove_user(tx: Transaction, command: RemoveUser) -> None:
     """Remove a user with all that is theirs."""
     user = _find(tx, command.name)
-    admins = [u for u in tx.tables.users if u.role is UserRole.ADMIN]
-    if admins == [user]:
-        raise Conflict(f"{user.name!r} is the last administrator; make another one first")
+    _keep_an_admin(tx, user)
     for endpoint in tx.tables.endpoints.by("user", user.name):
         endpoints.remove(tx, endpoint.id, "the user was removed")
     _forget_login(tx, user.name)
@@ -77,3 +88,8 @@ def _find(tx: Transaction, name: str) -> User:
 def _forget_login(tx: Transaction, user: str) -> None:
     if user in tx.tables.known_logins:
         tx.delete(tx.tables.known_logins, user)
+
+
+def _keep_an_admin(tx: Transaction, user: User) -> None:
+    if [u for u in tx.tables.users if u.role is UserRole.ADMIN] == [user]:
+        raise Conflict(f"{user.name!r} is the last administrator; make another one first")

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 SCRIPT = "from rce.cli.main import build_app; from importlib.metadata import EntryPoint;"
 COMMANDS = {
+    "audit": "rce_master.cli.audit:audit",
     "user": "rce_master.cli.users:app",
     "login": "rce_master.cli.session:login",
     "logout": "rce_master.cli.session:logout",

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+import tempfile
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
@@ -133,10 +134,12 @@ class Site:
 
 @asynccontextmanager
 async def running_site(
-    store: Store | None = None, state_dir: Path = Path("unused"), *, log_in: bool = True, **options: Any
+    store: Store | None = None, state_dir: Path | None = None, *, log_in: bool = True, **options: Any
 ) -> AsyncIterator[Site]:
     """Run a master in development mode on free ports, and log in."""
     options.setdefault("dev", True)
+    spare = tempfile.TemporaryDirectory(prefix="rce-master-")
+    state_dir = state_dir or Path(spare.name)
     settings = MasterSettings(bind=LOOPBACK, http_port=0, control_port=0, state_dir=state_dir, **options)
     ready: asyncio.Future[RunningMaster] = asyncio.get_running_loop().create_future()
     master = Master(settings, SECRET, store or MemoryStore(), hasher=HASHER)
@@ -153,6 +156,7 @@ async def running_site(
     finally:
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
+        spare.cleanup()
 
 
 @pytest.fixture

@@ -132,3 +132,15 @@ async def test_tokens_are_listed_and_revoked_by_commands(tmp_path: Path) -> None
         assert "log in again" in await rce(tmp_path, "token", "list", code=1)
         async with aiohttp.ClientSession(headers={"Authorization": f"Bearer {first}"}) as session:
             assert (await session.get(f"{url}api/v1/user")).status == 401
+
+
+async def test_roles_and_audit_by_commands(tmp_path: Path) -> None:
+    async with master(tmp_path, "--dev") as url:
+        await rce(tmp_path, "login", url, "-u", "testUser", "--password-stdin", text="testUser\n")
+        await rce(tmp_path, "user", "add", "eve", "--role", "viewer", "--password-stdin", text="one\n")
+        await rce(tmp_path, "user", "role", "eve", "operator")
+        assert "operator" in await rce(tmp_path, "user", "list")
+        told = await rce(tmp_path, "audit", "--user", "testUser")
+    assert "set_role  testUser/eve/operator" in told
+    assert "add_user" in told
+    assert "log_in" in told

@@ -1,0 +1,236 @@
+"""Who came in, who was refused, and who changed what: JSON lines in files that take turns.
+
+Nothing of what is written here is a secret: no password, token or value of a parameter, and of unknown users
+not even the name, because people type passwords where the name belongs.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections import OrderedDict, deque
+from itertools import islice
+from typing import TYPE_CHECKING
+
+import msgspec
+from msgspec import Struct
+
+from rce.config.logs import redact
+from rce.protocol.printable import one_line
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+_log = logging.getLogger(__name__)
+
+FILE_NAME = "audit.jsonl"
+MAX_BYTES = 8 << 20
+"""Of one file; then the next one begins."""
+FILES = 10
+"""How many files are kept, the one in use included."""
+KEPT = 10_000
+"""Newest records that the API shows; older ones are in the files."""
+REPEAT_S = 60.0
+"""Refusals of the same user from the same address within this time are one record."""
+MAX_REPEATS = 1000
+MAX_TEXT = 300
+
+DONE, REFUSED = "done", "refused"
+
+
+class Record(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Something that somebody did, or was refused."""
+
+    id: int
+    """Grows by one."""
+    time: float
+    """Seconds since 1970."""
+    user: str
+    """Who; empty: nobody that is known."""
+    action: str
+    """Such as ``log_in`` or ``create_container``."""
+    subject: str = ""
+    """What it was about, such as ``user/container``."""
+    outcome: str = DONE
+    """``done`` or ``refused``."""
+    detail: str = ""
+    address: str = ""
+    """Where it came from."""
+    via: str = ""
+    """What passed it on: a robot or a station."""
+    times: int = 1
+    """How often, since the record before of the same user, action and address."""
+
+
+class AuditLog:
+    """Keeps the newest records in memory and all of them in files, until those are too many.
+
+    Args:
+        folder: Where the files are; made with the first record, for its owner only.
+        clock: Seconds since 1970.
+        max_bytes: Of one file.
+        files: How many are kept.
+    """
+
+    def __init__(
+        self, folder: Path, clock: Callable[[], float], *, max_bytes: int = MAX_BYTES, files: int = FILES
+    ) -> None:
+        self._folder = folder
+        self._file = folder / FILE_NAME
+        self._clock = clock
+        self._max_bytes = max_bytes
+        self._files = files
+        self._records: deque[Record] = deque(self._newest(), maxlen=KEPT)
+        self._next_id = self._records[-1].id + 1 if self._records else 1
+        self._descriptor = -1
+        self._size = 0
+        self._failed = False
+        self._repeated: OrderedDict[tuple[str, str, str], tuple[float, int]] = OrderedDict()
+
+    def add(
+        self,
+        user: str,
+        action: str,
+        subject: str = "",
+        *,
+        detail: str = "",
+        address: str = "",
+        via: str = "",
+        outcome: str = DONE,
+        times: int = 1,
+    ) -> None:
+        """Write what somebody did.
+
+        A record that cannot be written is kept in memory, and the engine's log says so: the engine goes on.
+        """
+        record = Record(
+            id=self._next_id,
+            time=self._clock(),
+            user=_clean(user),
+            action=action,
+            subject=_clean(subject),
+            outcome=outcome,
+            detail=_clean(detail),
+            address=address,
+            via=_clean(via),
+            times=times,
+        )
+        self._next_id += 1
+        self._records.append(record)
+        self._write(msgspec.json.encode(record) + b"\n")
+
+    def refuse(self, user: str, action: str, *, detail: str = "", address: str = "") -> None:
+        """Write that somebody was refused; repetitions are counted and written once a minute at most."""
+        key, now = (user, action, address), self._clock()
+        since, count = self._repeated.get(key, (0.0, 0))
+        if now - since < REPEAT_S:
+            self._repeated[key] = (since, count + 1)
+            return
+        self._repeated.pop(key, None)
+        while len(self._repeated) >= MAX_REPEATS:
+            oldest, (_, missed) = self._repeated.popitem(last=False)
+            self._add_missed(oldest, missed)
+        self._repeated[key] = (now, 0)
+        self.add(user, action, detail=detail, address=address, outcome=REFUSED, times=count + 1)
+
+    def flush(self) -> None:
+        """Write the repetitions whose time is over."""
+        now = self._clock()
+        for key in [key for key, (since, _) in self._repeated.items() if now - since >= REPEAT_S]:
+            self._add_missed(key, self._repeated.pop(key)[1])
+
+    def since(self, id_: int, limit: int, user: str = "") -> list[Record]:
+        """List records after an id, oldest first; with a negative id, the newest ``-id`` ones.
+
+        Args:
+            id_: The last one that is known.
+            limit: At most so many.
+            user: Only of this user; empty: of all.
+        """
+        found = [r for r in self._records if (id_ < 0 or r.id > id_) and (not user or r.user == user)]
+        return list(islice(found[id_:] if id_ < 0 else found, limit))
+
+    def close(self) -> None:
+        """Write what was counted, and close the file."""
+        for key, (_, count) in self._repeated.items():
+            self._add_missed(key, count)
+        self._repeated.clear()
+        self._close()
+
+    def _add_missed(self, key: tuple[str, str, str], count: int) -> None:
+        user, action, address = key
+        if count:
+            self.add(user, action, detail="again", address=address, outcome=REFUSED, times=count)
+
+    def _write(self, line: bytes) -> None:
+        try:
+            if self._descriptor < 0:
+                self._open()
+            elif self._size + len(line) > self._max_bytes:
+                self._turn()
+            os.write(self._descriptor, line)
+            self._size += len(line)
+            self._failed = False
+        except OSError as error:
+            if not self._failed:
+                _log.error("the audit log %s cannot be written: %s", self._file, error)
+            self._failed = True
+            self._close()
+
+    def _open(self) -> None:
+        self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
+        self._descriptor = os.open(self._file, flags, 0o600)
+        self._size = os.fstat(self._descriptor).st_size
+        if self._size and os.pread(self._descriptor, 1, self._size - 1) != b"\n":
+            self._size += os.write(self._descriptor, b"\n")  # a crash cut the last line off
+        if self._size >= self._max_bytes:
+            self._turn()
+
+    def _turn(self) -> None:
+        """Begin a new file; the oldest one goes."""
+        self._close()
+        for number in range(self._files - 1, 0, -1):
+            older = self._numbered(number - 1)
+            if older.exists():
+                older.replace(self._numbered(number))
+        self._open()
+
+    def _close(self) -> None:
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def _numbered(self, number: int) -> Path:
+        return self._folder / f"{FILE_NAME}.{number}" if number else self._file
+
+    def _newest(self) -> list[Record]:
+        """Read the newest records of the files."""
+        found: list[Record] = []
+        for number in range(self._files):
+            found = [*_read(self._numbered(number)), *found]
+            if len(found) >= KEPT:
+                break
+        return found[-KEPT:]
+
+
+def _clean(text: str) -> str:
+    """Return a text on one line, of bounded length, without what looks like a token or password."""
+    return redact(one_line(text[:MAX_TEXT]))
+
+
+def _read(file: Path) -> Iterator[Record]:
+    """Read the records of a file; a line that was cut off by a crash is left out."""
+    try:
+        lines = file.read_bytes().splitlines()
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        _log.warning("the audit log %s cannot be read: %s", file, error)
+        return
+    for line in lines:
+        try:
+            yield msgspec.json.decode(line, type=Record)
+        except msgspec.MsgspecError:
+            _log.warning("the audit log %s has an unreadable line", file)

@@ -1,0 +1,35 @@
+"""What a robot's request is called in the audit log: names, never values (pure)."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rce_master.state.commands import Command
+
+SHOWN = 5
+"""So many of a request's commands are named; the others are counted."""
+
+_UPPER = re.compile(r"(?<!^)(?=[A-Z])")
+_NAMES = ("container", "endpoint", "tag", "name", "tag_a", "tag_b")
+
+
+def describe(commands: Sequence[Command]) -> str:
+    """Return what the commands of one request do, in short."""
+    words = [_describe(command) for command in commands[:SHOWN]]
+    more = len(commands) - len(words)
+    return ", ".join(words) + (f", and {more} more" if more else "")
+
+
+def _describe(command: Command) -> str:
+    action = _UPPER.sub(" ", type(command).__name__).lower()
+    names = [getattr(command, name, "") for name in _NAMES]
+    names += [_tag_of(getattr(command, part, None)) for part in ("node", "interface")]
+    return f"{action} {' '.join(name for name in names if name)}"
+
+
+def _tag_of(part: Any) -> str:
+    return str(getattr(part, "tag", ""))

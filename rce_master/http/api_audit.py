@@ -1,0 +1,61 @@
+"""REST: who came in, who was refused, and who changed what."""
+
+from __future__ import annotations
+
+from msgspec.structs import asdict
+
+from rce.web.openapi import Query
+from rce_master.exceptions import Forbidden
+from rce_master.http import models
+from rce_master.http.routes import Call, RouteTable
+from rce_master.state.records import UserRole
+
+routes = RouteTable("audit")
+
+MAX_RECORDS = 1000
+
+
+@routes.route(
+    "GET",
+    "/audit",
+    "Read the audit log, oldest first; to follow it, read on from the last id",
+    reply=models.AuditOut,
+    admin=True,
+    query=(
+        Query(name="user", description="Only what this user did."),
+        Query(
+            name="since",
+            description="Id of the last known record; negative: that many of the newest. Default: -100.",
+            type="integer",
+        ),
+    ),
+)
+async def read_audit(call: Call) -> models.AuditOut:
+    """Read records."""
+    user = call.request.query.get("user", "")
+    found = call.services.audit.since(call.number("since", -100), MAX_RECORDS, user)
+    return models.AuditOut(records=[models.AuditRecord(**asdict(record)) for record in found])
+
+
+@routes.route(
+    "POST",
+    "/audit",
+    "Note what the caller did at a station of this engine",
+    body=models.AuditIn,
+    status=204,
+    everybody=True,
+)
+async def note_action(call: Call) -> None:
+    """Note what somebody steered; a station does it with the token of who steered."""
+    body = call.read(models.AuditIn)
+    if call.caller.role is UserRole.VIEWER and body.outcome == "done":
+        raise Forbidden("role viewer steers nothing, so there is nothing to note")
+    call.services.audit.add(
+        call.caller.name,
+        body.action,
+        body.subject,
+        detail=body.detail,
+        address=body.address or call.address,
+        via="station",
+        outcome=body.outcome,
+    )

@@ -1,0 +1,53 @@
+"""Writes what requests changed, and what was refused to whom, into the audit log."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rce_master.exceptions import AuthError, Forbidden
+
+if TYPE_CHECKING:
+    from rce_master.exceptions import MasterError
+    from rce_master.http.routes import Call, Route
+
+_NAMES = ("userID", "tag", "tag_a", "tag_b", "name", "robot", "role", "scope", "draining")
+"""Keys of bodies that name things; all others are left out, because they may hold secrets."""
+
+
+def note_done(route: Route, call: Call) -> None:
+    """Note a request that changed something."""
+    if route.method == "GET" or not _is_noted(route):
+        return
+    audit = call.services.audit
+    user = call.user.name if call.user is not None else _claimed(call)
+    audit.add(user, _action(route), _subject(call), address=call.address)
+
+
+def note_refused(route: Route, call: Call, error: MasterError) -> None:
+    """Note a request that was refused for who asked. What was wrong in itself is not noted."""
+    if isinstance(error, AuthError | Forbidden) and _is_noted(route):
+        user = call.user.name if call.user is not None else _claimed(call)
+        detail = f"{type(error).__name__} {route.method} {_subject(call)}".rstrip()
+        call.services.audit.refuse(user, _action(route), detail=detail, address=call.address)
+
+
+def _is_noted(route: Route) -> bool:
+    return _action(route) != "note_action"
+
+
+def _action(route: Route) -> str:
+    return str(getattr(route.handler, "__name__", route.path))
+
+
+def _claimed(call: Call) -> str:
+    """Return the name that a login is for, if there is such a user: else it may be a password."""
+    name = str(getattr(call.body, "userID", ""))
+    return name if name in call.services.realm.tables.users else ""
+
+
+def _subject(call: Call) -> str:
+    owner = call.request.query.get("user", call.user.name if call.user is not None else "")
+    words = [str(word) for word in call.request.match_info.values()]
+    given = call.body.model_dump(include=set(_NAMES), exclude={"userID"}) if call.body is not None else {}
+    words += [str(value) for value in given.values()]
+    return "/".join((owner, *words)) if words else ""

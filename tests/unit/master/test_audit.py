@@ -1,0 +1,105 @@
+from __future__ import annotations
+
+import stat
+from typing import TYPE_CHECKING
+
+from rce_master.audit import MAX_TEXT, AuditLog
+from rce_master.audit_words import describe
+from rce_master.state import commands
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_records_survive_restart_and_ids_grow(tmp_path: Path) -> None:
+    first = AuditLog(tmp_path / "audit", Clock())
+    first.add("anna", "log_in", address="127.0.0.1")
+    first.close()
+    with (tmp_path / "audit" / "audit.jsonl").open("ab") as file:
+        file.write(b'{"id":2,"ti')  # the crash came in between
+    second = AuditLog(tmp_path / "audit", Clock())
+    second.add("bob", "log_in")
+    assert [(r.id, r.user) for r in second.since(0, 10)] == [(1, "anna"), (2, "bob")]
+    assert stat.S_IMODE((tmp_path / "audit" / "audit.jsonl").stat().st_mode) == 0o600
+    second.close()
+    third = AuditLog(tmp_path / "audit", Clock())
+    assert [r.user for r in third.since(-1, 10)] == ["bob"], "the half line cost no other one"
+
+
+def test_files_take_turns_and_their_number_is_bounded(tmp_path: Path) -> None:
+    log = AuditLog(tmp_path, Clock(), max_bytes=1000, files=3)
+    for number in range(200):
+        log.add("anna", "create_container", f"anna/c{number}")
+    log.close()
+    files = sorted(tmp_path.iterdir())
+    assert [file.name for file in files] == ["audit.jsonl", "audit.jsonl.1", "audit.jsonl.2"]
+    assert all(file.stat().st_size <= 1000 for file in files)
+    assert AuditLog(tmp_path, Clock(), max_bytes=1000, files=3).since(-1, 1)[0].subject == "anna/c199"
+
+
+def test_flood_of_refusals_is_one_record_a_minute(tmp_path: Path) -> None:
+    clock = Clock()
+    log = AuditLog(tmp_path, clock)
+    for _ in range(5000):
+        log.refuse("anna", "log_in", address="10.0.0.1")
+    assert [r.times for r in log.since(0, 10)] == [1]
+    clock.now += 61
+    log.flush()
+    assert [r.times for r in log.since(0, 10)] == [1, 4999]
+    log.close()
+
+
+def test_refusals_from_many_addresses_stay_bounded(tmp_path: Path) -> None:
+    log = AuditLog(tmp_path, Clock())
+    for number in range(3000):
+        log.refuse("anna", "log_in", address=f"10.0.{number // 256}.{number % 256}")
+    assert len(log._repeated) <= 1000
+    log.close()
+
+
+def test_records_by_user(tmp_path: Path) -> None:
+    log = AuditLog(tmp_path, Clock())
+    for name in ("anna", "bob", "anna"):
+        log.add(name, "log_in")
+    assert [r.id for r in log.since(-10, 10, "anna")] == [1, 3]
+    assert [r.id for r in log.since(1, 10, "anna")] == [3]
+    log.close()
+
+
+def test_text_is_bounded_one_line_and_without_tokens(tmp_path: Path) -> None:
+    log = AuditLog(tmp_path, Clock())
+    token = "rce_" + "x" * 43
+    log.add("anna", "revoke_token", f"anna/{token}", detail="\x1b[2J\n" + "y" * 5000)
+    (record,) = log.since(0, 1)
+    assert token not in record.subject
+    assert len(record.detail) <= MAX_TEXT
+    assert not {"\n", "\x1b"} & set(record.detail)
+    log.close()
+    assert token not in (tmp_path / "audit.jsonl").read_text()
+
+
+def test_folder_that_cannot_be_written_stops_nothing(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    log = AuditLog(tmp_path / "file" / "audit", Clock())
+    log.add("anna", "log_in")
+    assert len(log.since(0, 10)) == 1
+
+
+def test_requests_are_named_without_values() -> None:
+    wanted = [
+        commands.CreateContainer(user="anna", tag="c1"),
+        commands.SetParameter(user="anna", container="c1", name="key", value="a secret value"),
+        *(commands.DestroyContainer(user="anna", tag=f"d{n}") for n in range(10)),
+    ]
+    text = describe(wanted)
+    assert text.startswith("create container c1, set parameter c1 key, destroy container d0")
+    assert text.endswith("and 7 more")
+    assert "secret" not in text
