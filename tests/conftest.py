@@ -87,7 +87,7 @@ _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
     ),
     "rospy": (
         lambda: _runs("/usr/bin/python3", "-c", "import rospy"),
-        "ROS 1 is not installed (Debian: python3-rospy ros-core)",
+        "ROS 1 is not installed (Debian: python3-rospy)",
     ),
     "actionlib": (
         lambda: _runs("/usr/bin/python3", "-c", "import actionlib.msg"),
@@ -110,8 +110,11 @@ _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
         "roscpp's actionlib cannot be compiled against (Debian: g++ pkg-config libactionlib-dev)",
     ),
     "roslaunch": (
-        lambda: _runs("/usr/bin/python3", "-c", "import roslaunch, rosmaster, rostest, roswtf"),
-        "roslaunch is missing (Debian: ros-core python3-rostest python3-roswtf)",
+        lambda: (
+            _runs("/usr/bin/python3", "-c", "import roslaunch, rosmaster, rostest, roswtf")
+            and _has_metadata("rosout")
+        ),
+        "roslaunch or what it starts is missing (Debian: python3-roslaunch rosout python3-rostest python3-roswtf)",
     ),
     "ros_msgs": (
         lambda: _runs("/usr/bin/python3", "-c", "import map_msgs, move_base_msgs, pcl_msgs, stereo_msgs"),
@@ -123,8 +126,8 @@ _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
     ),
     "rosmsg": (lambda: shutil.which("rosmsg") is not None, "rosmsg is missing (Debian: python3-rosmsg)"),
     "topic_tools": (
-        lambda: Path("/usr/lib/topic_tools/relay").exists(),
-        "topic_tools is missing (Debian: topic-tools)",
+        lambda: Path("/usr/lib/topic_tools/relay").exists() and _has_metadata("topic_tools"),
+        "topic_tools or its package.xml is missing (Debian: topic-tools libtopic-tools-dev)",
     ),
     "chromium": (lambda: chromium_path() is not None, "Chromium is not installed (Debian: chromium)"),
     "pymunk": (
@@ -149,6 +152,11 @@ _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
 }
 
 
+def _has_metadata(package: str) -> bool:
+    """Whether ROS's tools find a package: Debian often has its ``package.xml`` apart from its programs."""
+    return Path("/usr/share", package, "package.xml").exists()
+
+
 def _importable(module: str) -> bool:
     import importlib.util
 
@@ -171,6 +179,19 @@ def missing(tool: str) -> str | None:
     """Why ``tool`` cannot be used here, or None."""
     check, reason = _CHECKS[tool]
     return None if check() else reason
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Keep tests together, in one worker of a parallel run, that share what is made once or is the machine's.
+
+    What podman keeps is the machine's; what a person finds out about the sandbox takes long.
+    """
+    for item in items:
+        person = getattr(item, "callspec", None) and item.callspec.params.get("person")  # type: ignore[attr-defined]
+        if any("podman" in marker.args for marker in item.iter_markers("needs")):
+            item.add_marker(pytest.mark.xdist_group("podman"))
+        elif person:
+            item.add_marker(pytest.mark.xdist_group(f"person {person}"))
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:

@@ -7,7 +7,7 @@ import os
 import pytest
 from support import chaos
 
-pytestmark = [pytest.mark.e2e, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.e2e]
 
 
 @pytest.mark.parametrize(

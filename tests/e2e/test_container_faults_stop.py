@@ -16,7 +16,7 @@ from support.leaks import Traces, sweep_cgroups
 from support.ports import free_ports
 from support.stranger import ask_for_echo, stranger
 
-pytestmark = [pytest.mark.e2e, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.e2e]
 
 PORT_OPTIONS = ("--http-port", "--control-port", "--ws-port", "--robot-link-port", "--container-link-port")
 MASTER_RUNS = ""

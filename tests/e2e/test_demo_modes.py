@@ -45,21 +45,18 @@ def check(code: int, report: dict[str, Any], text: str, mode: str) -> None:
     assert report["engine"]["dropped"] == (0 if mode == "cloud" else None)
 
 
-@pytest.mark.timeout(180)
 @pytest.mark.parametrize("mode", MODES, ids=" ".join)
 async def test_the_same_fleet_goes_to_the_same_goals(mode: tuple[str, ...]) -> None:
     options = ("--mode", *mode, "--robots", ROBOTS, "--seed", SEED)
     check(*await run_headless(*options, timeout=TIMEOUT_S), mode=mode[0])
 
 
-@pytest.mark.timeout(180)
 @pytest.mark.needs("roslaunch")
 async def test_single_with_a_real_roscore() -> None:
     options = ("--mode", "single", "--core", "roscore", "--robots", ROBOTS, "--seed", SEED)
     check(*await run_headless(*options, timeout=TIMEOUT_S), mode="single")
 
 
-@pytest.mark.timeout(120)
 async def test_the_page_of_a_single_core_and_its_end() -> None:
     options = ("--mode", "single", "--robots", 1, "--core-port", free_port(), "--no-auto")
     async with running_demo(*options) as demo, aiohttp.ClientSession() as session:
@@ -81,7 +78,6 @@ async def test_the_page_of_a_single_core_and_its_end() -> None:
         assert news["state"]["robots"][0]["state"] == "arrived"
 
 
-@pytest.mark.timeout(120)
 async def test_machines_of_many_masters_share_only_what_they_must() -> None:
     async with (
         running_demo("--mode", "multi", "--robots", 2, "--no-auto") as demo,
@@ -117,7 +113,6 @@ async def test_machines_of_many_masters_share_only_what_they_must() -> None:
         assert await foreign("Robot2") == {"/Robot2/goalNodesList", "/Robot2/cancelGoal"}
 
 
-@pytest.mark.timeout(200)
 @pytest.mark.parametrize("mode", ["single", "multi"])
 async def test_a_killed_planner_and_a_killed_move_client_come_back(mode: str) -> None:
     options = ("--mode", mode, "--robots", 2, "--core-port", free_port(), "--no-auto")
@@ -188,7 +183,6 @@ async def _state(station: StationApi) -> str:
     return ""
 
 
-@pytest.mark.timeout(120)
 @pytest.mark.parametrize("mode", ["single", "multi"])
 async def test_nothing_is_left_when_the_demo_is_killed(mode: str) -> None:
     interfaces = set(psutil.net_if_addrs())

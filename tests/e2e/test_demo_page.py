@@ -16,7 +16,7 @@ from rce.fleet.scenario import midway_cell
 from rce_client.demo.floor import FLOOR
 from rce_client.simulation.report import read_report
 
-pytestmark = [pytest.mark.e2e, pytest.mark.needs("chromium", "pymunk"), pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.e2e, pytest.mark.needs("chromium", "pymunk")]
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 ARTIFACTS = Path(__file__).parents[2] / "artifacts"

@@ -18,7 +18,7 @@ from rce_client.demo.station import StationApi
 if TYPE_CHECKING:
     from support.demo import Demo
 
-pytestmark = [pytest.mark.e2e, pytest.mark.timeout(200)]
+pytestmark = [pytest.mark.e2e]
 
 
 def kill(demo: Demo, *words: str) -> None:

@@ -12,7 +12,6 @@ from support.stranger import stranger
 
 pytestmark = [
     pytest.mark.e2e,
-    pytest.mark.timeout(120),
     pytest.mark.needs("root", "bwrap", "netns", "podman"),
 ]
 

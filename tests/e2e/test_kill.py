@@ -11,7 +11,7 @@ import pytest
 from support.engine import Engine, running_engine, until
 from support.stranger import ROBOT_TAGS, Stranger, check_echo, stranger, wire_echo
 
-pytestmark = [pytest.mark.e2e, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.e2e]
 
 RUNTIMES = ["process", pytest.param("namespace", marks=pytest.mark.needs("bwrap"))]
 

@@ -12,7 +12,7 @@ from support.engine import Engine, running_engine, until
 from rce_master.cli.client import ApiClient
 from rce_master.cli.exceptions import ApiError
 
-pytestmark = [pytest.mark.e2e, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.e2e]
 
 LOG = "/containers/C/nodes/echo/log"
 

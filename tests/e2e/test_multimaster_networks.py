@@ -15,7 +15,7 @@ import pytest
 from support.engine import Program, until
 from support.networks import NetworkMachine, network
 
-pytestmark = [pytest.mark.e2e, pytest.mark.needs("root", "netns"), pytest.mark.timeout(150)]
+pytestmark = [pytest.mark.e2e, pytest.mark.needs("root", "netns")]
 
 TALKER = """
 import asyncio, sys
@@ -33,10 +33,11 @@ run(main())
 """
 
 LISTENER = """
-import sys
+import os, sys
 from rce.ros.node import Node, run
 async def main():
-    async with Node("listener", argv=[]) as node:
+    name = "listener_" + os.environ["ROS_IP"].replace(".", "_")
+    async with Node(name, argv=[]) as node:
         await node.subscribe(sys.argv[1], "std_msgs/String", lambda m: print("heard", m.data, flush=True))
         print("listener ready", flush=True)
         await node.spin()
@@ -129,7 +130,7 @@ async def machines(count: int, folder: Path) -> AsyncIterator[list[Machine]]:
             yield [Machine(place, folder, stack) for place in places]
 
 
-async def hears(listener: Program, *, timeout: float = 30) -> None:
+async def hears(listener: Program, *, timeout: float = 90) -> None:
     """Wait until a listener hears something that it has not heard yet."""
     before = listener.output().count("heard")
     await until(

@@ -20,7 +20,7 @@ from websockets.exceptions import InvalidStatus
 
 from rce.ros.core import Core
 
-pytestmark = [pytest.mark.e2e, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.e2e]
 
 STRING = "std_msgs/String"
 ECHO = "Test/StringEcho"

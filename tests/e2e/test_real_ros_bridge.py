@@ -18,7 +18,7 @@ from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 
-pytestmark = [pytest.mark.e2e, pytest.mark.timeout(240), pytest.mark.needs("rospy", "roslaunch")]
+pytestmark = [pytest.mark.e2e, pytest.mark.needs("rospy", "roslaunch")]
 
 STRING = "std_msgs/String"
 ECHO = "Test/StringEcho"

@@ -17,7 +17,7 @@ from rce_client.connection import Connection
 from rce_client.ends import Publisher
 from rce_client.exceptions import RefusedError
 
-pytestmark = [pytest.mark.e2e, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.e2e]
 
 STRING = "std_msgs/String"
 

@@ -16,7 +16,7 @@ from support.engine import Engine, running_engine, until
 from support.stranger import Stranger, stranger
 from websockets.asyncio.client import ClientConnection, connect
 
-pytestmark = [pytest.mark.e2e, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.e2e]
 
 IMAGE = "sensor_msgs/Image"
 WIDTH, HEIGHT = 1600, 1042

@@ -19,7 +19,7 @@ from support.leaks import sweep_cgroups
 from support.ports import free_ports
 from support.stranger import check_echo, stranger, wire_echo
 
-pytestmark = [pytest.mark.e2e, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.e2e]
 
 PORT_OPTIONS = ("--http-port", "--control-port", "--ws-port", "--robot-link-port", "--container-link-port")
 

@@ -114,7 +114,7 @@ NODES = {
 
 
 async def until(
-    condition: Callable[[], Any], *, timeout: float = 20.0, what: str | Callable[[], object] = "condition"
+    condition: Callable[[], Any], *, timeout: float = 60.0, what: str | Callable[[], object] = "condition"
 ) -> Any:
     """Wait until ``condition`` gives something true, and return it."""
     deadline = time.monotonic() + timeout
@@ -261,11 +261,11 @@ class Machine:
         """Ask for a piece of a log and wait for the answer, which other messages may come before."""
         self._chunk = asyncio.get_running_loop().create_future()
         await self.manager.handle(request)
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             return await self._chunk
 
     async def log_holds(self, id_: str, node: str, text: str) -> str:
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 60
         while text not in (found := await self.log(id_, node)):
             assert time.monotonic() < deadline, f"{text!r} not in the log: {found!r}"
             await asyncio.sleep(0.02)
@@ -464,7 +464,7 @@ class Peer:
         )
 
     async def active(self, *tags: str) -> None:
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             for tag in tags or self.ends:
                 await self.ends[tag].active.wait()
 

@@ -11,15 +11,16 @@ import signal
 import sys
 import tempfile
 from collections.abc import AsyncIterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from rce_client.demo.ports import ANY, Ports, option_of
+from rce_client.demo.ports import Ports, option_of
 from support.engine import engine_processes, until
 from support.leaks import sweep_cgroups
+from support.ports import free_ports
 
-STOP_TIMEOUT_S = 30.0
+STOP_TIMEOUT_S = 120.0
 
 
 def environment(folder: Path) -> dict[str, str]:
@@ -46,12 +47,19 @@ def clean_folder() -> Any:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+def port_options() -> tuple[Ports, list[str]]:
+    """Choose ports that no other test uses, and the options that say so."""
+    ports = Ports(*free_ports(len(fields(Ports))))
+    names = ("page", "http", "control", "ws", "robot_link", "container_link")
+    return ports, [word for name in names for word in (option_of(name), str(getattr(ports, name)))]
+
+
 async def run_headless(*options: object, timeout: float) -> tuple[int, dict[str, Any], str]:
     """Run ``rce demo --headless``; returns exit code, report and what it printed."""
     with clean_folder() as folder:
         report = folder / "report.json"
         process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "rce_client.demo", "--headless"),
+            *(sys.executable, "-m", "rce_client.demo", "--headless", *port_options()[1]),
             *(*map(str, options), "--report", str(report), "--timeout", str(timeout)),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.PIPE,
@@ -97,13 +105,12 @@ class Demo:
 async def running_demo(*options: object) -> AsyncIterator[Demo]:
     """Run a demo with a page; at the end it is stopped and must leave nothing."""
     with clean_folder() as folder:
-        ports = ANY.chosen()
+        ports, given = port_options()
         log = Path(tempfile.mktemp(prefix="rce-demo-log-", dir="/tmp"))
-        names = ("page", "http", "control", "ws", "robot_link", "container_link")
         with log.open("wb") as output:
             process = await asyncio.create_subprocess_exec(
                 *(sys.executable, "-m", "rce_client.demo"),
-                *(part for name in names for part in (option_of(name), str(getattr(ports, name)))),
+                *given,
                 *map(str, options),
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=output,
@@ -114,7 +121,7 @@ async def running_demo(*options: object) -> AsyncIterator[Demo]:
         try:
             await until(
                 lambda: process.returncode is not None or f"RCE demo: {demo.page}" in demo.output(),
-                timeout=50,
+                timeout=120,
                 what="the demo says where its page is",
             )
             assert process.returncode is None, demo.output()

@@ -20,12 +20,12 @@ import psutil
 from support.leaks import sweep_cgroups
 from support.ports import free_ports
 
-READY_TIMEOUT_S = 30.0
-STOP_TIMEOUT_S = 30.0
+READY_TIMEOUT_S = 90.0
+STOP_TIMEOUT_S = 90.0
 
 
 async def until(
-    condition: Callable[[], Any | Awaitable[Any]], *, timeout: float = 15.0, what: str = "condition"
+    condition: Callable[[], Any | Awaitable[Any]], *, timeout: float = 60.0, what: str = "condition"
 ) -> Any:
     """Wait until ``condition`` gives something true, and return it."""
     loop = asyncio.get_running_loop()

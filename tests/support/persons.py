@@ -47,7 +47,7 @@ class Person:
         argv = [*self._prefix, self._python, "-m", module, f"{work}/m", self.runtime, *words]
         os.chown(work, self.uid, self.uid)
         done = subprocess.run(
-            argv, env=env, cwd="/", capture_output=True, text=True, timeout=100, check=False
+            argv, env=env, cwd="/", capture_output=True, text=True, timeout=500, check=False
         )
         assert done.returncode == 0, done.stderr
         found = json.loads(done.stdout.splitlines()[-1])

@@ -17,7 +17,7 @@ from rce.ros.errors import XmlRpcError
 from rce.ros.xmlrpc import RpcClient
 from support.ports import free_port
 
-PATIENCE_S = 45.0
+PATIENCE_S = 120.0
 """Seconds that a program of a real ROS may take: some start slowly."""
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import aiohttp
 
-PATIENCE_S = 30.0
+PATIENCE_S = 90.0
 """How long to wait for what should come at once: the machine may be busy."""
 
 

@@ -40,7 +40,6 @@ async def everything_flows(graph: Graph, engine: Engine) -> None:
         assert await engine.end("serve").port.call(b"\x01") == b"\x00" + ros_string("got True")
 
 
-@pytest.mark.timeout(150)
 @pytest.mark.parametrize("kind", ["ours", pytest.param("roscore", marks=pytest.mark.needs("roslaunch"))])
 async def test_a_restarted_master_is_told_everything_again(kind: str, engine: Engine, tmp_path: Path) -> None:
     async def cloud_answers(_: bytes) -> bytes:

@@ -139,7 +139,7 @@ async def test_a_new_version_comes_while_nodes_run(shop: Machine) -> None:
         new = offer(shop, "nav", "1.10", nodes__run=SAY.format(text="new"))
         await shop.put(BOX, nodes=(node("nav"),), bundles=(old,))
         await shop.log_holds(BOX, "node", "old")
-        before = (await shop.node_is(BOX, "node", NodeState.STARTING)).pid
+        before = await until(lambda: shop.node(BOX, "node").pid, what="its process is told")
         nodes = (node("nav"), node("nav", tag="newer"), node("nav@1.0", tag="fixed"))
         await shop.put(BOX, 2, nodes=nodes, bundles=(old, new))
         await shop.log_holds(BOX, "newer", "new")

@@ -4,14 +4,26 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 from support.leaks import CGROUPS, Traces, sweep_cgroups
 
+from rce_container.environment import proc
+
 MARK = "0123456789ab"
 TOKEN = "feedbeef"
+PATIENCE_S = 60.0
 SLEEP = "import time; time.sleep(600)"
+
+
+def vanish(traces: Traces) -> None:
+    """Wait until nothing is left: what was killed needs a moment for its end, and its parent to notice."""
+    deadline = time.monotonic() + PATIENCE_S
+    while left := traces.left():
+        assert time.monotonic() < deadline, left
+        time.sleep(0.01)
 
 
 def test_processes_are_found_by_name_and_by_descent_and_remembered(folder: Path) -> None:
@@ -22,8 +34,10 @@ def test_processes_are_found_by_name_and_by_descent_and_remembered(folder: Path)
         subprocess.Popen([sys.executable, "-c", SLEEP, "box_of_leaks"]) as other,
     ):
         try:
+            deadline = time.monotonic() + PATIENCE_S
             while len(found := traces.look()) < 3:
-                pass
+                assert time.monotonic() < deadline, found
+                time.sleep(0.01)
             assert {parent.pid, other.pid} < {one.pid for one in found}
             parent.kill()
             parent.wait()
@@ -32,8 +46,8 @@ def test_processes_are_found_by_name_and_by_descent_and_remembered(folder: Path)
             assert [line.split()[:2] for line in left] == [["process", str(orphan)]]
         finally:
             for one in traces.processes():
-                subprocess.run(["kill", "-9", str(one.pid)], check=True)
-    assert traces.left() == []
+                proc.kill(one)
+    vanish(traces)
 
 
 def test_files_and_sockets_are_found(folder: Path) -> None:

@@ -16,7 +16,7 @@ HOME_BYTES = 4 << 20
 NO_CAPABILITIES = "0" * 16
 REFUSED = (errno.EPERM, errno.ENOSYS, errno.EACCES)
 
-pytestmark = [pytest.mark.needs("bwrap"), pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.needs("bwrap")]
 
 
 @pytest.fixture(

@@ -8,7 +8,7 @@ import pytest
 from support.hostile_world import MODULE
 from support.persons import Person
 
-pytestmark = [pytest.mark.needs("bwrap"), pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.needs("bwrap")]
 
 EPERM, EACCES, ENOSYS, EROFS = "EPERM", "EACCES", "ENOSYS", "EROFS"
 NO_RIGHT, INVISIBLE, ABSENT, CLOSED = {EPERM}, {ENOSYS}, {"ENOENT"}, {EACCES, EPERM}

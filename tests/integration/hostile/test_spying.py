@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from support.persons import Person
 
-pytestmark = [pytest.mark.needs("bwrap"), pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.needs("bwrap")]
 
 SECRETS = {"secret", "other token", "neighbour", "treasure"}
 NOTHING = {"nothing", "ENOENT", "EACCES"}

@@ -8,7 +8,7 @@ import pytest
 from support.hostile_world import MEMORY_MB, MODULE, OUTSIDE, PROCESSES
 from support.persons import Person
 
-pytestmark = [pytest.mark.needs("bwrap"), pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.needs("bwrap")]
 
 KILLED, NO_SPACE, NO_MORE = {"killed"}, {"ENOSPC"}, {"EAGAIN"}
 OWN_PROCESSES = 4

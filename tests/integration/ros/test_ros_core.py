@@ -8,6 +8,7 @@ import signal
 import socket
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -232,23 +233,27 @@ async def test_a_large_graph(core: Core) -> None:
     nodes, parameters = 200, 5000
     async with RpcClient() as rpc:
 
+        async def call(method: str, *arguments: Any) -> None:
+            await rpc.call(core.uri, method, arguments, timeout=120)
+
         async def join(number: int) -> None:
             caller, uri = f"/n{number}", f"http://127.0.0.1:1/{number}"
-            await rpc.call(core.uri, "registerSubscriber", (caller, "/all", STRING, uri))
-            await rpc.call(core.uri, "registerPublisher", (caller, "/all", STRING, uri))
-            await rpc.call(core.uri, "subscribeParam", (caller, uri, f"/tree/b{number}"))
-            await rpc.call(core.uri, "setParam", (caller, f"/tree/b{number}", {"x": number, "y": [number]}))
+            tree = f"/tree/b{number}"
+            await call("registerSubscriber", caller, "/all", STRING, uri)
+            await call("registerPublisher", caller, "/all", STRING, uri)
+            await call("subscribeParam", caller, uri, tree)
+            await call("setParam", caller, tree, {"x": number, "y": [number]})
 
         async with asyncio.TaskGroup() as group:
             for number in range(nodes):
                 group.create_task(join(number))
         assert len(core.graph.nodes) == len(core.graph.publishers("/all")) == nodes
         many = {f"p{number}": {"value": number} for number in range(parameters)}
-        await rpc.call(core.uri, "setParam", ("/x", "/many", many), timeout=30)
-        status, _, known = await rpc.call(core.uri, "getParamNames", ("/x",), timeout=30)
+        await rpc.call(core.uri, "setParam", ("/x", "/many", many), timeout=120)
+        status, _, known = await rpc.call(core.uri, "getParamNames", ("/x",), timeout=120)
         assert status == 1
         assert len(known) == 2 * nodes + parameters + 4  # and the core's own
-        assert (await rpc.call(core.uri, "getParam", ("/x", "/many"), timeout=30))[2] == many
+        assert (await rpc.call(core.uri, "getParam", ("/x", "/many"), timeout=120))[2] == many
         for number in range(nodes):
             assert core.forget_uri(f"http://127.0.0.1:1/{number}")
         assert core.graph.nodes == core.graph.topic_types == {}

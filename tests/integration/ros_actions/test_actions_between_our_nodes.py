@@ -314,7 +314,7 @@ async def test_what_servers_publish_and_remember(core: Core, make_node: MakeNode
             seen |= {(status.goal_id.id, status.status) for status in message.status_list}
             if seen and not message.status_list:
                 break
-        assert seen == {(goal.id, 1), (goal.id, 3)}
+        assert seen - {(goal.id, 0)} == {(goal.id, 1), (goal.id, 3)}, "pending, if it was seen so early"
 
 
 async def test_goals_without_name_and_time_get_both(make_node: MakeNode) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import subprocess
@@ -21,6 +22,7 @@ from rce.ros.types import Time
 pytestmark = [pytest.mark.needs("actionlib"), pytest.mark.timeout(300)]
 
 TEST = "actionlib/TestAction"
+SILENCE_S = 3.0
 
 SERVERS = """
 import threading
@@ -188,16 +190,20 @@ def node(core: Core) -> Node:
 
 async def until_results_come(client: ActionClient) -> None:
     """Send goals that end at once: rospy greets a subscriber before it sends it anything."""
-    while await (await client.send(goal=-1)).wait() is GoalState.LOST:
-        pass
+    while True:
+        goal = await client.send(goal=-1)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(SILENCE_S):
+                if await goal.wait() is not GoalState.LOST:
+                    return
 
 
 async def test_our_client_at_a_simple_server(node: Node, peer: Peer) -> None:
     async with (
         peer("servers"),
         node,
-        ActionClient(node, "simple", TEST, patience=4) as client,
-        asyncio.timeout(50),
+        ActionClient(node, "simple", TEST, patience=30) as client,
+        asyncio.timeout(200),
     ):
         await until_results_come(client)
         goal = await client.send(goal=3)
@@ -225,8 +231,8 @@ async def test_our_client_at_a_full_server(node: Node, peer: Peer) -> None:
     async with (
         peer("servers") as process,
         node,
-        ActionClient(node, "full", TEST, patience=4) as client,
-        asyncio.timeout(50),
+        ActionClient(node, "full", TEST, patience=30) as client,
+        asyncio.timeout(200),
     ):
         await until_results_come(client)
         goals = [await client.send(goal=number) for number in (1, 2, 3, 4)]
@@ -309,7 +315,7 @@ async def test_real_clients_at_our_servers(node: Node, peer: Peer) -> None:
         node,
         SimpleActionServer(node, "simple", TEST, patient),
         ActionServer(node, "full", TEST, choose, auto_accept=False),
-        asyncio.timeout(50),
+        asyncio.timeout(200),
     ):
         await node.advertise_service("go", "roscpp/Empty", lambda _: go.release())
         async with peer("client") as process:

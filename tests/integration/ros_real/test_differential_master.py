@@ -25,7 +25,7 @@ from support.ros_real import ros_environment
 
 from rce.ros.core import Graph
 
-pytestmark = [pytest.mark.needs("rospy", "roslaunch"), pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.needs("rospy", "roslaunch")]
 
 PATIENCE_S = 20.0
 

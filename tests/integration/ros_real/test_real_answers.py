@@ -15,7 +15,7 @@ from rce.ros.errors import RemoteFault
 from rce.ros.node import Node
 from rce.ros.xmlrpc import RpcClient
 
-pytestmark = [pytest.mark.needs("rospy", "roslaunch"), pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.needs("rospy", "roslaunch")]
 
 STRING = "std_msgs/String"
 SLAVE = "http://127.0.0.1:1/"

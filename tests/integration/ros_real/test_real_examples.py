@@ -15,7 +15,7 @@ from support.ros_real import Graph, end
 
 from rce.ros.types import TypeRegistry
 
-pytestmark = [pytest.mark.needs("rospy", "rostopic"), pytest.mark.timeout(200)]
+pytestmark = [pytest.mark.needs("rospy", "rostopic")]
 
 EXAMPLES = Path(__file__).parents[3] / "examples" / "ros"
 STRING = "std_msgs/String"

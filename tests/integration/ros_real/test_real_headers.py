@@ -16,7 +16,7 @@ from rce.ros.tcpros.header import decode_header, encode_header
 from rce.ros.types import TypeRegistry
 from rce.ros.xmlrpc import RpcClient
 
-pytestmark = [pytest.mark.needs("rospy"), pytest.mark.timeout(150)]
+pytestmark = [pytest.mark.needs("rospy")]
 
 TYPES = TypeRegistry()
 STRING, SET_BOOL = TYPES.message("std_msgs/String"), TYPES.service("std_srvs/SetBool")

@@ -13,7 +13,7 @@ from support.ros_real import Graph
 
 from rce.ros.node import Node
 
-pytestmark = [pytest.mark.needs("rospy", "roslaunch"), pytest.mark.timeout(150)]
+pytestmark = [pytest.mark.needs("rospy", "roslaunch")]
 
 OURS = str(Path(sys.executable).parent / "rce")
 ROSPY = """

@@ -14,7 +14,7 @@ from support.ros_real import Graph
 
 from rce.ros.node import Node
 
-pytestmark = [pytest.mark.needs("rospy", "rostopic", "roslaunch"), pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.needs("rospy", "rostopic", "roslaunch")]
 
 STRING = "std_msgs/String"
 

@@ -17,7 +17,7 @@ from support.ros_real import Graph
 from rce.ros.errors import ServiceFault
 from rce.ros.node import Node
 
-pytestmark = [pytest.mark.needs("rospy", "rostopic"), pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.needs("rospy", "rostopic")]
 
 MakeNode = Callable[..., Node]
 STRING = "std_msgs/String"

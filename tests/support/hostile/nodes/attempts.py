@@ -15,6 +15,7 @@ Attack = Callable[[], object]
 DONE = "done"
 HANGS = "hangs"
 _PATIENCE_S = 5.0
+_MAX_SILENCES = 12
 _MAX_RESULT = 1 << 16
 
 libc = ctypes.CDLL(None, use_errno=True)
@@ -48,6 +49,11 @@ def attempt_all(attacks: Mapping[str, Attack]) -> dict[str, str]:
 def attempt(attack: Attack, patience: float = _PATIENCE_S) -> str:
     """Try an attack in a child.
 
+    Args:
+        attack: What to try.
+        patience: Seconds of silence after which it hangs, if it did not even use the processor meanwhile: a
+            machine may be busy.
+
     Returns:
         What it returned, or :data:`DONE`; the name of the error or of the signal that ended it.
     """
@@ -58,18 +64,32 @@ def attempt(attack: Attack, patience: float = _PATIENCE_S) -> str:
         os.write(theirs, _try(attack).encode()[:_MAX_RESULT])
         os._exit(0)
     os.close(theirs)
-    said = b""
-    while select.select((ours,), (), (), patience)[0]:
-        piece = os.read(ours, _MAX_RESULT)
-        if not piece:
+    said, worked, silences = b"", 0, 0
+    while True:
+        if select.select((ours,), (), (), patience)[0]:
+            piece = os.read(ours, _MAX_RESULT)
+            if not piece:
+                break
+            said += piece
+            continue
+        before, worked = worked, _ticks(child)
+        silences += 1
+        if worked == before or silences > _MAX_SILENCES:
+            said = HANGS.encode()
+            os.kill(child, signal.SIGKILL)
             break
-        said += piece
-    else:
-        said = HANGS.encode()
-        os.kill(child, signal.SIGKILL)
     os.close(ours)
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     return said.decode() or (signal.Signals(-code).name if code < 0 else f"exit {code}")
+
+
+def _ticks(pid: int) -> int:
+    """What a child has used of the processor; 0 if that cannot be seen."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0
+    return int(fields[11]) + int(fields[12])
 
 
 def _try(attack: Attack) -> str:
