@@ -114,7 +114,7 @@ _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
             _runs("/usr/bin/python3", "-c", "import roslaunch, rosmaster, rostest, roswtf")
             and _has_metadata("rosout")
         ),
-        "roslaunch or what it starts is missing (Debian: python3-roslaunch rosout python3-rostest python3-roswtf)",
+        "roslaunch or what it starts is missing (Debian: python3-roslaunch python3-roswtf rosout ...)",
     ),
     "ros_msgs": (
         lambda: _runs("/usr/bin/python3", "-c", "import map_msgs, move_base_msgs, pcl_msgs, stereo_msgs"),
