@@ -14,6 +14,7 @@ import os
 import socket
 from typing import TYPE_CHECKING, cast
 
+from rce.guard.complaints import Complaints
 from rce.guard.lobby import address_of
 from rce.tls.exceptions import CertificateError
 from rce.tls.faults import explain_to_server
@@ -30,9 +31,6 @@ _SHUTDOWN_S = 1.0
 """For the other end's farewell."""
 _HANDSHAKE_RECORD = 0x16
 """First byte of a TLS client."""
-_COMPLAIN_EVERY_S = 10.0
-"""The log is told of an address at most so often."""
-_MAX_COMPLAINTS = 1024
 _TEXT = b"This port speaks TLS only: use https:// or wss://\n"
 _PLAIN_ANSWER = (
     b"HTTP/1.1 400 Bad Request\r\nContent-Type: text/plain\r\nConnection: close\r\n"
@@ -54,7 +52,7 @@ class TlsGate:
         self._context = context
         self._lobby = lobby
         self._tasks: set[asyncio.Task[None]] = set()
-        self._complaints: dict[str, float] = {}
+        self._complaints = Complaints()
         self._closed = False
 
     def guard(self, protocol: asyncio.Protocol) -> asyncio.Protocol:
@@ -124,13 +122,8 @@ class TlsGate:
             raise
 
     def _complain(self, address: str, why: str) -> None:
-        now = asyncio.get_running_loop().time()
-        if now - self._complaints.get(address, -_COMPLAIN_EVERY_S) < _COMPLAIN_EVERY_S:
-            return
-        if len(self._complaints) >= _MAX_COMPLAINTS:
-            self._complaints.clear()
-        self._complaints[address] = now
-        _log.warning("%s: a client at %s was not taken: %s", self._name, address or "this machine", why)
+        if self._complaints.is_due(address, asyncio.get_running_loop().time()):
+            _log.warning("%s: a client at %s was not taken: %s", self._name, address or "this machine", why)
 
 
 class _Arrival(asyncio.Protocol):

@@ -21,7 +21,7 @@ from rce.ros.multimaster.registrar import Registrar
 from rce.ros.multimaster.relay.exporter import Exporter
 from rce.ros.multimaster.relay.frames import Frame
 from rce.ros.multimaster.relay.importer import Importer
-from rce.ros.multimaster.relay.link import LinkIdentity, RelayLinks
+from rce.ros.multimaster.relay.link import LinkIdentity, RelayLinks, check_listening
 from rce.ros.multimaster.relay.namespace import NamespaceRemote, add_namespace
 from rce.ros.multimaster.remote import DirectRemote, Remote
 from rce.ros.multimaster.settings import local_master
@@ -67,6 +67,15 @@ class SyncSettings:
     """What both sides of a relay link must know."""
     relay_name: str = ""
     """This side's name on relay links; if empty, the local master's."""
+
+    def __post_init__(self) -> None:
+        """Refuse relay links from everybody.
+
+        Raises:
+            MultimasterError: Other machines could connect, and there is no token that they must have.
+        """
+        if self.relay_listen is not None:
+            check_listening(self.relay_addr, self.relay_token)
 
     def namespace_of(self, master: str) -> str:
         """Return the namespace for a master; empty: its names stay."""

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import struct
+import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
@@ -13,6 +16,7 @@ from support.multimaster import STRING, Neighbourhood, node
 from rce.ros.core import Core
 from rce.ros.errors import ServiceFault
 from rce.ros.multimaster.filters import SyncLists
+from rce.ros.multimaster.relay.link import STRANGERS_PER_ADDRESS
 from rce.ros.multimaster.relay.throttle import MessageThrottle
 from rce.ros.multimaster.relay.topic import TopicRelay
 from rce.ros.multimaster.sync import MasterSync, SyncSettings
@@ -247,3 +251,89 @@ async def test_another_token_is_refused(caplog: pytest.LogCaptureFixture) -> Non
                 await asyncio.sleep(0.02)
         assert one._links.connected == other._links.connected == set()
         assert "/said" not in cloud.graph.topic_types
+
+
+async def read_all(reader: asyncio.StreamReader) -> bytes:
+    """Read until the connection ends, however it does."""
+    try:
+        async with asyncio.timeout(20):
+            return await reader.read()
+    except ConnectionError:
+        return b""
+
+
+def greeting(kind: str, said: dict[str, Any]) -> bytes:
+    body = json.dumps(said).encode()
+    return struct.pack("<IB", 1 + len(body), ord(kind)) + body
+
+
+@pytest.mark.parametrize("says", ["nothing", "hello", "hello and a wrong proof", "the old hello"])
+async def test_stranger_learns_nothing_but_a_nonce(says: str, caplog: pytest.LogCaptureFixture) -> None:
+    """Neither token, nor name, nor topics; before a hello not a byte. It is hung up on within seconds."""
+    async with linked() as (_, _, one, _):
+        reader, writer = await asyncio.open_connection("127.0.0.1", one.relay_port)
+        if says == "the old hello":
+            writer.write(greeting("H", {"protocol": 1, "name": "stranger", "token": ""}))
+        elif says != "nothing":
+            writer.write(greeting("H", {"protocol": 2, "name": "stranger", "nonce": "ab" * 32, "proof": ""}))
+        if "proof" in says:
+            writer.write(greeting("R", {"proof": "00" * 32}))
+        answer = await read_all(reader)
+        writer.close()
+        if says in ("nothing", "the old hello"):
+            assert answer == b""
+        else:
+            length, kind = struct.unpack_from("<IB", answer)
+            assert (kind, len(answer)) == (ord("N"), 4 + length), "a challenge and nothing else"
+            assert list(json.loads(answer[5:])) == ["nonce"]
+        assert "stranger" not in one._links.connected
+    assert caplog.text.count("relay link from 127.0.0.1") == 1
+
+
+async def test_stranger_cannot_send_much(caplog: pytest.LogCaptureFixture) -> None:
+    """A large frame is refused by its header."""
+    async with linked() as (_, _, one, _):
+        reader, writer = await asyncio.open_connection("127.0.0.1", one.relay_port)
+        writer.write(struct.pack("<IB", 60_000_000, ord("D")))
+        assert await read_all(reader) == b""
+        writer.close()
+    assert "a frame of 60000000 bytes" in caplog.text
+
+
+async def test_stranger_cannot_say_much(caplog: pytest.LogCaptureFixture) -> None:
+    """Many small frames end the connection; none of them is kept."""
+    async with linked() as (_, _, one, _):
+        reader, writer = await asyncio.open_connection("127.0.0.1", one.relay_port)
+        writer.write(greeting("N", {"nonce": ""}) * 50)
+        assert await read_all(reader) == b""
+        writer.close()
+    assert caplog.text.count("relay link from 127.0.0.1") == 1
+
+
+async def test_strangers_are_bounded_in_number() -> None:
+    async with linked() as (_, _, one, other):
+        async with asyncio.timeout(20):
+            while "cloud" not in other._links.connected:
+                await asyncio.sleep(0.02)
+        connections = [await asyncio.open_connection("127.0.0.1", one.relay_port) for _ in range(60)]
+        async with asyncio.timeout(20):
+            while one._links._lobby.turned_away < 60 - STRANGERS_PER_ADDRESS:
+                await asyncio.sleep(0.02)
+        assert len(one._links._lobby) <= STRANGERS_PER_ADDRESS
+        assert one._links.connected == {"robot"}, "who is known goes on"
+        for _, writer in connections:
+            writer.close()
+
+
+@pytest.mark.parametrize("where", [[], ["--relay-addr", "0.0.0.0"]])
+async def test_program_does_not_listen_for_everybody(where: list[str]) -> None:
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-c", "from rce.cli.main import main; main()"),
+        *("sync", "--relay-listen", "0", *where),
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
+    )
+    output, _ = await process.communicate()
+    assert process.returncode == 1
+    assert b"need a token: give --relay-token" in output
+    assert b"Traceback" not in output

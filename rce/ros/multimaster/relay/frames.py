@@ -3,7 +3,9 @@
 A frame on the wire is its length (uint32, little-endian, of all that follows), one byte for its kind, and its
 body: JSON for what is rare, a fixed head and the untouched message for what is many::
 
-    H  hello     {"protocol": 1, "name": ..., "token": ...}
+    H  hello     {"protocol": 2, "name": ..., "nonce": ..., "proof": ...}: see :mod:`.handshake`
+    N  challenge {"nonce": ...}
+    R  proof     {"proof": ...}
     O  offer     {"topics": [[id, name, type, md5sum, definition], ...],
                   "services": [[id, name, type, md5sum, request type, response type], ...]}: all there is now
     W  want      [topic id, ...]: all topics whose messages shall come now
@@ -25,13 +27,16 @@ from rce.ros.multimaster.errors import LinkBroken
 from rce.ros.multimaster.relay.kinds import ServiceKind, TopicKind
 from rce.ros.tcpros.framing import MAX_FRAME
 
-PROTOCOL = 1
+PROTOCOL = 2
 
 _HEAD = struct.Struct("<IB")
 _DATA = struct.Struct("<IB")
 _CALL = struct.Struct("<II")
 _ANSWER = struct.Struct("<IB")
-_MOST = MAX_FRAME + 64
+MAX_FRAME_SIZE = MAX_FRAME + 64
+"""Bytes of the longest frame."""
+MAX_GREETING = 4096
+"""Bytes of a frame of the handshake."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,12 +45,40 @@ class Hello:
 
     CODE: ClassVar[bytes] = b"H"
     name: str
-    token: str = field(default="", repr=False)
+    nonce: str = ""
+    """Of the side that dials; empty in the answer."""
+    proof: str = ""
+    """Of the side that listens; empty in the first hello."""
     protocol: int = PROTOCOL
 
     def body(self) -> tuple[bytes, ...]:
         """Write the body."""
-        return (_json({"protocol": self.protocol, "name": self.name, "token": self.token}),)
+        said = {"protocol": self.protocol, "name": self.name, "nonce": self.nonce, "proof": self.proof}
+        return (_json(said),)
+
+
+@dataclass(frozen=True, slots=True)
+class Challenge:
+    """What the side that dials must prove itself with."""
+
+    CODE: ClassVar[bytes] = b"N"
+    nonce: str
+
+    def body(self) -> tuple[bytes, ...]:
+        """Write the body."""
+        return (_json({"nonce": self.nonce}),)
+
+
+@dataclass(frozen=True, slots=True)
+class Proof:
+    """The answer to a challenge."""
+
+    CODE: ClassVar[bytes] = b"R"
+    proof: str
+
+    def body(self) -> tuple[bytes, ...]:
+        """Write the body."""
+        return (_json({"proof": self.proof}),)
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +166,9 @@ class Ping:
         return ()
 
 
-Frame = Hello | Offer | Want | Data | Call | Answer | Ping
+Greeting = Hello | Challenge | Proof
+"""A frame of the handshake."""
+Frame = Greeting | Offer | Want | Data | Call | Answer | Ping
 
 
 def encode(frame: Frame) -> tuple[bytes, ...]:
@@ -143,9 +178,14 @@ def encode(frame: Frame) -> tuple[bytes, ...]:
 
 
 class Decoder:
-    """Cuts a byte stream into frames."""
+    """Cuts a byte stream into frames.
 
-    def __init__(self) -> None:
+    Attributes:
+        most: Bytes of the longest frame that is taken. Set to :data:`MAX_GREETING` until the peer is known.
+    """
+
+    def __init__(self, most: int = MAX_FRAME_SIZE) -> None:
+        self.most = most
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> Iterator[Frame]:
@@ -158,7 +198,7 @@ class Decoder:
         position = 0
         while len(self._buffer) - position >= _HEAD.size:
             length, code = _HEAD.unpack_from(self._buffer, position)
-            if not 1 <= length <= _MOST:
+            if not 1 <= length <= self.most:
                 raise LinkBroken(f"a frame of {length} bytes")
             end = position + _HEAD.size + length - 1
             if end > len(self._buffer):
@@ -192,7 +232,12 @@ def _decode(code: bytes, body: bytes) -> Frame:
 def _decode_json(code: bytes, values: Any) -> Frame:
     match code:
         case Hello.CODE:
-            return Hello(str(values["name"]), str(values["token"]), int(values["protocol"]))
+            nonce, proof = str(values.get("nonce", "")), str(values.get("proof", ""))
+            return Hello(str(values["name"]), nonce, proof, int(values["protocol"]))
+        case Challenge.CODE:
+            return Challenge(str(values["nonce"]))
+        case Proof.CODE:
+            return Proof(str(values["proof"]))
         case Want.CODE:
             return Want(frozenset(map(int, values)))
         case Offer.CODE:

@@ -3,40 +3,35 @@
 from __future__ import annotations
 
 import asyncio
-import hmac
 import logging
 import random
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from typing import cast
 
 from rce.dialing import open_socket
-from rce.ros.multimaster.errors import LinkBroken
+from rce.guard.complaints import Complaints
+from rce.guard.lobby import Lobby
+from rce.ros.multimaster.errors import LinkBroken, MultimasterError
+from rce.ros.multimaster.relay.connection import RelayConnection
 from rce.ros.multimaster.relay.exporter import Exporter
-from rce.ros.multimaster.relay.frames import PROTOCOL, Data, Decoder, Frame, Hello, Ping, encode
+from rce.ros.multimaster.relay.frames import Frame
+from rce.ros.multimaster.relay.handshake import DialerHandshake, ListenerHandshake
 from rce.ros.multimaster.relay.importer import Importer
-from rce.ros.node.queue import DropOldest
+from rce.ros.node.settings import is_loopback
 from rce.ros.tasks import TaskScope
 
 _log = logging.getLogger(__name__)
 
 DEFAULT_PORT = 11911
-PING_PERIOD = 1.0
-SILENCE = 3.5
-"""Seconds without a frame after which the other side is taken for gone."""
-
 HELLO_TIMEOUT = 5.0
 CONNECT_TIMEOUT = 10.0
 RETRY_FIRST, RETRY_MOST = 0.2, 5.0
-WRITE_HIGH = 2**20
-"""Bytes waiting to be sent from which on messages wait, the newest :data:`QUEUE` of them."""
+MAX_NEW = STRANGERS = 64
+"""How many links may wait to be taken, or have not shown yet that they have the token."""
 
-QUEUE = 100
-MAX_NEW = 64
-"""How many links may wait to be taken."""
+STRANGERS_PER_ADDRESS = 16
+"""The same from one address."""
 
-MAX_BACKLOG = 16
-"""How many frames may come before this side has read the hello."""
 
 MakeEnds = Callable[[Callable[[Frame], None], TaskScope, str], tuple[Exporter, Importer]]
 """Makes both ends for a link, given what takes frames, what owns tasks, and the other side's name."""
@@ -51,6 +46,23 @@ class LinkIdentity:
     """Both sides must have the same."""
 
 
+def check_listening(host: str, token: str) -> None:
+    """Refuse to listen for everybody.
+
+    Args:
+        host: Address to listen on; empty for all.
+        token: What other sides must have.
+
+    Raises:
+        MultimasterError: Other machines could connect, and there is no token that they must have.
+    """
+    if not token and not is_loopback(host):
+        raise MultimasterError(
+            f"relay connections on {host or 'all addresses'} need a token: give --relay-token"
+            " (or RCE_RELAY_TOKEN) at both ends, or listen on this machine only with --relay-addr 127.0.0.1"
+        )
+
+
 class RelayLinks:
     """All links of one synchronization: those it makes and those it takes."""
 
@@ -59,8 +71,12 @@ class RelayLinks:
         """Names of the sides that are linked now."""
         self._identity = identity
         self._make_ends = make_ends
-        self._running: set[_Link] = set()
-        self._guests: asyncio.Queue[_Link] = asyncio.Queue(MAX_NEW)
+        self._running: set[RelayConnection] = set()
+        self._guests: asyncio.Queue[RelayConnection] = asyncio.Queue(MAX_NEW)
+        self._lobby = Lobby("relay links", per_address=STRANGERS_PER_ADDRESS, in_all=STRANGERS)
+        self._complaints = Complaints()
+        self._dialing: set[str] = set()
+        """Nonces of the attempts to dial that go on."""
 
     async def dial(self, host: str, port: int) -> None:
         """Keep a link to another side, until cancelled."""
@@ -70,8 +86,9 @@ class RelayLinks:
             begin = loop.time()
             try:
                 async with asyncio.timeout(CONNECT_TIMEOUT):
-                    _, link = await loop.create_connection(_Link, sock=await open_socket(host, port))
-                await self._serve(link)
+                    sock = await open_socket(host, port)
+                    _, link = await loop.create_connection(RelayConnection, sock=sock)
+                await self._serve(link, self._greet_as_dialer)
             except (OSError, LinkBroken) as error:
                 _log.warning("relay to %s:%d: %s", host, port, str(error) or type(error).__name__)
             if loop.time() - begin > RETRY_MOST:  # it did work for a while
@@ -83,8 +100,10 @@ class RelayLinks:
         """Begin to listen for links; :meth:`serve` takes them.
 
         Raises:
+            MultimasterError: Other machines could connect, and there is no token that they must have.
             OSError: The port cannot be had.
         """
+        check_listening(host or "", self._identity.token)
         return await asyncio.get_running_loop().create_server(self._accept, host or "0.0.0.0", port)  # noqa: S104
 
     async def serve(self, server: asyncio.Server) -> None:
@@ -97,46 +116,64 @@ class RelayLinks:
         finally:
             server.close()
 
-    def _accept(self) -> _Link:
-        link = _Link()
+    def _accept(self) -> RelayConnection:
+        link = RelayConnection(self._lobby)
         try:
             self._guests.put_nowait(link)
         except asyncio.QueueFull:
             link.refused = True
         return link
 
-    async def _serve_guest(self, link: _Link) -> None:
+    async def _serve_guest(self, link: RelayConnection) -> None:
         try:
-            await self._serve(link)
+            await self._serve(link, self._greet_as_listener)
         except LinkBroken as error:
-            _log.warning("relay link: %s", error)
+            if self._complaints.is_due(link.address, asyncio.get_running_loop().time()):
+                _log.warning("relay link from %s: %s", link.address, error)
 
-    async def _serve(self, link: _Link) -> None:
+    async def _serve(self, link: RelayConnection, greet: Callable[[RelayConnection], Awaitable[str]]) -> None:
         """Run a link until it ends.
 
         Raises:
             LinkBroken: The other side breaks the protocol, has another token or fell silent.
         """
         try:
-            link.send(Hello(self._identity.name, self._identity.token))
             try:
                 async with asyncio.timeout(HELLO_TIMEOUT):
-                    hello = await link.hello
+                    name = await greet(link)
             except TimeoutError as error:
                 raise LinkBroken("the other side does not say who it is") from error
-            self._check(hello)
-            await self._run(link, hello.name)
+            link.become_known()
+            await self._run(link, name)
         finally:
             link.abort()
             await link.gone.wait()
 
-    def _check(self, hello: Hello) -> None:
-        if hello.protocol != PROTOCOL:
-            raise LinkBroken(f"{hello.name} speaks protocol {hello.protocol}, not {PROTOCOL}")
-        if not hmac.compare_digest(hello.token.encode(), self._identity.token.encode()):
-            raise LinkBroken(f"{hello.name} has another token")
+    async def _greet_as_dialer(self, link: RelayConnection) -> str:
+        """Shake hands; return the other side's name."""
+        handshake = DialerHandshake(self._identity.name, self._identity.token)
+        self._dialing.add(handshake.nonce)
+        try:
+            link.send(handshake.begin())
+            link.send(handshake.prove(await link.greeting()))
+            try:
+                last = await link.greeting()
+            except LinkBroken as error:
+                raise LinkBroken(f"{error}; it may have another token") from error
+            return handshake.finish(last)
+        finally:
+            self._dialing.discard(handshake.nonce)
 
-    async def _run(self, link: _Link, name: str) -> None:
+    async def _greet_as_listener(self, link: RelayConnection) -> str:
+        """Shake hands; return the other side's name."""
+        identity = self._identity
+        handshake = ListenerHandshake(identity.name, identity.token, frozenset(self._dialing))
+        link.send(handshake.challenge(await link.greeting()))
+        name, hello = handshake.finish(await link.greeting())
+        link.send(hello)
+        return name
+
+    async def _run(self, link: RelayConnection, name: str) -> None:
         _log.info("relay link with %s", name)
         self.connected.add(name)
         self._running.add(link)
@@ -154,116 +191,3 @@ class RelayLinks:
         finally:
             self.connected.discard(name)
             self._running.discard(link)
-
-
-class _Link(asyncio.Protocol):
-    """One connection."""
-
-    def __init__(self) -> None:
-        loop = asyncio.get_running_loop()
-        self.hello: asyncio.Future[Hello] = loop.create_future()
-        self.ended: asyncio.Future[None] = loop.create_future()
-        self.gone = asyncio.Event()
-        self._ends: tuple[Callable[[Frame], None], ...] = ()
-        self.refused = False
-        self._stopped = False
-        self._transport: asyncio.Transport | None = None
-        self._early: list[Frame] = []
-        self._backlog: list[Frame] = []
-        self._decoder = Decoder()
-        self._waiting: DropOldest[Data] = DropOldest(QUEUE)
-        self._full = False
-        self._heard = loop.time()
-
-    # ------------------------------------------------------------------ for the owner
-
-    def send(self, frame: Frame) -> None:
-        """Send a frame; a message waits, and may be dropped for newer ones, while the connection is full."""
-        if isinstance(frame, Data) and self._full:
-            self._waiting.put(frame, len(frame.payload))
-        elif self._transport is not None and not self._transport.is_closing():
-            for piece in encode(frame):
-                self._transport.write(piece)
-        elif self._transport is None and not self.gone.is_set():
-            self._early.append(frame)
-
-    def start(self, *ends: Callable[[Frame], None]) -> None:
-        """Give the frames to ``ends`` from now on, those that came since the hello first."""
-        self._ends = ends
-        backlog, self._backlog = self._backlog, []
-        for frame in backlog:
-            self._take(frame)
-
-    def stop(self) -> None:
-        """Ignore what comes from now on."""
-        self._stopped = True
-
-    async def ping(self) -> None:
-        """Say now and then that this side is there; end the link when the other does not."""
-        loop = asyncio.get_running_loop()
-        while True:
-            self.send(Ping())
-            await asyncio.sleep(PING_PERIOD)
-            if loop.time() - self._heard > SILENCE:
-                self._fail(LinkBroken("the other side fell silent"))
-
-    def abort(self) -> None:
-        """Close now."""
-        if self._transport is not None:
-            self._transport.abort()
-        for future in (self.hello, self.ended):
-            future.cancel()
-
-    # ------------------------------------------------------------------ for the transport
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = cast("asyncio.Transport", transport)  # uvloop's only behave like one
-        self._transport.set_write_buffer_limits(high=WRITE_HIGH)
-        if self.refused:
-            self._transport.abort()
-        early, self._early = self._early, []
-        for frame in early:
-            self.send(frame)
-
-    def data_received(self, data: bytes) -> None:
-        self._heard = asyncio.get_running_loop().time()
-        try:
-            for frame in self._decoder.feed(data):
-                self._take(frame)
-        except LinkBroken as error:
-            self._fail(error)
-
-    def pause_writing(self) -> None:
-        self._full = True
-
-    def resume_writing(self) -> None:
-        self._full = False
-        while self._waiting and not self._full:
-            self.send(self._waiting.take())
-
-    def connection_lost(self, error: Exception | None) -> None:
-        self._transport = None
-        self.gone.set()
-        self._fail(LinkBroken(f"the connection is lost: {error or 'the other side closed it'}"))
-
-    def _take(self, frame: Frame) -> None:
-        if self._stopped:
-            return
-        if isinstance(frame, Hello):
-            if not self.hello.done():
-                self.hello.set_result(frame)
-            return
-        if not self._ends:
-            if not self.hello.done() or len(self._backlog) > MAX_BACKLOG:
-                raise LinkBroken("the other side does not begin with a hello")
-            self._backlog.append(frame)
-        for end in self._ends:
-            end(frame)
-
-    def _fail(self, error: LinkBroken) -> None:
-        for future in (self.hello, self.ended):
-            if not future.done():
-                future.set_exception(error)
-                future.exception()  # it is not an unseen one: who waits gets it
-        if self._transport is not None:
-            self._transport.abort()

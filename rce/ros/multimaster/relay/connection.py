@@ -1,0 +1,201 @@
+"""One connection of a relay: frames in, frames out, and little of both until the other side is known."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import cast
+
+from rce.guard.lobby import Guest, Lobby, address_of
+from rce.ros.multimaster.errors import LinkBroken
+from rce.ros.multimaster.relay.frames import (
+    MAX_FRAME_SIZE,
+    MAX_GREETING,
+    Challenge,
+    Data,
+    Decoder,
+    Frame,
+    Greeting,
+    Hello,
+    Ping,
+    Proof,
+    encode,
+)
+from rce.ros.node.queue import DropOldest
+
+PING_PERIOD = 1.0
+SILENCE = 3.5
+"""Seconds without a frame after which the other side is taken for gone."""
+
+WRITE_HIGH = 2**20
+"""Bytes waiting to be sent from which on messages wait, the newest :data:`QUEUE` of them."""
+
+QUEUE = 100
+MAX_BACKLOG = 16
+"""How many frames may come before this side has read the hello."""
+
+MAX_GREETINGS = 4
+"""How many frames of the handshake may wait."""
+
+
+class RelayConnection(asyncio.Protocol):
+    """One connection.
+
+    Args:
+        lobby: Where it is counted until it is known; none for one that this side makes.
+    """
+
+    def __init__(self, lobby: Lobby | None = None) -> None:
+        loop = asyncio.get_running_loop()
+        self.address = ""
+        self._lobby = lobby
+        self._guest: Guest | None = None
+        self._greetings: asyncio.Queue[Greeting | None] = asyncio.Queue()
+        """What came of the handshake; None at the end."""
+        self._is_known = False
+        self._answered = False
+        """Whether the side that was dialed has said its last word of the handshake."""
+        self.ended: asyncio.Future[None] = loop.create_future()
+        self.gone = asyncio.Event()
+        self._ends: tuple[Callable[[Frame], None], ...] = ()
+        self.refused = False
+        self._stopped = False
+        self._transport: asyncio.Transport | None = None
+        self._early: list[Frame] = []
+        self._backlog: list[Frame] = []
+        self._decoder = Decoder(MAX_GREETING)
+        self._waiting: DropOldest[Data] = DropOldest(QUEUE)
+        self._full = False
+        self._heard = loop.time()
+
+    # ------------------------------------------------------------------ for the owner
+
+    def send(self, frame: Frame) -> None:
+        """Send a frame; a message waits, and may be dropped for newer ones, while the connection is full."""
+        if isinstance(frame, Data) and self._full:
+            self._waiting.put(frame, len(frame.payload))
+        elif self._transport is not None and not self._transport.is_closing():
+            for piece in encode(frame):
+                self._transport.write(piece)
+        elif self._transport is None and not self.gone.is_set():
+            self._early.append(frame)
+
+    async def greeting(self) -> Greeting:
+        """Wait for the next frame of the handshake.
+
+        Raises:
+            LinkBroken: The connection ended, or something else came.
+        """
+        found = await self._greetings.get()
+        if found is None:
+            self._greetings.put_nowait(None)
+            await self.ended
+            raise LinkBroken("the connection is lost")
+        return found
+
+    def become_known(self) -> None:
+        """Take frames of any size from now on: the other side has the token."""
+        self._is_known = True
+        self._decoder.most = MAX_FRAME_SIZE
+        if self._guest is not None:
+            self._guest.leave()
+
+    def start(self, *ends: Callable[[Frame], None]) -> None:
+        """Give the frames to ``ends`` from now on, those that came since the hello first."""
+        self._ends = ends
+        backlog, self._backlog = self._backlog, []
+        for frame in backlog:
+            self._take(frame)
+
+    def stop(self) -> None:
+        """Ignore what comes from now on."""
+        self._stopped = True
+
+    async def ping(self) -> None:
+        """Say now and then that this side is there; end the link when the other does not."""
+        loop = asyncio.get_running_loop()
+        while True:
+            self.send(Ping())
+            await asyncio.sleep(PING_PERIOD)
+            if loop.time() - self._heard > SILENCE:
+                self._fail(LinkBroken("the other side fell silent"))
+
+    def abort(self) -> None:
+        """Close now."""
+        if self._transport is not None:
+            self._transport.abort()
+        self.ended.cancel()
+
+    # ------------------------------------------------------------------ for the transport
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Count it, and send what waits."""
+        self._transport = cast("asyncio.Transport", transport)  # uvloop's only behave like one
+        self._transport.set_write_buffer_limits(high=WRITE_HIGH)
+        self.address = address_of(transport.get_extra_info("peername"))
+        if self._lobby is not None:
+            self._guest = self._lobby.enter(self.address, self._transport.abort)
+        if self.refused or (self._lobby is not None and self._guest is None):
+            self._transport.abort()
+        early, self._early = self._early, []
+        for frame in early:
+            self.send(frame)
+
+    def data_received(self, data: bytes) -> None:
+        """Take frames."""
+        self._heard = asyncio.get_running_loop().time()
+        try:
+            for frame in self._decoder.feed(data):
+                self._take(frame)
+        except LinkBroken as error:
+            self._fail(error)
+
+    def pause_writing(self) -> None:
+        """Let messages wait."""
+        self._full = True
+
+    def resume_writing(self) -> None:
+        """Send the messages that wait."""
+        self._full = False
+        while self._waiting and not self._full:
+            self.send(self._waiting.take())
+
+    def connection_lost(self, error: Exception | None) -> None:
+        """End."""
+        self._transport = None
+        if self._guest is not None:
+            self._guest.leave()
+        self.gone.set()
+        self._fail(LinkBroken(f"the connection is lost: {error or 'the other side closed it'}"))
+
+    def _take(self, frame: Frame) -> None:
+        if self._stopped:
+            return
+        if isinstance(frame, Hello | Challenge | Proof):
+            self._take_greeting(frame)
+            return
+        if not self._ends:
+            if len(self._backlog) > MAX_BACKLOG or not (self._is_known or self._answered):
+                raise LinkBroken("the other side does not begin with a hello")
+            self._backlog.append(frame)
+        for end in self._ends:
+            end(frame)
+
+    def _take_greeting(self, frame: Greeting) -> None:
+        if self._is_known:
+            return
+        if self._greetings.qsize() >= MAX_GREETINGS:
+            raise LinkBroken("the other side says too much before the handshake is done")
+        if self._lobby is None and isinstance(frame, Hello):
+            # The listening side's last word of the handshake; what follows may come with it.
+            self._answered = True
+            self._decoder.most = MAX_FRAME_SIZE
+        self._greetings.put_nowait(frame)
+
+    def _fail(self, error: LinkBroken) -> None:
+        self._greetings.put_nowait(None)
+        if not self.ended.done():
+            self.ended.set_exception(error)
+            self.ended.exception()  # it is not an unseen one: who waits gets it
+        if self._transport is not None:
+            self._transport.abort()
