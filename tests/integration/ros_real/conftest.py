@@ -48,10 +48,23 @@ def rospy_peer() -> tuple[str, str]:
 @pytest.fixture(scope="session")
 def roscpp_peer(tmp_path_factory: pytest.TempPathFactory) -> tuple[str]:
     """How to start the roscpp node ``/roscpp_peer``; compiled once."""
-    program = tmp_path_factory.mktemp("roscpp") / "roscpp_peer"
+    return (compiled("roscpp_peer", tmp_path_factory),)
+
+
+@pytest.fixture(scope="session")
+def roscpp_library(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The program that uses what roscpp's client library has; compiled once."""
+    return compiled("roscpp_library", tmp_path_factory)
+
+
+def compiled(name: str, folders: pytest.TempPathFactory) -> str:
+    """Compile a program of this folder against roscpp."""
+    program = folders.mktemp("roscpp") / name
     flags = subprocess.run(
         ["pkg-config", "--cflags", "--libs", "roscpp"], capture_output=True, text=True, check=True
     ).stdout.split()
-    source = SOURCES / "roscpp_peer.cpp"
-    subprocess.run(["g++", "-O0", "-o", str(program), str(source), *flags], check=True, timeout=240)
-    return (str(program),)
+    source = SOURCES / f"{name}.cpp"
+    subprocess.run(
+        ["g++", "-O0", "-pthread", "-o", str(program), str(source), *flags], check=True, timeout=240
+    )
+    return str(program)
