@@ -13,6 +13,7 @@ from typing import Any
 import typer
 
 from rce import __version__
+from rce.extras import missing_for
 
 GROUP = "rce.commands"
 
@@ -36,13 +37,11 @@ def build_app(points: list[EntryPoint]) -> typer.Typer:
     app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
     app.callback()(_root)
     for point in points:
-        try:
-            plugged: Any = point.load()
-        except ModuleNotFoundError as error:
-            if error.name is None or error.name.startswith("rce"):
-                raise
-            _add_unavailable(app, point.name, error.name)
+        problem = missing_for(point.module)
+        if problem is not None:
+            _add_unavailable(app, point.name, problem)
             continue
+        plugged: Any = point.load()
         if isinstance(plugged, typer.Typer):
             app.add_typer(plugged, name=point.name)
         else:
@@ -50,13 +49,16 @@ def build_app(points: list[EntryPoint]) -> typer.Typer:
     return app
 
 
-def _add_unavailable(app: typer.Typer, name: str, module: str) -> None:
+def _add_unavailable(app: typer.Typer, name: str, problem: str) -> None:
     """Add a command that only says what it misses, so that the others work without an extra's packages."""
-    text = f"Not available: the package {module} is missing; install RCE with its extra 'fleet'."
 
-    @app.command(name, help=text, context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+    @app.command(
+        name,
+        help=f"Not available: {problem}.",
+        context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
+    )
     def unavailable() -> None:
-        typer.echo(f"rce {name}: {text[0].lower()}{text[1:]}", err=True)
+        typer.echo(f"rce {name}: {problem}", err=True)
         raise typer.Exit(1)
 
 

@@ -1,0 +1,48 @@
+"""What must be installed beside the base for each role, and how to say what is missing.
+
+The base is what a robot needs. ``pyproject.toml`` names the packages of each extra.
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+SERVER, FLEET, ALL = "server", "fleet", "all"
+
+_MODULES = {
+    SERVER: ("aiohttp", "aiosqlite", "argon2", "cryptography", "numpy", "PIL", "prometheus_client", "rich"),
+    FLEET: ("aiohttp", "numpy", "pymunk"),
+}
+_ROLES = {
+    "rce.cli.certificate": SERVER,
+    "rce.cli.up": SERVER,
+    "rce.cli.service": SERVER,
+    "rce_master": SERVER,
+    "rce_robot": SERVER,
+    "rce_container": SERVER,
+    "rce_client.station": FLEET,
+    "rce_client.simulation": FLEET,
+    "rce_client.demo": ALL,
+}
+
+
+def extra_of(module: str) -> str:
+    """Return the extra that a module of the project needs; empty for none.
+
+    Example::
+
+        extra_of("rce_master.cli.show")  # "server"
+    """
+    return next((extra for start, extra in _ROLES.items() if f"{module}.".startswith(f"{start}.")), "")
+
+
+def missing_for(module: str) -> str | None:
+    """Return what to do before a module of the project can be used; None if all is installed."""
+    extra = extra_of(module)
+    parts = (SERVER, FLEET) if extra == ALL else (extra,)
+    names = {name for part in parts for name in _MODULES.get(part, ())}
+    missing = sorted(name for name in names if find_spec(name) is None)
+    if not missing:
+        return None
+    be = "is" if len(missing) == 1 else "are"
+    return f"{', '.join(missing)} {be} not installed: pip install 'rce[{extra}]'"

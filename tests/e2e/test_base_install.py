@@ -1,0 +1,133 @@
+"""The wheel with its base only, in an environment of its own: what a robot gets."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from support.engine import Program, free_ports, running_engine
+
+ROOT = Path(__file__).parents[2]
+MOST_PACKAGES = 24
+"""Distributions that the base brings, its own included; pip and setuptools are not counted."""
+
+pytestmark = [pytest.mark.e2e, pytest.mark.timeout(400)]
+
+ASK = """
+import asyncio
+from rce.ros.node import Node, run
+async def main():
+    async with Node("asker", argv=[]) as node:
+        answered = asyncio.Event()
+        def heard(message):
+            print("answer:", message.data, flush=True)
+            answered.set()
+        await node.subscribe("/stringEchoResp", "std_msgs/String", heard)
+        publisher = await node.advertise("/stringEchoReq", "std_msgs/String")
+        while not answered.is_set():
+            publisher.publish(data="hello")
+            await asyncio.sleep(0.2)
+run(main())
+"""
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of programs of an environment in which only the base is installed."""
+    folder = tmp_path_factory.mktemp("base")
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
+    subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
+    (wheel,) = folder.glob("*.whl")
+    subprocess.run([sys.executable, "-m", "venv", str(folder / "venv")], check=True)
+    programs = folder / "venv" / "bin"
+    subprocess.run([str(programs / "python"), "-m", "pip", "install", "--quiet", str(wheel)], check=True)
+    return programs
+
+
+def environment(folder: Path, **more: str) -> dict[str, str]:
+    kept = {
+        key: value for key, value in os.environ.items() if not key.startswith(("RCE_", "ROS_", "VIRTUAL"))
+    }
+    return kept | {"HOME": str(folder), "XDG_RUNTIME_DIR": str(folder), "COLUMNS": "200", **more}
+
+
+def test_base_is_small(base: Path) -> None:
+    listing = subprocess.run(
+        [str(base / "python"), "-m", "pip", "list", "--format", "freeze"],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    names = {line.partition("==")[0].lower() for line in listing.split()} - {"pip", "setuptools"}
+    assert len(names) <= MOST_PACKAGES
+    assert not names & {"aiohttp", "numpy", "pillow", "cryptography", "argon2-cffi", "pymunk"}
+
+
+@pytest.mark.parametrize(
+    ("command", "extra"),
+    [
+        ("rce-master", "server"),
+        ("rce-robot 10.0.0.1", "server"),
+        ("rce-container 10.0.0.1", "server"),
+        ("rce up --dev", "server"),
+        ("rce ps", "server"),
+        ("rce certificate init", "server"),
+        ("rce ui fleet.config", "fleet"),
+        ("rce demo", "all"),
+    ],
+)
+def test_command_of_a_missing_role_names_its_extra(
+    base: Path, command: str, extra: str, tmp_path: Path
+) -> None:
+    program, *words = command.split()
+    done = subprocess.run(
+        [str(base / program), *words],
+        env=environment(tmp_path),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert f"pip install 'rce[{extra}]'" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("program", ["rce", "rce-ros"])
+def test_help_of_the_base_is_whole(base: Path, program: str, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [str(base / program), "--help"], env=environment(tmp_path), capture_output=True, text=True, check=True
+    )
+    assert "Usage" in done.stdout
+
+
+async def test_robot_with_the_base_uses_its_container(base: Path, tmp_path: Path) -> None:
+    """A message goes from the robot's ROS graph to a node in the cloud and back, without any extra."""
+    (core_port,) = free_ports(1)
+    async with running_engine() as engine:
+        text = (ROOT / "configs/test.config").read_text()
+        config = tmp_path / "robot.config"
+        config.write_text(re.sub(r"http://localhost:9000/", engine.url, text))
+        env = environment(tmp_path, ROS_MASTER_URI=f"http://127.0.0.1:{core_port}/")
+        core = Program("core", [str(base / "rce"), "core", "--port", str(core_port)], env, tmp_path)
+        bridge = Program("bridge", [str(base / "rce-ros"), str(config)], env, tmp_path)
+        await core.start(ready="ready:", timeout=90)
+        try:
+            await bridge.start(ready="rce-ros ready:", timeout=120)
+            (tmp_path / "ask.py").write_text(ASK)
+            asking = await asyncio.create_subprocess_exec(
+                *("timeout", "60", str(base / "python"), str(tmp_path / "ask.py")),
+                env=env,
+                stdout=asyncio.subprocess.PIPE,
+            )
+            output, _ = await asking.communicate()
+            assert output.decode().strip() == "answer: hello", bridge.output()
+            assert await bridge.stop() == 0
+        finally:
+            for program in (bridge, core):
+                if program.running:
+                    await program.stop()
