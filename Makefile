@@ -6,12 +6,13 @@ STAMP  := $(VENV)/.installed
 
 PARALLEL := -n auto --dist loadgroup --durations=25
 
-.PHONY: help install demo test test-all test-quick lint format reference bench lock clean
+.PHONY: help install demo test test-all test-quick fuzz lint format reference bench lock clean
 
 help:
 	@echo "make demo    engine, containers and a simulated fleet, with its web page"
 	@echo "make test    everything: linters, types, unit, integration and end-to-end tests"
 	@echo "make test-all  make test without linters and types        make test-quick  the unit tests"
+	@echo "make fuzz    send the servers what no client would; EXAMPLES=5000 of each kind"
 	@echo "make lint    ruff and mypy        make format   rewrite the layout"
 	@echo "make bench   measure              make lock     pin the dependencies anew"
 	@echo "make reference  the pages of settings and options"
@@ -34,6 +35,10 @@ test: lint
 
 test-all: install
 	$(BIN)/python -m pytest $(PARALLEL) $(ARGS)
+
+fuzz: install
+	RCE_FUZZ_EXAMPLES=$(or $(EXAMPLES),5000) $(BIN)/python -m pytest --timeout 3600 \
+		$(wildcard tests/integration/*/test_*_fuzz.py tests/integration/*/test_openapi.py) $(ARGS)
 
 test-quick: install
 	$(BIN)/python -m pytest -n logical --durations=5 tests/unit $(ARGS)

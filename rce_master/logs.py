@@ -11,7 +11,7 @@ import msgspec
 from rce.control.exceptions import ControlError
 from rce.control.logs import LogWish
 from rce.control.messages import LogChunk, TaskSetKind
-from rce.protocol.names import EndpointId
+from rce.protocol.names import EndpointId, is_name
 from rce_master.exceptions import NotFound, TaskSetAway
 from rce_master.state.records import Container
 from rce_master.state.tables import Tables
@@ -55,6 +55,9 @@ async def read_log(tables: Tables, peers: Mapping[str, LogReader], request: LogR
         NotFound: There is no such container, node or log.
         TaskSetAway: Its task set is not connected or does not answer.
     """
+    user, _, tag = request.id.partition("/")
+    if not is_name(user) or not is_name(tag):
+        raise NotFound(f"there is no container {tag!r}: a name has letters, digits and '_', a letter first")
     container = tables.container(request.id)
     if container is None or not _is_present(tables, request):
         wish = msgspec.structs.replace(request.wish, since=_owner_since(tables, request.id))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Protocol
-from urllib.parse import urlsplit
 
 from websockets.protocol import State
 
@@ -66,12 +65,12 @@ class Gate:
         """Let a robot in (None), or say why not."""
         assert isinstance(connection, RobotSocket)
         connection.speak()
-        if request.headers.get("Upgrade", "").lower() != "websocket":
+        if ",".join(request.headers.get_all("Upgrade")).lower() != "websocket":
             return None  # the library knows what to say to what is no WebSocket handshake
         try:
-            self._check_origin(request.headers.get("Origin"))
+            self._check_origin(request.headers.get_all("Origin"))
             authorization = request.headers.get_all("Authorization")
-            credentials = read_credentials(urlsplit(request.path).query, authorization)
+            credentials = read_credentials(request.path.partition("?")[2].partition("#")[0], authorization)
             forwarded = request.headers.get_all("X-Forwarded-For")
             address = self._proxies.origin(connection.remote_address, forwarded)
             namespace = await self._claim(credentials, address)
@@ -88,10 +87,11 @@ class Gate:
             session.on_lost("the robot left during the handshake")
         return None
 
-    def _check_origin(self, origin: str | None) -> None:
+    def _check_origin(self, origins: list[str]) -> None:
         """Refuse pages of other sites: a browser would let them in with whatever its user may reach."""
-        if origin is not None and origin not in self._origins and "*" not in self._origins:
-            raise HandshakeError(_FORBIDDEN, f"Origin {origin} may not connect here.")
+        for origin in origins:
+            if origin not in self._origins and "*" not in self._origins:
+                raise HandshakeError(_FORBIDDEN, f"Origin {origin} may not connect here.")
 
     async def _claim(self, credentials: Credentials, address: str) -> Namespace:
         """Log in. A former connection of the robot that turns out to be dead makes room for the new one."""

@@ -51,7 +51,7 @@ def is_for_contents(path: str) -> bool:
 async def answer(request: Request, read: ReadContent) -> Response:
     """Answer a request for a piece; whoever calls this has checked the secret."""
     found = _PATH.fullmatch(request.path)
-    start = _FROM.fullmatch(request.headers.get("Range", "bytes=0-"))
+    start = _FROM.fullmatch(",".join(request.headers.get_all("Range")) or "bytes=0-")
     if found is None or start is None:
         return _refuse(HTTPStatus.BAD_REQUEST, "the path must be /contents/SHA256, the range bytes=OFFSET-")
     offset = int(start[1])

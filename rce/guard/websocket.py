@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, TypeVar
 
 from websockets.asyncio.server import ServerConnection
+from websockets.protocol import State
 
 from rce.guard.lobby import address_of
 
@@ -37,6 +38,26 @@ class GuardedConnection(ServerConnection):
         self._guest = self.lobby.enter(address, self.transport.abort)
         if self._guest is None:
             self.transport.abort()
+
+    def data_received(self, data: bytes) -> None:
+        """Drop who sends garbage, or their end, before the handshake was answered.
+
+        The library has given such a connection up then, and could not send its answer.
+        """
+        super().data_received(data)
+        if self.protocol.state is State.CONNECTING and self.protocol.eof_sent:
+            self._give_up()
+
+    def eof_received(self) -> None:
+        """Drop who ends their side before the handshake was answered."""
+        if self.protocol.state is State.CONNECTING:
+            self._give_up()
+        else:
+            super().eof_received()
+
+    def _give_up(self) -> None:
+        self.protocol.state = State.CLOSED
+        self.transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Leave."""

@@ -45,6 +45,8 @@ class HandshakeError(ProtocolError):
     """
 
     def __init__(self, status: int, reason: str) -> None:
+        # It may quote bytes of the request that are no text, which could not be sent back.
+        reason = reason.encode("utf-8", "backslashreplace").decode()
         super().__init__(status, reason)
         self.status = status
         self.reason = reason

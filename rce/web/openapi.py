@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from http import HTTPStatus
 from typing import Any
 
 from pydantic import BaseModel
@@ -13,6 +14,19 @@ from pydantic.json_schema import models_json_schema
 from rce import __version__
 
 PREFIX = "/api/v1"
+_FAILURES: dict[int, str] = {
+    HTTPStatus.BAD_REQUEST: "The request cannot be read",
+    HTTPStatus.UNAUTHORIZED: "No token, or one that is not good any more; or a wrong password",
+    HTTPStatus.FORBIDDEN: "The caller may not do this",
+    HTTPStatus.NOT_FOUND: "There is no such thing",
+    HTTPStatus.REQUEST_TIMEOUT: "The body did not come in time",
+    HTTPStatus.CONFLICT: "It contradicts what there is, or exceeds a limit",
+    HTTPStatus.REQUEST_ENTITY_TOO_LARGE: "The body is too large",
+    HTTPStatus.MISDIRECTED_REQUEST: "The server is not known by the name in Host",
+    HTTPStatus.UNPROCESSABLE_ENTITY: "The request is wrong; the text names each fault",
+    HTTPStatus.TOO_MANY_REQUESTS: "Too much at a time; try again after Retry-After seconds",
+    HTTPStatus.SERVICE_UNAVAILABLE: "Something that is needed for it cannot be reached now",
+}
 _REF = "#/components/schemas/{model}"
 
 
@@ -44,6 +58,10 @@ class Operation:
     open: bool = False
     """Whether it can be used without a token."""
     query: tuple[Query, ...] = ()
+    upload: str = ""
+    """Media type of a body that is a file."""
+    errors: tuple[int, ...] = ()
+    """All other statuses that an answer may have; none: not said, so any."""
 
 
 def build_document(
@@ -83,13 +101,15 @@ def _describe(known: Operation, error: type[BaseModel]) -> dict[str, Any]:
         "tags": [known.group],
         "parameters": [_path_parameter(name) for name in re.findall(r"{(\w+)}", known.path)]
         + [_query_parameter(query) for query in known.query],
-        "responses": {
-            str(known.status): _success(known),
-            "default": {"description": "It was not done, and why", "content": _content(error)},
-        },
+        "responses": {str(known.status): _success(known)}
+        | {str(status): _failure(status, error) for status in sorted(known.errors)}
+        | ({} if known.errors else {"default": _failure(0, error)}),
     }
     if known.body is not None:
         described["requestBody"] = {"required": True, "content": _content(known.body)}
+    if known.upload:
+        file = {"schema": {"type": "string", "format": "binary"}}
+        described["requestBody"] = {"required": True, "content": {known.upload: file}}
     if known.open:
         described["security"] = []
     return described
@@ -115,6 +135,15 @@ def _success(known: Operation) -> dict[str, Any]:
         answer["content"] = _content(known.reply)
     elif known.media != "application/json":
         answer["content"] = {known.media: {"schema": {"type": "string"}}}
+    return answer
+
+
+def _failure(status: int, error: type[BaseModel]) -> dict[str, Any]:
+    text = _FAILURES.get(status, "It was not done, and why")
+    answer: dict[str, Any] = {"description": text, "content": _content(error)}
+    if status == HTTPStatus.TOO_MANY_REQUESTS:
+        seconds = {"description": "Seconds after which to try again", "schema": {"type": "integer"}}
+        answer["headers"] = {"Retry-After": seconds}
     return answer
 
 

@@ -10,6 +10,7 @@ from yarl import URL
 
 from rce.guard.lobby import Guest, Lobby, address_of
 from rce.tls.gate import TlsGate
+from rce.web.faults import logger, refuse_expectations
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -64,7 +65,7 @@ class HttpServer:
         app.middlewares.insert(0, self._track)
         app.on_response_prepare.append(self._grant)
         self._runner = web.AppRunner(
-            app, access_log=None, shutdown_timeout=SHUTDOWN_S, keepalive_timeout=idle_timeout
+            app, access_log=None, logger=logger, shutdown_timeout=SHUTDOWN_S, keepalive_timeout=idle_timeout
         )
         self._host = host
         self._port = port
@@ -74,6 +75,8 @@ class HttpServer:
 
     async def __aenter__(self) -> Self:
         await self._runner.setup()
+        assert self._runner.server is not None
+        self._runner.server.request_handler = refuse_expectations(self._runner.server.request_handler)
         try:
             self._server = await asyncio.get_running_loop().create_server(
                 self._make_arrival, self._host or None, self._port, backlog=_BACKLOG

@@ -11,6 +11,7 @@ from pathlib import Path
 from aiohttp import WSMsgType, hdrs, web
 from pydantic import BaseModel, ValidationError
 
+from rce.web.bodies import read_whole
 from rce.web.openapi import PREFIX, Operation, build_document
 from rce.web.origin import ServerNames, is_foreign
 from rce_client.station.api import (
@@ -164,7 +165,7 @@ class Station:
 
     async def put_goal(self, request: web.Request) -> web.StreamResponse:
         """Send a robot to a cell."""
-        wish = GoalRequest.model_validate_json(await request.read())
+        wish = GoalRequest.model_validate_json(await read_whole(request))
         return _reply(Answer(message=await self._fleet.set_goal(request.match_info["robot"], wish.cell)))
 
     async def put_cell(self, request: web.Request) -> web.StreamResponse:
@@ -172,7 +173,7 @@ class Station:
         number = request.match_info["cell"]
         if not number.isdecimal():
             return _problem(404, f"{number!r} is not the number of a cell")
-        wish = CellRequest.model_validate_json(await request.read())
+        wish = CellRequest.model_validate_json(await read_whole(request))
         return _reply(Answer(message=await self._fleet.block_cell(int(number), blocked=wish.blocked)))
 
     async def live(self, request: web.Request) -> web.StreamResponse:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 from functools import cache
 from typing import TYPE_CHECKING
 
-from aiohttp import web
-
 from rce.bundles.exceptions import BadKey
 from rce.bundles.signing import key_id
+from rce.web.bodies import read_pieces
 from rce.web.openapi import Query
-from rce.web.server import IDLE_S
 from rce_master.bundles.office import Wish
 from rce_master.exceptions import Invalid, NotFound
 from rce_master.http import package_models as models
@@ -21,13 +18,10 @@ from rce_master.state.packages import find, uses
 from rce_master.state.records import Bundle, PackageKey, bundle_key
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
     from rce_master.state.tables import Tables
 
 routes = RouteTable("packages")
 
-_CHUNK = 1 << 16
 _QUERY = (OF_USER,)
 
 
@@ -64,8 +58,9 @@ async def show_package(call: Call) -> models.PackageOut:
 @routes.route(
     "PUT",
     "/packages/{name}/{version}",
-    "Push a package: the body is its archive (application/gzip)",
+    "Push a package: the body is its archive",
     reply=models.PackageOut,
+    upload="application/gzip",
     query=(
         Query(name="key", description="The public key, in hex, that signed it.", required=True),
         Query(
@@ -83,7 +78,7 @@ async def push_package(call: Call) -> models.PackageOut:
         signature=call.query("signature"),
     )
     size = call.request.content_length or 0
-    bundle, warnings = await call.services.packages.push(wish, size, _body(call.request))
+    bundle, warnings = await call.services.packages.push(wish, size, read_pieces(call.request))
     return _shown(call.services.realm.tables, bundle, warnings)
 
 
@@ -129,19 +124,6 @@ async def register_package_key(call: Call) -> models.PackageKeyOut:
 async def revoke_package_key(call: Call) -> None:
     """Trust a key no more."""
     await call.services.realm.submit(commands.RemovePackageKey(user=call.owner, id=call.path("id")))
-
-
-async def _body(request: web.Request) -> AsyncIterator[bytes]:
-    """Read the body piece by piece, each of which must come in good time."""
-    while True:
-        try:
-            async with asyncio.timeout(IDLE_S):
-                chunk = await request.content.read(_CHUNK)
-        except TimeoutError:
-            raise web.HTTPRequestTimeout from None
-        if not chunk:
-            return
-        yield chunk
 
 
 def _shown(tables: Tables, bundle: Bundle, warnings: tuple[str, ...] = ()) -> models.PackageOut:

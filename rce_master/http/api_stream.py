@@ -46,6 +46,7 @@ _LOG_QUERY = (
     "/containers/{container}/nodes/{node}/log",
     "Read a node's log; to follow it, read on from the offset that is given back",
     reply=models.LogOut,
+    errors=(503,),
     query=_LOG_QUERY,
 )
 async def read_node_log(call: Call) -> models.LogOut:
@@ -58,6 +59,7 @@ async def read_node_log(call: Call) -> models.LogOut:
     "/containers/{container}/log",
     "Read the log of a container's environment",
     reply=models.LogOut,
+    errors=(503,),
     query=_LOG_QUERY,
 )
 async def read_container_log(call: Call) -> models.LogOut:

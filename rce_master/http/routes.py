@@ -186,6 +186,10 @@ class Route:
     open: bool = False
     """Whether it can be used without a token."""
     query: tuple[Query, ...] = ()
+    upload: str = ""
+    """Media type of a body that the handler reads itself."""
+    errors: tuple[int, ...] = ()
+    """Statuses beside those that follow from the rest."""
 
     @property
     def operation(self) -> Operation:
@@ -202,7 +206,22 @@ class Route:
             status=self.status,
             open=self.open,
             query=self.query,
+            upload=self.upload,
+            errors=tuple(set(self._errors())),
         )
+
+    def _errors(self) -> Iterator[int]:
+        """The statuses of what may go wrong."""
+        yield from (401, 403, 421, 429)
+        if "{" in self.path or OF_USER in self.query:
+            yield 404
+        if self.body is not None or self.upload:
+            yield from (408, 413)
+        if self.body is not None or self.query:
+            yield 422
+        if self.method != "GET":
+            yield from (409, 503)
+        yield from self.errors
 
 
 @dataclass(slots=True)

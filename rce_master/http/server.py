@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 from aiohttp import hdrs, web
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
+from rce.web.bodies import read_whole
 from rce.web.openapi import PREFIX, build_document
 from rce.web.origin import ServerNames, is_foreign
-from rce.web.server import IDLE_S
 from rce_master.exceptions import (
     AuthError,
     MasterError,
@@ -101,7 +101,7 @@ def _adapt(route: Route, services: Services) -> Handler:
         try:
             admit(route, user)
             if route.body:
-                call = replace(call, body=read_body(route.body, await _read(request)))
+                call = replace(call, body=read_body(route.body, await read_whole(request)))
             reply = await route.handler(call)
         except MasterError as error:
             note_refused(route, call, error)
@@ -116,15 +116,6 @@ def _adapt(route: Route, services: Services) -> Handler:
         )
 
     return handle
-
-
-async def _read(request: web.Request) -> bytes:
-    """Read the body, which must come in good time."""
-    try:
-        async with asyncio.timeout(IDLE_S):
-            return await request.read()
-    except TimeoutError:
-        raise web.HTTPRequestTimeout from None
 
 
 def _metrics(services: Services) -> Handler:

@@ -1,0 +1,45 @@
+"""What the log says of requests that are no HTTP: one line, as it is no fault of the engine's."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+from aiohttp import hdrs, web
+from aiohttp.http_exceptions import HttpProcessingError
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
+
+logger = logging.getLogger("rce.web.requests")
+
+
+_CONTINUE = "100-continue"
+
+
+def _shorten(record: logging.LogRecord) -> bool:
+    """Make a line of the library's report of a fault of the client's; keep everything else as it is."""
+    error = record.exc_info[1] if record.exc_info else None
+    if isinstance(error, (HttpProcessingError, web.RequestPayloadError)):
+        # Only what kind of fault: what follows quotes the request, and there may be a password in it.
+        kind = str(getattr(error, "message", error)).strip().partition(":")[0] or type(error).__name__
+        record.msg, record.args = f"{record.getMessage()}: it is not HTTP: %.60r", (kind,)
+        record.exc_info = record.exc_text = None
+        record.levelno, record.levelname = logging.INFO, "INFO"
+    return True
+
+
+logger.addFilter(_shorten)
+
+
+def refuse_expectations(handler: Handler) -> Handler:
+    """Wrap what handles requests: the library's answer to an unknown ``Expect`` quotes it, text or not."""
+
+    async def handle(request: web.BaseRequest) -> web.StreamResponse:
+        if request.headers.get(hdrs.EXPECT, _CONTINUE).lower() != _CONTINUE:
+            return web.json_response({"error": "the header Expect can only be 100-continue"}, status=417)
+        return await handler(request)
+
+    return handle

@@ -1,0 +1,51 @@
+"""Requests over HTTP that no page and no ERP would send: the station answers none with a fault of its own."""
+
+from __future__ import annotations
+
+import pytest
+from support.fuzzing import Tracebacks, exchange, requests
+
+from rce.web.server import HttpServer
+from rce_client.station.fleet_link import FleetLink
+from rce_client.station.live import Broadcast
+from rce_client.station.server import Station
+from rce_client.station.view import FleetView
+
+COUNT = 300
+PATHS = [
+    *("/", "/static/{file}", "/static/../{file}", "/api/v1/openapi.json", "/api/v1/live", "/api/v1/fleet"),
+    *("/api/v1/robots/{robot}", "/api/v1/robots/{robot}/goal", "/api/v1/cells/{cell}", "/api/v1/cells/1"),
+    *("/?token={token}", "*"),
+]
+LOGINS = ([b"Authorization: Bearer token"], [b"Cookie: rce_station=token"])
+UPGRADE = [
+    b"Upgrade: websocket",
+    b"Connection: Upgrade",
+    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
+    b"Sec-WebSocket-Version: 13",
+]
+
+
+class Planner(FleetLink):
+    """Does all that it is asked for."""
+
+    def __init__(self) -> None:
+        """Need no wire to a planner."""
+
+    async def set_goal(self, robot: str, cell: int | None) -> str:
+        return f"{robot} {cell}"
+
+    async def block_cell(self, cell: int, *, blocked: bool) -> str:
+        return f"{cell} {blocked}"
+
+
+@pytest.mark.parametrize("login", [*LOGINS, [*LOGINS[0], *UPGRADE]])
+async def test_raw_requests_to_the_station(login: list[bytes]) -> None:
+    app = Station(FleetView(), Planner(), Broadcast(), token="token").make_app()
+    async with HttpServer(app, "127.0.0.1", 0) as server:
+        port = int(server.url.rpartition(":")[2].rstrip("/"))
+        with Tracebacks().watching() as log:
+            for request in requests(PATHS, COUNT, login):
+                answers = await exchange(port, request)
+                assert 500 not in answers, request
+                assert not log.found, (request, log.found)
