@@ -41,7 +41,13 @@ def build_app(points: list[EntryPoint]) -> typer.Typer:
         if problem is not None:
             _add_unavailable(app, point.name, problem)
             continue
-        plugged: Any = point.load()
+        try:
+            plugged: Any = point.load()
+        except ModuleNotFoundError as error:  # of a package that plugs in, and was installed in part
+            if error.name is None or error.name.startswith("rce"):
+                raise
+            _add_unavailable(app, point.name, f"the package {error.name} is missing")
+            continue
         if isinstance(plugged, typer.Typer):
             app.add_typer(plugged, name=point.name)
         else:
