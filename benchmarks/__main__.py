@@ -9,7 +9,7 @@ from typing import Any
 
 import uvloop
 
-from benchmarks import containers, fanout, rate, roundtrip, sandboxes, stalled
+from benchmarks import abuse, containers, fanout, rate, roundtrip, sandboxes, stalled
 from benchmarks.engine import RunningEngine, engine
 from benchmarks.figures import plot_round_trips, save, show
 
@@ -37,6 +37,10 @@ def suites(*, quick: bool) -> dict[str, tuple[str, Callable[[RunningEngine], Awa
         "fanout": (
             "Fan-out",
             lambda e: fanout.run(e, clients=20 if quick else 200, rate=20.0, seconds=seconds),
+        ),
+        "abuse": (
+            "Beside another user's abuse",
+            lambda e: abuse.run(e, seconds=5.0 if quick else 20.0),
         ),
         "stalled": ("One client stops reading", lambda e: stalled.run(e, seconds=seconds)),
     }

@@ -7,6 +7,7 @@ the master drops the robot or it comes back.
 from __future__ import annotations
 
 import asyncio
+import gc
 from collections import Counter
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -36,6 +37,10 @@ if TYPE_CHECKING:
     from rce_robot.interface import RobotInterface
     from rce_robot.outbox import Buffer, Overflow, Queued
     from rce_robot.session import Session
+
+
+COLLECT_AFTER = 16 << 20
+"""Bytes given up after which it is made sure that they are free."""
 
 
 class Forms(Protocol):
@@ -95,6 +100,8 @@ class Namespace:
         self._interfaces: dict[str, RobotInterface] = {}
         self._applying = asyncio.Lock()
         self._pool = pool
+        self._given_up = 0
+        """Bytes, since the last look for garbage."""
         self._holdings = Holdings(self._note)
         self._account = ledger.open(id.user, self)
         self._endpoint = Endpoint(
@@ -153,13 +160,19 @@ class Namespace:
 
     def shed(self, size: int) -> None:
         """Drop the oldest of what waits, on the robot's side first."""
-        goal = self.held - size
+        before = self.held
+        goal = before - size
         if self.session is not None:
             self.session.shed(size)
         if self.held > goal:
             self._endpoint.shed(self.held - goal)
         if self.held > goal:
             self._holdings.shed(self.held - goal)
+        self._given_up += before - self.held
+        if self._given_up > COLLECT_AFTER:
+            # An error and its traceback are a cycle that may hold a message; the collector counts no bytes.
+            self._given_up = 0
+            gc.collect()
 
     def fail(self, reason: str) -> None:
         """Drop the robot's connection."""

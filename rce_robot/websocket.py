@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 LARGE_PART = 64 << 10
 """Bytes of an incomplete message from which on the receiver is told of every part."""
 
-READS_PER_STEP = 64
+READS_PER_STEP = 4
 """Reads of the parser before others may have their turn; a frame takes three or four."""
 
 MAX_FRAGMENTS = 4096
@@ -265,6 +265,7 @@ class _Steps:
 
     def __init__(self, reader: StreamReader) -> None:
         self._left: float = math.inf
+        self._reader = reader
         self._read = reader.read_exact
         self.stopped = False
         """Whether the parser could go on."""
@@ -280,7 +281,17 @@ class _Steps:
         while self._left < 0:
             self.stopped = True
             yield
-        return (yield from self._read(n))
+        reader = self._reader
+        if n < LARGE_PART:
+            return (yield from self._read(n))
+        while len(reader.buffer) < n and not reader.eof:
+            yield
+        if len(reader.buffer) < n:
+            return (yield from self._read(n))  # says what is wrong
+        data = reader.buffer  # taken as it is: a copy of a large message takes long
+        reader.buffer = data[n:]
+        del data[n:]
+        return data
 
 
 def _add_frame(buffers: list[Buffer], first: int, head: bytes, body: Buffer) -> None:

@@ -88,10 +88,10 @@ _ITEMS: dict[str, type[Struct]] = {
 }
 _CONNECTION_ITEMS: dict[str, type[Struct]] = {"connect": Connection, "disconnect": Connection}
 
-_MAX_ITEMS = 1024
+_MAX_ITEMS = 512
 """Items of all lists of one ``CN`` or ``CX``: each is read on its own."""
 _MAX_FAULTS = 32
-"""Wrong items of one ``CN`` or ``CX`` that are told of one by one."""
+"""Wrong items of one ``CN`` or ``CX`` after which no more are read."""
 _MAX_QUOTED = 80
 _SHORT = 4096
 
@@ -313,6 +313,11 @@ def _read_items(data: dict[str, Any], kinds: dict[str, type[Struct]]) -> dict[st
             continue
         good = read[key] = []
         for index, item in enumerate(items):
+            if len(faults) >= _MAX_FAULTS:
+                faults.append(
+                    f"data.{key}: the last {len(items) - index} items were not read, too many are wrong"
+                )
+                break
             place = f"data.{key}[{index}]"
             try:
                 made = _convert(item, cls, place)
@@ -321,8 +326,6 @@ def _read_items(data: dict[str, Any], kinds: dict[str, type[Struct]]) -> dict[st
                 faults.append(str(error))
             else:
                 good.append(made)
-    if len(faults) > _MAX_FAULTS:
-        faults[_MAX_FAULTS:] = [f"data: {len(faults) - _MAX_FAULTS} more items are wrong"]
     read["faults"] = faults
     return read
 

@@ -117,6 +117,8 @@ def serve(sock: socket.socket, worker: Worker) -> None:
         del parts
         for buffer in pack(result, answer):
             sock.sendall(buffer)
+        del answer
+        gc.collect()  # what an error's traceback holds is a cycle
 
 
 def _need(sock: socket.socket, size: int) -> bytes:
@@ -158,6 +160,7 @@ def main() -> None:
     _give_way(memory)
     types = TypeRegistry(PackageIndex([Path(package) for package in packages]))
     with socket.socket(fileno=int(fd)) as sock:
+        gc.freeze()
         sock.sendall(b"\0")
         with contextlib.suppress(EOFError, ConnectionError):  # the endpoint is gone: so is the work
             serve(sock, Worker(FormFactory(types), memory))

@@ -116,6 +116,7 @@ class Engine:
         robots: int = 1,
         apart: bool = False,
         packages: Path | None = None,
+        robot_options: tuple[str, ...] = (),
     ) -> None:
         """Prepare an engine.
 
@@ -125,6 +126,7 @@ class Engine:
             robots: How many robot task sets.
             apart: Every task set takes itself to be on a machine of its own, so that links go over TCP.
             packages: A folder with more packages.
+            robot_options: Options of the robot task sets.
         """
         self.folder = folder
         self.http_port, self.control_port, *rest = free_ports(3 + 2 * robots)
@@ -150,6 +152,7 @@ class Engine:
                 "127.0.0.1",
                 *("--control-port", self.control_port, "--ws-port", ws, "--link-port", link, "--dev"),
                 *(("--machine", f"robots{number}") if apart else ()),
+                *robot_options,
                 name=f"rce-robot-{number}",
             )
             for number, (ws, link) in enumerate(self.robot_ports)

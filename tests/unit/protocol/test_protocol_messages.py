@@ -190,7 +190,7 @@ def test_bad_connection_is_reported_and_the_good_one_kept() -> None:
         (text("DM", {"iTag": "i", "type": "a/B"}), "data.msg: is missing"),
         (text("DM", [1]), "data: must be object"),
         (text("ER", {}), "data: must be str"),
-        ("[" * 100_000, "no valid JSON"),
+        ("[" * 100_000, "nested deeper"),
         (
             text("DM", {"iTag": "i", "type": "a/B", "msg": json.loads("[" * 63 + "]" * 63)}),
             "nested deeper than 64",
@@ -285,7 +285,7 @@ def test_any_items_are_read_or_reported(data: Any) -> None:
             if isinstance(read, m.ConfigureConnections)
             else len(read.add_nodes) + len(read.add_interfaces) + len(read.set_param)
         )
-        assert kept + len(read.faults) >= given_items or len(read.faults) > 32
+        assert kept + len(read.faults) >= given_items or len(read.faults) > 31
 
 
 @given(st.text() | st.binary())

@@ -1,0 +1,201 @@
+"""Ways to abuse the robot endpoint: ``python -m benchmarks.attacks KIND URL`` attacks until it is killed."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import io
+import json
+import struct
+import sys
+from collections.abc import AsyncIterator, Awaitable, Callable
+
+import uvloop
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed
+
+USER = PASSWORD = "abuser"
+STRING, IMAGE = "std_msgs/String", "sensor_msgs/Image"
+_MASK = bytes(4)
+_ID = b"0" * 32
+
+Attack = Callable[[str], Awaitable[None]]
+
+
+@contextlib.asynccontextmanager
+async def robot(url: str, name: str = "a0") -> AsyncIterator[ClientConnection]:
+    """Connect a robot of the abuser."""
+    digest = hashlib.sha256(PASSWORD.encode()).hexdigest()
+    target = f"{url}?userID={USER}&robotID={name}&password={digest}"
+    async with connect(target, max_size=None, compression=None, ping_interval=None) as socket:
+        yield socket
+
+
+async def loop_back(socket: ClientConnection, cls: str, name: str = "a0") -> None:
+    """Join two of the robot's interfaces, so that what it sends comes back to it."""
+    ends = [
+        {"endpointTag": name, "interfaceTag": tag, "interfaceType": kind, "className": cls}
+        for tag, kind in (("out", "SubscriberConverter"), ("in", "PublisherConverter"))
+    ]
+    await send(socket, "CN", {"addInterfaces": ends})
+    await send(socket, "CX", {"connect": [{"tagA": f"{name}/out", "tagB": f"{name}/in"}]})
+    while True:
+        message = json.loads(await socket.recv())
+        if message["type"] == "ST" and message["data"]["iTag"] == "in" and message["data"]["status"]:
+            return
+
+
+async def send(socket: ClientConnection, kind: str, data: object) -> None:
+    """Send a message."""
+    await socket.send(json.dumps({"type": kind, "data": data}))
+
+
+def data_message(msg: str, cls: str = STRING) -> str:
+    """The text of a data message of the looped interface."""
+    return f'{{"type":"DM","data":{{"iTag":"out","type":"{cls}","msgID":"nil","msg":{msg}}}}}'
+
+
+async def drain(socket: ClientConnection) -> None:
+    """Read whatever comes."""
+    async for _ in socket:
+        pass
+
+
+def texts(*messages: str) -> Attack:
+    """Send texts over and over."""
+
+    async def attack(url: str) -> None:
+        async with robot(url) as socket:
+            await loop_back(socket, STRING)
+            reading = asyncio.create_task(drain(socket))
+            while not reading.done():
+                for message in messages:
+                    await socket.send(message)
+
+    return attack
+
+
+async def frames(url: str) -> None:
+    """Small frames, as many as the network takes."""
+    async with robot(url) as socket:
+        reading = asyncio.create_task(drain(socket))
+        piece = (struct.pack("!BB", 0x81, 0x82) + _MASK + b"{}") * 8192
+        while not reading.done():
+            socket.transport.write(piece)
+            await socket.send("{}")  # waits until there is room in the buffer
+
+
+async def requests(url: str) -> None:
+    """Requests of a thousand wrong items each, without a pause."""
+    async with robot(url) as socket:
+        reading = asyncio.create_task(drain(socket))
+        item = {"endpointTag": "a0", "interfaceTag": "x", "interfaceType": "Nonsense", "className": "a/B"}
+        text = json.dumps({"type": "CN", "data": {"addInterfaces": [item] * 1000}})
+        while not reading.done():
+            await socket.send(text)
+
+
+def images(picture: bytes) -> Attack:
+    """Pictures that come back as pictures: decoded and encoded again."""
+
+    async def attack(url: str) -> None:
+        async with robot(url) as socket:
+            await loop_back(socket, IMAGE)
+            reading = asyncio.create_task(drain(socket))
+            text = {"iTag": "out", "type": IMAGE, "msgID": "nil", "msg*": _ID.decode()}
+            while not reading.done():
+                await send(socket, "DM", text)
+                await socket.send(_ID + picture)
+
+    return attack
+
+
+def png(width: int, height: int) -> bytes:
+    """A black picture."""
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.new("RGB", (width, height)).save(file, "PNG", compress_level=1)
+    return file.getvalue()
+
+
+def png_bomb() -> bytes:
+    """A small picture whose header says that it is huge."""
+    import zlib
+
+    data = bytearray(png(8, 8))
+    data[16:24] = struct.pack("!II", 60_000, 60_000)
+    data[29:33] = struct.pack("!I", zlib.crc32(data[12:29]))
+    return bytes(data)
+
+
+async def slow(url: str) -> None:
+    """A robot sends 5 MB messages to itself and reads nothing."""
+    async with robot(url) as socket:
+        await loop_back(socket, STRING)
+        socket.transport.pause_reading()
+        text = data_message(json.dumps({"data": "x" * 5_000_000}))
+        while True:
+            await socket.send(text)
+
+
+async def halves(url: str) -> None:
+    """Ten robots send 60 MB of a binary value each, but for its last byte, and begin anew."""
+
+    async def one(name: str) -> None:
+        size = 60_000_000
+        header = struct.pack("!BBQ", 0x82, 0xFF, size) + _MASK
+        while True:
+            with contextlib.suppress(ConnectionClosed, OSError):
+                async with robot(url, name) as socket:
+                    socket.transport.write(header + bytes(size - 1))
+                    await asyncio.wait_for(socket.wait_closed(), 10)
+
+    await asyncio.gather(*(one(f"a{number}") for number in range(10)))
+
+
+async def binaries(url: str) -> None:
+    """Binary values of 60 MB that no message asks for."""
+    async with robot(url) as socket:
+        reading = asyncio.create_task(drain(socket))
+        value = bytes(60_000_000)
+        for number in range(1_000_000):
+            if reading.done():
+                return
+            await socket.send(b"%032x" % number + value)
+
+
+def kinds() -> dict[str, Attack]:
+    """All attacks by name."""
+    many = 199_000
+    return {
+        "too many elements": texts(data_message("[" + "[]," * 5_000_000 + "[]]")),
+        "many elements": texts(data_message("[" + "[]," * (many - 10) + "[]]")),
+        "many keys": texts(data_message("{" + ",".join(f'"k{n}":1' for n in range(many)) + "}")),
+        "many light texts": texts(data_message("[" + "[]," * 2000 + "[]]")),
+        "nested": texts(data_message("[" * 4000 + "]" * 4000)),
+        "10 MB strings": texts(data_message(json.dumps({"data": "x" * 10_000_000}))),
+        "15 MB of escapes": texts(data_message(json.dumps({"data": "\xe4" * 2_500_000}))),
+        "small frames": frames,
+        "requests": requests,
+        "images": images(png(4000, 4000)),
+        "image bombs": images(png_bomb()),
+        "slow reading": slow,
+        "half binaries": halves,
+        "binaries": binaries,
+    }
+
+
+async def attack(kind: str, url: str) -> None:
+    """Attack until killed; a connection that is ended is made again."""
+    chosen = kinds()[kind]
+    print("ready", flush=True)
+    while True:
+        with contextlib.suppress(ConnectionClosed, OSError):
+            await chosen(url)
+        await asyncio.sleep(0.1)
+
+
+if __name__ == "__main__":
+    uvloop.run(attack(sys.argv[1], sys.argv[2]))

@@ -1,0 +1,161 @@
+"""A user who makes the robot endpoint hold messages in every way has it hold no more than their limit."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import json
+import struct
+from collections.abc import AsyncIterator
+from urllib.parse import urlencode, urlsplit
+
+import psutil
+import pytest
+from support.engine import Engine, running_engine, until
+from websockets.asyncio.client import ClientConnection, connect
+
+pytestmark = [pytest.mark.e2e, pytest.mark.timeout(240)]
+
+MB = 1 << 20
+LIMIT_MB = 64
+OVERHEAD_MB = 200
+"""What the allocator keeps (128 MB), and messages in the hands of the network and of the code."""
+SERVICE, STRING = "std_srvs/SetBool", "std_msgs/String"
+
+
+@contextlib.asynccontextmanager
+async def robot(engine: Engine, name: str) -> AsyncIterator[ClientConnection]:
+    url = engine.get("/?userID=testUser&version=20130902", token="")["url"]
+    password = hashlib.sha256(b"testUser").hexdigest()
+    query = urlencode({"userID": "testUser", "robotID": name, "password": password})
+    async with connect(f"{url}?{query}", max_size=None, ping_interval=None, compression=None) as socket:
+        yield socket
+
+
+async def send(socket: ClientConnection, kind: str, data: object) -> None:
+    await socket.send(json.dumps({"type": kind, "data": data}))
+
+
+async def connect_ends(socket: ClientConnection, *ends: tuple[str, str, str, str]) -> None:
+    """Make interfaces, each (robot, tag, type, class), and join the first with the second."""
+    keys = ("endpointTag", "interfaceTag", "interfaceType", "className")
+    await send(socket, "CN", {"addInterfaces": [dict(zip(keys, end, strict=True)) for end in ends]})
+    (a, b) = (f"{end[0]}/{end[1]}" for end in ends)
+    await send(socket, "CX", {"connect": [{"tagA": a, "tagB": b}]})
+
+
+async def say(socket: ClientConnection, tag: str, cls: str, payload: bytes, number: int) -> None:
+    id_ = f"{number:032x}"
+    await send(socket, "DM", {"iTag": tag, "type": cls, "msgID": str(number), "msg*": id_})
+    await socket.send(id_.encode() + payload)
+
+
+def memory_mb(engine: Engine) -> int:
+    return sum(process.memory_info().rss for process in engine.processes_of("rce-robot")) // MB
+
+
+async def peak_while(engine: Engine, attack: asyncio.Task[None]) -> int:
+    """Return the most memory of the endpoint until the attack ends, megabytes."""
+    peak = 0
+    while not attack.done():
+        with contextlib.suppress(psutil.Error):
+            peak = max(peak, memory_mb(engine))
+        await asyncio.wait([attack], timeout=0.05)
+    with contextlib.suppress(ConnectionError):
+        await attack
+    return peak
+
+
+async def requests_without_answer(engine: Engine) -> None:
+    """200 requests of 5 MB to a robot that never answers."""
+    async with robot(engine, "asks") as asks, robot(engine, "mute") as mute:
+        await connect_ends(
+            asks,
+            ("asks", "call", "ServiceProviderForwarder", SERVICE),
+            ("mute", "serve", "ServiceClientForwarder", SERVICE),
+        )
+        await until(lambda: _established(engine), what="the service is connected")
+        reading = [asyncio.create_task(_read(socket)) for socket in (asks, mute)]
+        for number in range(200):
+            await say(asks, "call", SERVICE, bytes(5 * MB), number)
+        for task in reading:
+            task.cancel()
+
+
+async def topics_that_nobody_reads(engine: Engine) -> None:
+    """100 messages of 5 MB to each of five robots that read nothing."""
+    async with contextlib.AsyncExitStack() as stack:
+        source = await stack.enter_async_context(robot(engine, "source"))
+        for number in range(5):
+            deaf = await stack.enter_async_context(robot(engine, f"deaf{number}"))
+            await connect_ends(
+                source,
+                ("source", f"out{number}", "SubscriberForwarder", STRING),
+                (f"deaf{number}", "in", "PublisherForwarder", STRING),
+            )
+            deaf.transport.pause_reading()
+        await until(lambda: _established(engine) == 5, what="the topics are connected")
+        reading = asyncio.create_task(_read(source))
+        payload = struct.pack("<I", 5 * MB) + b"x" * (5 * MB)
+        for number in range(100):
+            await say(source, f"out{number % 5}", STRING, payload, number)
+        reading.cancel()
+
+
+async def halves(engine: Engine) -> None:
+    """Ten connections send 30 MB of a binary value that does not end."""
+    writers = []
+    ends = []
+    url = urlsplit(engine.get("/?userID=testUser&version=20130902", token="")["url"])
+    password = hashlib.sha256(b"testUser").hexdigest()
+    for number in range(10):
+        reader, writer = await asyncio.open_connection(url.hostname, url.port)
+        query = urlencode({"userID": "testUser", "robotID": f"half{number}", "password": password})
+        writer.write(
+            f"GET /?{query} HTTP/1.1\r\nHost: {url.netloc}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n".encode()
+        )
+        assert b"101" in await reader.readuntil(b"\r\n\r\n")
+        writer.write(struct.pack("!BBQ", 0x82, 0xFF, 60 * MB) + bytes(4) + bytes(30 * MB))
+        ends.append(asyncio.create_task(_wait_for_end(reader)))
+        writers.append(writer)
+    await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED, timeout=60)
+    assert any(end.done() for end in ends), "no connection was ended"
+    for end, writer in zip(ends, writers, strict=True):
+        end.cancel()
+        writer.transport.abort()
+
+
+async def _wait_for_end(reader: asyncio.StreamReader) -> None:
+    with contextlib.suppress(ConnectionError):
+        await reader.read(-1)
+
+
+async def _read(socket: ClientConnection) -> None:
+    async for _ in socket:
+        pass
+
+
+def _established(engine: Engine) -> int:
+    return sum(c["established"] for c in engine.get("/api/v1/connections")["connections"])
+
+
+@pytest.mark.parametrize("attack", [requests_without_answer, topics_that_nobody_reads, halves])
+async def test_the_limit_holds_whatever_holds_the_messages(attack: object) -> None:
+    async with running_engine(robot_options=("--user-memory", str(LIMIT_MB))) as engine:
+        before = memory_mb(engine)
+        assert callable(attack)
+        peak = await peak_while(engine, asyncio.create_task(attack(engine)))
+        print(f"before {before} MB, most {peak} MB")  # noqa: T201 - what was measured
+        assert peak < before + LIMIT_MB + OVERHEAD_MB
+        held = lambda: float(_gauge(engine.get("/metrics"), "rce_task_set_held_bytes"))  # noqa: E731
+        await until(lambda: held() < MB, what="the gauge falls when nothing is held")
+
+
+def _gauge(metrics: str, name: str) -> str:
+    return next(
+        line.rpartition(" ")[2]
+        for line in metrics.splitlines()
+        if line.startswith(name) and 'kind="robot"' in line
+    )
