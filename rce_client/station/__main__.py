@@ -7,15 +7,17 @@ import ipaddress
 import json
 import logging
 from collections.abc import Callable
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Annotated, Any, Protocol
+from urllib.parse import urlsplit
 
 import typer
 import uvloop
 
 from rce.cli.tls_options import Authority, CertificateName, Certificates, Tls, TlsCert, TlsKey
 from rce.config.client import ClientConfig, load
-from rce.config.exceptions import ConfigError
+from rce.config.exceptions import ConfigError, Fault
 from rce.config.logs import start_logging
 from rce.config.resources import examples_dir
 from rce.ros.packages import PackageIndex
@@ -27,11 +29,13 @@ from rce.tls.identity import Context
 from rce.web.origin import ServerNames
 from rce.web.server import HttpServer
 from rce_client.exceptions import RefusedError
+from rce_client.station.engine_entrance import EngineAccount, EngineEntrance
 from rce_client.station.engine_watch import EngineWatch
 from rce_client.station.engine_wire import EngineWire
 from rce_client.station.fleet_link import FleetLink, PlannerWire
 from rce_client.station.graph_watch import GraphWatch
 from rce_client.station.live import Broadcast
+from rce_client.station.persons import Entrance, SharedToken
 from rce_client.station.ros_wire import RosWire
 from rce_client.station.server import Station
 from rce_client.station.view import FleetView
@@ -55,8 +59,19 @@ def ui(
     ] = None,
     token: Annotated[
         str,
-        typer.Option(envvar="RCE_STATION_TOKEN", help="Callers must show it; needed beyond loopback."),
+        typer.Option(
+            envvar="RCE_STATION_TOKEN",
+            help="With --ros-master: callers must show it.",
+        ),
     ] = "",
+    login: Annotated[
+        bool | None,
+        typer.Option(
+            help="Ask people to log in as users of the engine"
+            " (default: unless station and engine are on loopback)",
+            show_default=False,
+        ),
+    ] = None,
     tls: Tls = False,
     certificates: Certificates = None,
     certificate: CertificateName = ENGINE,
@@ -81,19 +96,46 @@ def ui(
     except (ConfigError, CertificateError) as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(2) from None
-    if identity is None and (text := plain_warning("the station's token travels", bind)):
+    if identity is None and (text := plain_warning("the logins of the station travel", bind)):
         logging.getLogger(__name__).warning("%s", text)
-    if not token and not _is_loopback(bind):
-        raise typer.BadParameter(f"--bind {bind} opens the station to others: give it a --token")
+    entrance = _entrance(way, bind, token, login)
     try:
         names = ServerNames(bind, public_name or ())
-        uvloop.run(serve(way, bind, port, token, names, identity.server if identity else None))
+        uvloop.run(serve(way, bind, port, entrance, names, identity.server if identity else None))
     except* RefusedError as group:
         typer.echo(f"rce ui: {group.exceptions[0]}", err=True)
         raise typer.Exit(1) from None
     except* OSError as group:
         typer.echo(f"rce ui: cannot listen on {bind}:{port}: {group.exceptions[0]}", err=True)
         raise typer.Exit(1) from None
+
+
+def _entrance(way: EngineWay | RosWay, bind: str, token: str, login: bool | None) -> Entrance:
+    """Choose how people come in.
+
+    Raises:
+        typer.BadParameter: What was chosen would let in anybody from elsewhere, or does not fit.
+    """
+    if isinstance(way, RosWay):
+        if login:
+            raise typer.BadParameter("--login needs the users of an engine; give a --token with --ros-master")
+        if not token and not _is_loopback(bind):
+            raise typer.BadParameter(f"--bind {bind} opens the station to others: give it a --token")
+        return SharedToken(token)
+    if token:
+        raise typer.BadParameter(
+            "--token is for --ros-master; at a station of the engine callers show tokens of the engine's"
+            " users (rce token), and people log in at the page"
+        )
+    account = way.account
+    asks = login if login is not None else not (_is_loopback(bind) and _is_loopback(_host(account.url)))
+    if not asks and not _is_loopback(bind):
+        raise typer.BadParameter(f"--no-login with --bind {bind} would let anybody steer the fleet")
+    return EngineEntrance(account, open=not asks)
+
+
+def _host(url: str) -> str:
+    return urlsplit(url).hostname or ""
 
 
 def _is_loopback(host: str) -> bool:
@@ -153,19 +195,23 @@ class EngineWay:
 
     def __init__(self, config: ClientConfig, authority: Path | None = None) -> None:
         self._tls = config.tls(authority)
+        password = config.password.get_secret_value()
+        if not password:
+            raise ConfigError(
+                "station", [Fault("token", "is for robots; a station needs its user's password")]
+            )
+        self.account = EngineAccount(config.url, config.user, password, self._tls)
         self.wire = EngineWire(config, self._tls)
-        self._config = config
 
     async def watch(self, on_state: Callable[[dict[str, Any]], None]) -> None:
         """Tell the engine's state; the wire has ended nodes started again."""
-        config = self._config
 
         def take(state: dict[str, Any]) -> None:
             on_state(state)
             self.wire.on_engine(state)
 
-        password = config.password.get_secret_value()
-        await EngineWatch(config.url, config.user, password, tls=self._tls, on_state=take).run()
+        account = self.account
+        await EngineWatch(account.url, account.user, account.password, tls=self._tls, on_state=take).run()
 
 
 class RosWay:
@@ -182,7 +228,7 @@ class RosWay:
 
 
 async def serve(
-    way: Way, bind: str, port: int, token: str, names: ServerNames, tls: Context | None = None
+    way: Way, bind: str, port: int, entrance: Entrance, names: ServerNames, tls: Context | None = None
 ) -> None:
     """Serve until SIGINT or SIGTERM."""
     view, pages = FleetView(), Broadcast()
@@ -191,8 +237,11 @@ async def serve(
     stop = asyncio.Event()
     for number in end_signals():
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    station = Station(view, fleet, pages, token=token, names=names)
-    async with HttpServer(station.make_app(), bind, port, tls) as server:
+    station = Station(view, fleet, pages, entrance=entrance, names=names)
+    async with AsyncExitStack() as stack:
+        if isinstance(entrance, EngineEntrance):
+            await stack.enter_async_context(entrance)
+        server = await stack.enter_async_context(HttpServer(station.make_app(), bind, port, tls))
 
         async def announce() -> None:
             typer.echo(f"rce ui ready: {server.url}")

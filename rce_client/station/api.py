@@ -21,6 +21,22 @@ class CellRequest(_Model):
     blocked: bool
 
 
+class LoginRequest(_Model):
+    """Who wants to come in."""
+
+    userID: str = Field(max_length=256)  # noqa: N815 - its name everywhere in the protocol
+    password: str = Field(max_length=1024, repr=False)
+
+
+class PersonModel(_Model):
+    """Who asks, and what they may do."""
+
+    name: str
+    role: str = Field(description="viewer, user, operator or admin.")
+    steers: bool = Field(description="Whether robots may be sent and cells blocked.")
+    logged_in: bool = Field(description="Whether there is a login that can be ended.")
+
+
 class Answer(_Model):
     """What was done, in words."""
 

@@ -4,27 +4,30 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hmac
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
-from aiohttp import WSMsgType, hdrs, web
+from aiohttp import WSCloseCode, WSMsgType, hdrs, web
 from pydantic import BaseModel, ValidationError
 
 from rce.web.bodies import read_whole
 from rce.web.openapi import PREFIX, Operation, build_document
-from rce.web.origin import ServerNames, is_foreign
+from rce.web.origin import ServerNames
 from rce_client.station.api import (
     Answer,
     CellRequest,
     FleetModel,
     GoalRequest,
+    LoginRequest,
     MapModel,
+    PersonModel,
     Problem,
     RobotModel,
 )
+from rce_client.station.door import COOKIE, PERSON, Door, problem, set_cookie, shown_token
 from rce_client.station.fleet_link import FleetError, FleetLink, PlannerAwayError
 from rce_client.station.live import Broadcast, Page
+from rce_client.station.persons import Entrance, EntranceError, SharedToken
 from rce_client.station.view import FleetView
 
 STATIC = Path(__file__).parent / "static"
@@ -32,6 +35,8 @@ MAX_BODY = 1 << 16
 MIN_FRAME_S = 0.05
 """Least time between two batches of messages to one page."""
 HEARTBEAT_S = 20.0
+CHECK_S = 5.0
+"""How often it is looked whether the login of an open page is still good."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -43,7 +48,7 @@ class Station:
         view: What is known of the fleet.
         fleet: Carries wishes to the planner.
         pages: The open pages.
-        token: If not empty, callers must show it as a bearer token; pages as ``?token=`` of the page's URL.
+        entrance: Says who somebody is; anybody may do everything if None.
         names: By which the station may be asked for.
     """
 
@@ -53,18 +58,18 @@ class Station:
         fleet: FleetLink,
         pages: Broadcast,
         *,
-        token: str = "",
+        entrance: Entrance | None = None,
         names: ServerNames | None = None,
     ) -> None:
-        self._names = names or ServerNames()
         self._view = view
         self._fleet = fleet
         self._pages = pages
-        self._token = token
+        self._entrance = entrance or SharedToken()
+        self._door = Door(self._entrance, names or ServerNames())
 
     def make_app(self) -> web.Application:
         """Build the application."""
-        app = web.Application(middlewares=[self._guard, _problems], client_max_size=MAX_BODY)
+        app = web.Application(middlewares=[_problems, self._door.guard], client_max_size=MAX_BODY)
         for known, handler in self._operations():
             app.router.add_route(known.method, PREFIX + known.path, handler)
         document = build_document(
@@ -80,6 +85,7 @@ class Station:
 
         app.router.add_get(f"{PREFIX}/openapi.json", describe)
         app.router.add_get(f"{PREFIX}/live", self.live)
+        app.router.add_get("/login", self.login_page)
         app.router.add_get("/", self.page)
         app.router.add_static("/static", STATIC)
         return app
@@ -96,6 +102,41 @@ class Station:
                     reply=FleetModel,
                 ),
                 self.get_fleet,
+            ),
+            (
+                Operation(
+                    name="log_in",
+                    method="POST",
+                    path="/login",
+                    summary="Log in as a user of the engine; the token comes as a cookie",
+                    group="login",
+                    body=LoginRequest,
+                    status=204,
+                    open=True,
+                ),
+                self.log_in,
+            ),
+            (
+                Operation(
+                    name="log_out",
+                    method="DELETE",
+                    path="/login",
+                    summary="Make the token of this request worthless",
+                    group="login",
+                    status=204,
+                ),
+                self.log_out,
+            ),
+            (
+                Operation(
+                    name="get_person",
+                    method="GET",
+                    path="/me",
+                    summary="Who you are, and what you may do",
+                    group="fleet",
+                    reply=PersonModel,
+                ),
+                self.get_person,
             ),
             (
                 Operation(
@@ -141,6 +182,38 @@ class Station:
         del request
         return web.FileResponse(STATIC / "index.html", headers={hdrs.CACHE_CONTROL: "no-cache"})
 
+    async def login_page(self, request: web.Request) -> web.StreamResponse:
+        """The page where people log in."""
+        del request
+        return web.FileResponse(STATIC / "login.html", headers={hdrs.CACHE_CONTROL: "no-cache"})
+
+    async def log_in(self, request: web.Request) -> web.StreamResponse:
+        """Check a password at the engine; the token goes into a cookie, never to the page."""
+        who = LoginRequest.model_validate_json(await read_whole(request))
+        token = await self._entrance.log_in(who.userID, who.password, request.remote or "")
+        response = web.Response(status=204)
+        set_cookie(response, token, secure=request.secure)
+        return response
+
+    async def log_out(self, request: web.Request) -> web.StreamResponse:
+        """Make the token worthless that the request shows."""
+        await self._entrance.log_out(shown_token(request))
+        response = web.Response(status=204)
+        response.del_cookie(COOKIE)
+        return response
+
+    async def get_person(self, request: web.Request) -> web.StreamResponse:
+        """Who asks."""
+        person = request[PERSON]
+        return _reply(
+            PersonModel(
+                name=person.name,
+                role=person.role,
+                steers=person.steers,
+                logged_in=self._entrance.has_logins,
+            )
+        )
+
     async def get_fleet(self, request: web.Request) -> web.StreamResponse:
         """Everything that is known of the fleet."""
         del request
@@ -161,20 +234,31 @@ class Station:
             if robot["id"] == wanted:
                 return _reply(RobotModel(**robot))
         known = ", ".join(self._view.robot_ids()) or "none yet"
-        return _problem(404, f"there is no robot {wanted!r}; known are: {known}")
+        return problem(404, f"there is no robot {wanted!r}; known are: {known}")
 
     async def put_goal(self, request: web.Request) -> web.StreamResponse:
         """Send a robot to a cell."""
+        robot = request.match_info["robot"]
+        refusal = self._door.may_steer(request, "set_goal", robot)
+        if refusal is not None:
+            return refusal
         wish = GoalRequest.model_validate_json(await read_whole(request))
-        return _reply(Answer(message=await self._fleet.set_goal(request.match_info["robot"], wish.cell)))
+        message = await self._fleet.set_goal(robot, wish.cell)
+        self._door.note(request, "set_goal", robot, "stop" if wish.cell is None else f"cell {wish.cell}")
+        return _reply(Answer(message=message))
 
     async def put_cell(self, request: web.Request) -> web.StreamResponse:
         """Block or free a cell."""
         number = request.match_info["cell"]
         if not number.isdecimal():
-            return _problem(404, f"{number!r} is not the number of a cell")
+            return problem(404, f"{number!r} is not the number of a cell")
+        refusal = self._door.may_steer(request, "block_cell", number)
+        if refusal is not None:
+            return refusal
         wish = CellRequest.model_validate_json(await read_whole(request))
-        return _reply(Answer(message=await self._fleet.block_cell(int(number), blocked=wish.blocked)))
+        message = await self._fleet.block_cell(int(number), blocked=wish.blocked)
+        self._door.note(request, "block_cell" if wish.blocked else "free_cell", number)
+        return _reply(Answer(message=message))
 
     async def live(self, request: web.Request) -> web.StreamResponse:
         """Send a page what changes, until it goes."""
@@ -182,6 +266,7 @@ class Station:
         await socket.prepare(request)
         page = self._pages.open()
         writer = asyncio.create_task(_write(socket, page))
+        watcher = asyncio.create_task(self._close_when_out(socket, request))
         try:
             async for message in socket:
                 if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
@@ -189,30 +274,17 @@ class Station:
         finally:
             self._pages.close(page)
             writer.cancel()
-            await asyncio.gather(writer, return_exceptions=True)
+            watcher.cancel()
+            await asyncio.gather(writer, watcher, return_exceptions=True)
         return socket
 
-    # Who may come in
-
-    @web.middleware
-    async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        refusal = self._names.refusal(request.headers.get(hdrs.HOST, ""))
-        if refusal is not None:
-            return _problem(421, refusal)
-        if is_foreign(request.headers.get(hdrs.ORIGIN), request.host):
-            return _problem(403, "a page of another site may not use the station")
-        if not self._token:
-            return await handler(request)
-        shown = request.query.get("token") or request.cookies.get("rce_station", "")
-        bearer = request.headers.get(hdrs.AUTHORIZATION, "").removeprefix("Bearer ").strip()
-        if not any(hmac.compare_digest(text.encode(), self._token.encode()) for text in (shown, bearer)):
-            return _problem(401, "the station wants its token: as 'Authorization: Bearer', or ?token= once")
-        response = await handler(request)
-        if request.query.get("token") and not response.prepared:
-            response.set_cookie(
-                "rce_station", self._token, httponly=True, samesite="Strict", secure=request.secure
-            )
-        return response
+    async def _close_when_out(self, socket: web.WebSocketResponse, request: web.Request) -> None:
+        """End a page's socket when its person may not look any more."""
+        while True:
+            await asyncio.sleep(CHECK_S)
+            if not await self._door.is_still_in(request):
+                break
+        await socket.close(code=WSCloseCode.POLICY_VIOLATION, message=b"your login ended; log in again")
 
 
 async def _write(socket: web.WebSocketResponse, page: Page) -> None:
@@ -230,18 +302,16 @@ async def _problems(request: web.Request, handler: Handler) -> web.StreamRespons
         return await handler(request)
     except ValidationError as error:
         faults = [f"{'.'.join(map(str, fault['loc'])) or 'body'}: {fault['msg']}" for fault in error.errors()]
-        return _problem(400, "; ".join(faults))
+        return problem(400, "; ".join(faults))
+    except EntranceError as error:
+        return problem(error.status, str(error))
     except PlannerAwayError as error:
-        return _problem(503, str(error))
+        return problem(503, str(error))
     except FleetError as error:
-        return _problem(409, str(error))
+        return problem(409, str(error))
     except web.HTTPException as error:
-        return _problem(error.status, error.reason)
+        return problem(error.status, error.reason)
 
 
 def _reply(model: BaseModel) -> web.Response:
     return web.Response(text=model.model_dump_json(), content_type="application/json")
-
-
-def _problem(status: int, text: str) -> web.Response:
-    return web.json_response({"error": text}, status=status)

@@ -88,6 +88,26 @@ fleet.addEventListener("map", () => {
   canvas.style.aspectRatio = `${fleet.map.columns} / ${fleet.map.rows}`;
 });
 
+async function identify() {
+  const response = await fetch("/api/v1/me");
+  if (response.status === 401) return location.replace("/login");
+  if (!response.ok) return say((await response.json()).error, true);
+  const person = await response.json();
+  document.querySelector("#person").textContent = person.logged_in ? `${person.name} (${person.role})` : "";
+  document.querySelector("#logout").hidden = !person.logged_in;
+  if (!person.steers) {
+    for (const tool of [toolBlock, toolGoal]) tool.hidden = true;
+    document.querySelector("#hint").textContent = `Your role, ${person.role}, looks and does not steer.`;
+  }
+}
+
+document.querySelector("#logout").addEventListener("click", async () => {
+  await fetch("/api/v1/login", { method: "DELETE" });
+  location.replace("/login");
+});
+
+const LOGIN_ENDED = 1008;
+
 function connect(delay = 500) {
   const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/v1/live`);
   let opened = false;
@@ -100,13 +120,15 @@ function connect(delay = 500) {
     const received = JSON.parse(event.data);
     fleet.apply(received);
   });
-  socket.addEventListener("close", () => {
+  socket.addEventListener("close", ({ code }) => {
+    if (code === LOGIN_ENDED) return location.replace("/login");
     badge.textContent = "connecting";
     badge.classList.remove("live");
     setTimeout(connect, delay * (0.5 + Math.random()), opened ? 500 : Math.min(2 * delay, 8000));
   });
 }
 
+identify();
 connect();
 
 // For automated tests of the page.

@@ -10,6 +10,7 @@ from aiohttp.test_utils import TestClient, TestServer
 
 from rce_client.station.fleet_link import FleetError, FleetLink, PlannerAwayError
 from rce_client.station.live import Broadcast
+from rce_client.station.persons import SharedToken
 from rce_client.station.server import Station
 from rce_client.station.view import FleetView
 
@@ -42,7 +43,7 @@ class House:
         self.client: TestClient
 
     async def start(self, token: str = "") -> None:
-        app = Station(self.view, self.fleet, self.pages, token=token).make_app()
+        app = Station(self.view, self.fleet, self.pages, entrance=SharedToken(token)).make_app()
         self.client = TestClient(TestServer(app))
         await self.client.start_server()
 
@@ -172,6 +173,8 @@ async def test_the_document_describes_every_route(house: House) -> None:
     document = await (await house.client.get("/api/v1/openapi.json")).json()
     assert document["openapi"].startswith("3.1")
     assert set(document["paths"]) == {
+        "/api/v1/login",
+        "/api/v1/me",
         "/api/v1/fleet",
         "/api/v1/robots/{robot}",
         "/api/v1/robots/{robot}/goal",

@@ -1,0 +1,190 @@
+"""Lets the engine's users into a station: their tokens are checked at the master."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import ssl
+import time
+from collections import OrderedDict
+from dataclasses import dataclass
+from http import HTTPStatus
+from typing import Any, Self
+
+import aiohttp
+from yarl import URL
+
+from rce_client.station.persons import Action, EntranceError, Person
+
+_log = logging.getLogger(__name__)
+
+FRESH_S = 3.0
+"""How long an answer of the master counts; a revoked token is worth nothing after that."""
+STALE_S = 30.0
+"""How long it counts while the master cannot be reached."""
+LIFETIME_S = 12 * 3600.0
+"""Of a login at the page."""
+MAX_KNOWN = 1000
+MAX_NOTES = 1000
+_TIMEOUT = aiohttp.ClientTimeout(total=10)
+
+
+@dataclass(frozen=True, slots=True)
+class EngineAccount:
+    """The user that the station itself works as."""
+
+    url: str
+    """Of the master."""
+    user: str
+    password: str
+    tls: ssl.SSLContext | None = None
+
+    def __repr__(self) -> str:
+        return f"EngineAccount(url={self.url!r}, user={self.user!r})"
+
+
+class EngineEntrance:
+    """Asks the master whose a token is. Use it as an asynchronous context manager.
+
+    Args:
+        account: Of the station; the fleet is this user's.
+        open: Whether who shows no token is taken for the station's own user: for trials on one machine.
+    """
+
+    def __init__(self, account: EngineAccount, *, open: bool = False) -> None:  # noqa: A002 - as a door is
+        self._account = account
+        self._api = URL(account.url) / "api/v1"
+        self._open = open
+        self._known: OrderedDict[str, tuple[float, Person | None]] = OrderedDict()
+        self._notes: asyncio.Queue[tuple[str, Action]] = asyncio.Queue(MAX_NOTES)
+        self._own = ""
+        self._session: aiohttp.ClientSession
+        self._writer: asyncio.Task[None]
+
+    @property
+    def has_logins(self) -> bool:
+        """Whether people log in here by name and password."""
+        return not self._open
+
+    async def __aenter__(self) -> Self:
+        """Begin; the master need not be there."""
+        tls = self._account.tls
+        connector = aiohttp.TCPConnector(ssl=True if tls is None else tls)
+        self._session = aiohttp.ClientSession(timeout=_TIMEOUT, connector=connector)
+        self._writer = asyncio.create_task(self._write_notes())
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Give the station's own token back."""
+        self._writer.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await self._writer
+        if self._own:
+            await self.log_out(self._own)
+        await self._session.close()
+
+    async def who(self, token: str) -> Person | None:
+        """Return whose token it is.
+
+        Raises:
+            EntranceError: The master cannot be reached.
+        """
+        if not token:
+            return Person(self._account.user, "operator", owns=True) if self._open else None
+        now = time.monotonic()
+        asked, known = self._known.get(token, (0.0, None))
+        if token in self._known and now - asked < FRESH_S:
+            return known
+        try:
+            person = await self._ask(token)
+        except (aiohttp.ClientError, TimeoutError) as error:
+            if token in self._known and known is not None and now - asked < STALE_S:
+                return known
+            raise EntranceError(
+                503, f"the engine cannot be reached, so nobody's login can be checked; try again ({error})"
+            ) from error
+        self._known[token] = (now, person)
+        self._known.move_to_end(token)
+        if len(self._known) > MAX_KNOWN:
+            self._known.popitem(last=False)
+        return person
+
+    async def log_in(self, user: str, password: str, address: str) -> str:
+        """Return a token for a user.
+
+        Raises:
+            EntranceError: The password is wrong, the user may not see the fleet, or the master is away.
+        """
+        body = {"userID": user, "password": password, "label": "station page", "lifetime": LIFETIME_S}
+        headers = {"X-Forwarded-For": address} if address else {}
+        try:
+            token = await self._log_in(body, headers)
+            person = await self.who(token)
+        except (aiohttp.ClientError, TimeoutError) as error:
+            raise EntranceError(503, f"the engine cannot be reached; try again ({error})") from error
+        if person is None or not person.sees:
+            await self.log_out(token)
+            raise EntranceError(403, f"user {user!r} may not see this fleet; an administrator gives the role")
+        return token
+
+    async def log_out(self, token: str) -> None:
+        """Make a token worthless."""
+        self._known.pop(token, None)
+        try:
+            async with self._session.delete(self._api / "login", headers=_bearer(token)):
+                pass  # that it is worthless already is as good
+        except (aiohttp.ClientError, TimeoutError) as error:
+            _log.warning("a token was not given back, it expires by itself: %s", error)
+
+    def note(self, token: str, action: Action) -> None:
+        """Have an action written into the engine's audit log; never waits."""
+        try:
+            self._notes.put_nowait((token, action))
+        except asyncio.QueueFull:
+            _log.warning("not in the audit log, too much waits: %s %s", action.name, action.subject)
+
+    async def _ask(self, token: str) -> Person | None:
+        async with self._session.get(self._api / "user", headers=_bearer(token)) as reply:
+            if reply.status in (HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN):
+                return None
+            reply.raise_for_status()
+            found: dict[str, Any] = await reply.json()
+        return Person(found["name"], found["role"], owns=found["name"] == self._account.user)
+
+    async def _log_in(self, body: dict[str, Any], headers: dict[str, str]) -> str:
+        async with self._session.post(self._api / "login", json=body, headers=headers) as reply:
+            answer = await reply.json()
+            if reply.status != HTTPStatus.OK:
+                raise EntranceError(reply.status, str(answer.get("error", reply.reason)))
+            return str(answer["token"])
+
+    async def _write_notes(self) -> None:
+        while True:
+            token, action = await self._notes.get()
+            try:
+                await self._write_note(token, action)
+            except (aiohttp.ClientError, TimeoutError, EntranceError) as error:
+                _log.warning("not in the audit log: %s %s: %s", action.name, action.subject, error)
+
+    async def _write_note(self, token: str, action: Action) -> None:
+        if not token and not self._own:
+            account = self._account
+            body = {"userID": account.user, "password": account.password, "label": "operator station"}
+            self._own = await self._log_in(body, {})
+        note = {
+            "action": action.name,
+            "subject": action.subject[:300],
+            "detail": action.detail[:300],
+            "address": action.address,
+            "outcome": "done" if action.done else "refused",
+        }
+        headers = _bearer(token or self._own)
+        async with self._session.post(self._api / "audit", json=note, headers=headers) as reply:
+            if reply.status == HTTPStatus.UNAUTHORIZED and not token:
+                self._own = ""
+            reply.raise_for_status()
+
+
+def _bearer(token: str) -> dict[str, str]:
+    return {"Authorization": f"Bearer {token}"}

@@ -1,0 +1,193 @@
+"""The engine's users at a station: API, page and audit log, against a real master."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+from aiohttp.test_utils import TestServer
+from support.engine import until
+from support.master_program import master
+
+from rce_client.station import server as station_server
+from rce_client.station.engine_entrance import FRESH_S, EngineAccount, EngineEntrance
+from rce_client.station.live import Broadcast
+from rce_client.station.server import Station
+from rce_client.station.view import FleetView
+
+pytestmark = pytest.mark.timeout(180)
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+ROLES = ("viewer", "user", "operator", "admin")
+
+
+class RecordingFleet:
+    """Takes wishes in place of a planner."""
+
+    def __init__(self) -> None:
+        self.wishes: list[tuple[Any, ...]] = []
+
+    async def set_goal(self, robot: str, cell: int | None) -> str:
+        self.wishes.append((robot, cell))
+        return "done"
+
+    async def block_cell(self, cell: int, *, blocked: bool) -> str:
+        self.wishes.append((cell, blocked))
+        return "done"
+
+
+class Site:
+    """A master with a user of each role, and a station of testUser's fleet."""
+
+    def __init__(self, url: str, session: aiohttp.ClientSession) -> None:
+        self.url = url
+        self.session = session
+        self.fleet = RecordingFleet()
+        self.station = ""
+        self.tokens: dict[str, str] = {}
+
+    async def master(
+        self, method: str, path: str, body: Any = None, *, token: str = "", status: int = 200
+    ) -> Any:
+        headers = {"Authorization": f"Bearer {token or self.tokens['testUser']}"} if self.tokens else {}
+        async with self.session.request(
+            method, f"{self.url}api/v1{path}", json=body, headers=headers
+        ) as reply:
+            assert reply.status == status, await reply.text()
+            return await reply.json() if reply.status in (200, 201) else None
+
+    async def log_in(self, user: str, password: str) -> None:
+        body = {"userID": user, "password": password}
+        self.tokens[user] = (await self.master("POST", "/login", body))["token"]
+
+    async def steer(self, token: str) -> int:
+        headers = {"Authorization": f"Bearer {token}"} if token else {}
+        url = f"{self.station}api/v1/robots/Robot1/goal"
+        async with self.session.put(url, json={"cell": 7}, headers=headers) as reply:
+            return reply.status
+
+    async def look(self, token: str) -> int:
+        headers = {"Authorization": f"Bearer {token}"} if token else {}
+        async with self.session.get(f"{self.station}api/v1/fleet", headers=headers) as reply:
+            return reply.status
+
+
+@contextlib.asynccontextmanager
+async def running_site(folder: Path, *, open_: bool = False) -> AsyncIterator[Site]:
+    async with (
+        master(folder, "--dev") as url,
+        aiohttp.ClientSession(cookie_jar=aiohttp.DummyCookieJar()) as session,
+        EngineEntrance(EngineAccount(url, "testUser", "testUser"), open=open_) as entrance,
+    ):
+        site = Site(url, session)
+        await site.log_in("testUser", "testUser")
+        for role in ROLES:
+            await site.master("POST", "/users", {"name": role, "password": "pw", "role": role}, status=201)
+            await site.log_in(role, "pw")
+        app = Station(FleetView(), site.fleet, Broadcast(), entrance=entrance).make_app()  # type: ignore[arg-type]  # as wide as what is called
+        async with TestServer(app) as server:
+            site.station = str(server.make_url("/"))
+            yield site
+
+
+async def test_roles_at_station_and_audit(tmp_path: Path) -> None:
+    async with running_site(tmp_path) as site:
+        expected = {
+            "viewer": (200, 403),
+            "user": (403, 403),  # of another fleet
+            "operator": (200, 200),
+            "admin": (200, 200),
+            "testUser": (200, 200),  # whose fleet it is
+        }
+        found = {who: (await site.look(token), await site.steer(token)) for who, token in site.tokens.items()}
+        assert found == expected
+        assert await site.look("") == await site.look("rce_guess") == 401
+        assert site.fleet.wishes == [("Robot1", 7)] * 3
+        robot = (await site.master("POST", "/robot-tokens", {"robot": "R1"}, status=201))["token"]
+        assert await site.look(robot) == 401, "a robot's token is for robots"
+
+        async def noted() -> list[tuple[str, str, str]]:
+            records = (await site.master("GET", "/audit?since=-1000"))["records"]
+            return [(r["user"], r["detail"], r["outcome"]) for r in records if r["action"] == "set_goal"]
+
+        wanted = {
+            ("viewer", "", "refused"),
+            ("operator", "cell 7", "done"),
+            ("admin", "cell 7", "done"),
+            ("testUser", "cell 7", "done"),
+        }
+
+        async def complete() -> bool:
+            return set(await noted()) == wanted
+
+        await until(complete, what="the station's actions are in the audit log")
+
+
+async def test_revoked_token_ends_open_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(station_server, "CHECK_S", 0.2)
+    async with running_site(tmp_path) as site:
+        headers = {"Authorization": f"Bearer {site.tokens['operator']}"}
+        async with site.session.ws_connect(f"{site.station}api/v1/live", headers=headers) as socket:
+            (token,) = (await site.master("GET", "/tokens?user=operator"))["tokens"]
+            await site.master("DELETE", f"/tokens/{token['id']}?user=operator", status=204)
+            while (message := await socket.receive(timeout=FRESH_S + 60)).type != aiohttp.WSMsgType.CLOSE:
+                assert message.type is aiohttp.WSMsgType.TEXT
+        assert (message.data, message.extra) == (1008, "your login ended; log in again")
+        assert await site.steer(site.tokens["operator"]) == 401
+
+
+async def test_open_station_acts_as_its_user(tmp_path: Path) -> None:
+    """On loopback nobody logs in; what is done counts as done by the station's user."""
+    async with running_site(tmp_path, open_=True) as site:
+        assert await site.steer("") == 200
+        assert await site.steer(site.tokens["viewer"]) == 403
+
+        async def noted() -> bool:
+            records = (await site.master("GET", "/audit?since=-1000"))["records"]
+            return any(r["action"] == "set_goal" and r["user"] == "testUser" for r in records)
+
+        await until(noted, what="the action is in the audit log")
+
+
+@pytest.mark.needs("chromium")
+async def test_page_asks_for_login(tmp_path: Path) -> None:
+    """A viewer logs in at the page, looks, cannot steer, and logs out; a wrong password is told."""
+    from playwright.async_api import async_playwright
+
+    async with running_site(tmp_path) as site, async_playwright() as playwright:
+        browser = await playwright.chromium.launch(
+            executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu", "--no-first-run"]
+        )
+        try:
+            page = await browser.new_page()
+            page.set_default_timeout(60_000)
+            await page.goto(site.station)
+            await page.fill("#user", "viewer")
+            await page.fill("#password", "wrong")
+            await page.click("button[type=submit]")
+            await page.wait_for_function(
+                "document.querySelector('#message').textContent.includes('password')"
+            )
+            await page.fill("#password", "pw")
+            await page.click("button[type=submit]")
+            await page.wait_for_function("document.querySelector('#link')?.textContent === 'live'")
+            await page.wait_for_function(
+                "document.querySelector('#person').textContent === 'viewer (viewer)'"
+            )
+            assert not await page.is_visible("#tool-block")
+            assert "rce_" not in await page.evaluate("document.cookie"), "no script reads the token"
+            status = await page.evaluate(
+                "fetch('/api/v1/cells/7', {method: 'PUT', body: '{\"blocked\": true}'}).then(r => r.status)"
+            )
+            assert status == 403
+            await page.click("#logout")
+            await page.wait_for_selector("#login")
+            assert await page.evaluate("fetch('/api/v1/fleet').then(r => r.status)") == 401
+        finally:
+            await browser.close()
+    assert site.fleet.wishes == []
