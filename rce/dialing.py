@@ -10,6 +10,9 @@ from __future__ import annotations
 import asyncio
 import socket
 from typing import Any
+from urllib.parse import urlsplit
+
+_PORTS = {"https": 443, "wss": 443}
 
 Address = tuple[socket.AddressFamily, Any]
 """Family and socket address."""
@@ -48,6 +51,19 @@ async def open_socket(host: str, port: int) -> socket.socket:
         OSError: The name cannot be resolved (``socket.gaierror``), or nobody answers.
     """
     return await connect_first(await resolve(host, port))
+
+
+async def open_url_socket(url: str) -> socket.socket:
+    """Connect to the host of a WebSocket or HTTP URL as :func:`open_socket` does.
+
+    Raises:
+        OSError: The name cannot be resolved (``socket.gaierror``), or nobody answers.
+        ValueError: The URL names no host, or its port is not a number.
+    """
+    parts = urlsplit(url)
+    if not parts.hostname:
+        raise ValueError(f"{url!r} names no host")
+    return await open_socket(parts.hostname, parts.port or _PORTS.get(parts.scheme, 80))
 
 
 async def connect_first(addresses: list[Address]) -> socket.socket:

@@ -13,6 +13,7 @@ from urllib.parse import urlencode, urlsplit, urlunsplit
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
 
+from rce.dialing import open_url_socket
 from rce.protocol.limits import Limits
 from rce.protocol.stream import ProtocolStream
 from rce_client.backoff import Backoff, judge
@@ -203,8 +204,11 @@ class Courier:
         )
         parts = urlsplit(found.url)
         query, headers = target.handshake(header=found.takes_header)
+        async with asyncio.timeout(timing.open):
+            sock = await open_url_socket(found.url)
         socket = await connect(
             urlunsplit(parts._replace(query=query)),
+            sock=sock,
             additional_headers=headers,
             ssl=(target.tls or True) if parts.scheme == "wss" else None,
             compression=None,  # costs more time than it saves for all but slow links

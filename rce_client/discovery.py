@@ -14,6 +14,7 @@ from urllib.parse import urlencode, urlsplit
 
 import h11
 
+from rce.dialing import open_socket
 from rce_client.backoff import judge, judge_status
 from rce_client.exceptions import RefusedError, UnavailableError
 
@@ -68,8 +69,11 @@ async def locate(
     target = f"{parts.path or '/'}?{urlencode({'userID': user, 'version': version, 'auth': 'bearer'})}"
     try:
         async with asyncio.timeout(timeout):
+            is_https = parts.scheme == "https"
             reader, writer = await asyncio.open_connection(
-                parts.hostname, port, ssl=(tls or True) if parts.scheme == "https" else None
+                sock=await open_socket(parts.hostname, port),
+                ssl=(tls or True) if is_https else None,
+                server_hostname=parts.hostname if is_https else None,
             )
             try:
                 status, body = await _get(reader, writer, parts.netloc.rpartition("@")[2], target)

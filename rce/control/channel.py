@@ -30,6 +30,7 @@ from rce.control.messages import (
     encode,
 )
 from rce.control.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, MAX_QUEUED, MAX_TEXT, ControlTimeouts
+from rce.dialing import open_url_socket
 from rce.tls.exceptions import CertificateError
 from rce.tls.faults import explain_to_client
 
@@ -194,8 +195,11 @@ class TaskSetChannel:
     async def _connect_once(self) -> float:
         """Run one connection to its end; return how long to wait before the next, in seconds."""
         try:
+            async with asyncio.timeout(self._timeouts.open):
+                sock = await open_url_socket(self._url)
             async with connect(
                 self._url,
+                sock=sock,
                 additional_headers={"Authorization": f"Bearer {self._secret.reveal()}"},
                 ssl=None if self._tls is None else self._tls(),
                 compression=None,

@@ -24,11 +24,11 @@ from rce.ros.tcpros.header import ANY, check_type, decode_header, encode_header,
 if TYPE_CHECKING:
     from rce.ros.types import Message, ServiceType
 
-MAX_IDLE = 8
-"""How many idle connections a client keeps."""
-
 MAX_ACTIVE = 64
 """How many calls of one client are under way at once; more wait."""
+
+MAX_IDLE = MAX_ACTIVE
+"""How many idle connections a client keeps: one for each call of a burst, so that the next makes none."""
 
 
 class ServiceClient:

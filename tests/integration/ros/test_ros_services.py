@@ -34,6 +34,31 @@ async def test_calls(make_node: MakeNode, persistent: bool) -> None:
         assert service.calls == 2
 
 
+async def test_bursts_make_no_new_connections(make_node: MakeNode, core: Core) -> None:
+    """Each connection begins with a look-up of the provider, which the core counts."""
+    async with make_node("a") as a, make_node("b") as b:
+        all_there = asyncio.Barrier(40)
+
+        async def meet(request: Any) -> dict[str, Any]:
+            await all_there.wait()
+            return switch(request)
+
+        service = await a.advertise_service("switch", SET_BOOL, meet)
+        client = b.service_client("switch", SET_BOOL)
+        looked_up: list[str] = []
+        find = core.graph.service
+
+        def counting(name: str) -> str | None:
+            looked_up.append(name)
+            return find(name)
+
+        core.graph.service = counting  # type: ignore[method-assign]  # the real one answers
+        for _ in range(3):
+            await asyncio.gather(*(client.call({"data": True}, timeout=20) for _ in range(40)))
+        assert service.calls == 120
+        assert len(looked_up) <= 40
+
+
 async def test_requests_and_responses_of_any_size(make_node: MakeNode) -> None:
     async with make_node("a") as a, make_node("b") as b:
 
