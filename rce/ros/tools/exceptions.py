@@ -1,0 +1,7 @@
+"""What can go wrong in the tools."""
+
+from __future__ import annotations
+
+
+class ToolError(Exception):
+    """The command cannot be done; its text says why and what to do."""
