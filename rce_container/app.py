@@ -20,6 +20,7 @@ from rce.config.resources import examples_dir
 from rce.config.secret import Secret
 from rce.control.channel import TaskSetChannel
 from rce.control.contents import ContentClient
+from rce.control.dialing import RunDialer
 from rce.control.limits import MEMORY_PER_SLOT
 from rce.control.messages import MachineInfo
 from rce.link.address import in_url, is_any, own_address
@@ -119,8 +120,12 @@ class App:
                     links=(reach, port),
                     limiter=limiter,
                     library=library,
+                    dialer=RunDialer(self._control_url(tls), self.secret, tls=tls),
                 )
                 await self._manage(manager, tls, quitting.of(manager), lambda: ready(name, runtime.name))
+
+    def _control_url(self, tls: Context | None) -> str:
+        return f"{'ws' if tls is None else 'wss'}://{in_url(self.master)}:{self.control_port}"
 
     def _library(self, state: StateFolder, tls: Context | None) -> Library:
         """Where packages that users bring come from. Blocks."""
@@ -134,8 +139,7 @@ class App:
     async def _manage(
         self, manager: Manager, tls: Context | None, quit_: asyncio.Event, ready: Callable[[], None]
     ) -> None:
-        url = f"{'ws' if tls is None else 'wss'}://{in_url(self.master)}:{self.control_port}"
-        channel = TaskSetChannel(url, self.secret, manager.hello, manager.handle, tls=tls)
+        channel = TaskSetChannel(self._control_url(tls), self.secret, manager.hello, manager.handle, tls=tls)
         manager.send = channel.send
         async with asyncio.TaskGroup() as tasks:
             dialing: list[asyncio.Task[None]] = []

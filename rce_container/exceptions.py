@@ -7,6 +7,7 @@ ContainerError
 ├── KillError                 a container could not be ended
 ├── LimitError                a limit of a container could not be put in force
 ├── LimitsUnavailableError    a way to enforce limits does not work on this machine
+├── ExecutionError            a command cannot be run in a container
 └── StateError                the state directory cannot be used
 """
 
@@ -47,6 +48,10 @@ class LimitError(ContainerError):
 
 class LimitsUnavailableError(ContainerError):
     """A way to enforce limits does not work on this machine; the text says why."""
+
+
+class ExecutionError(ContainerError):
+    """A command cannot be run in a container; the text says why."""
 
 
 class StateError(ContainerError):

@@ -15,6 +15,7 @@ import msgspec
 from msgspec.structs import asdict, replace
 
 from rce.control.model import EndpointState, EndpointStatus, InterfaceUsage, LinkAddress, NodeStatus
+from rce.control.tags import Unknown
 from rce.protocol.names import is_name
 from rce.protocol.printable import one_line
 from rce_container.environment import messages as m
@@ -43,17 +44,16 @@ PER_LOOK = 100_000
 """The same for one that makes the manager look for processes."""
 
 
-def read(line: bytes) -> m.ToManager:
+def read(line: bytes) -> m.ToManager | Unknown:
     """Read a message of an environment.
 
     Raises:
         msgspec.DecodeError: It is none.
     """
     try:
-        message: m.ToManager = m.decode_to_manager(line)
+        return m.decode_to_manager(line)
     except (RecursionError, UnicodeError) as error:
         raise msgspec.DecodeError(str(error)) from error
-    return message
 
 
 def sound_text(text: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import socket
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -12,9 +13,12 @@ from typing import TYPE_CHECKING
 
 import psutil
 
+from rce.control.execution import FEATURE as EXEC
+from rce.control.execution import Command
 from rce.control.messages import (
     CONTROL_VERSION,
     Drop,
+    Execute,
     Hello,
     LogChunk,
     MachineInfo,
@@ -35,7 +39,8 @@ from rce_container.environment import proc
 from rce_container.environment.channel import connect
 from rce_container.environment.exceptions import ChannelError
 from rce_container.environment.process import strike_all
-from rce_container.exceptions import ContainerError, NetworkError, StateError
+from rce_container.exceptions import ContainerError, ExecutionError, NetworkError, StateError
+from rce_container.executions import Executions
 from rce_container.folder import ContainerFolder
 from rce_container.launcher import Launcher
 from rce_container.life import Phase
@@ -49,6 +54,7 @@ from rce_container.unit import Office, Unit
 from rce_container.usage import Subject, UsageMeter
 
 if TYPE_CHECKING:
+    from rce.control.dialing import RunDialer
     from rce.link.handover import Doorman
     from rce_container.folder import StateFolder
     from rce_container.limits import Limiter
@@ -72,6 +78,7 @@ class Manager:
         links: Host and port where it does.
         limiter: Enforces the containers' limits.
         library: Gives packages that users bring.
+        dialer: Connects to the master for commands that users run.
 
     Attributes:
         send: Sends a message to the master, or drops it while there is none.
@@ -90,6 +97,7 @@ class Manager:
         links: tuple[str, int],
         limiter: Limiter,
         library: Library,
+        dialer: RunDialer,
     ) -> None:
         self._name = name
         self._info = info
@@ -118,6 +126,7 @@ class Manager:
             archive=state.archive,
             library=library,
         )
+        self._executions = Executions(dialer, self._execute)
         self._units: dict[str, Unit] = {}
         """All lives of which something may be left, by mark."""
         self._queue: deque[str] = deque()
@@ -139,6 +148,7 @@ class Manager:
             process=self._name,
             machine=self._info,
             endpoints=self._core.statuses,
+            features=(EXEC,),
         )
 
     async def handle(self, message: ToTaskSet) -> None:
@@ -152,8 +162,17 @@ class Manager:
                 self._feed(events.Sync(specs))
             case ReadLog():
                 self._log_reads.take(message)
+            case Execute(id=id_):
+                self._tasks.create_task(self._executions.execute(message), name=f"command in {id_}")
             case _:
                 log.debug("not for a container task set: %s", type(message).__name__)
+
+    def _execute(self, id_: str, command: Command, sock: socket.socket) -> None:
+        container = self._core.containers.get(id_)
+        unit = self._units.get(container.mark) if container is not None else None
+        if unit is None:
+            raise ExecutionError("the container is not running here")
+        unit.execute(command, sock)
 
     @property
     def statuses(self) -> tuple[EndpointStatus, ...]:

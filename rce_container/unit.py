@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import msgspec
 
+from rce.control.execution import FEATURE as EXEC
+from rce.control.execution import Command
 from rce.control.model import EndpointSpec, EndpointStatus, LinkAddress, NodeStatus
 from rce.link.handover import Doorman, HandoverSender
 from rce.link.tasks import TaskScope
@@ -25,7 +27,14 @@ from rce_container.environment import messages as m
 from rce_container.environment import proc
 from rce_container.environment.channel import Channel, connect
 from rce_container.environment.exceptions import ChannelError
-from rce_container.exceptions import KillError, LimitError, NetworkError, StartError, StateError
+from rce_container.exceptions import (
+    ExecutionError,
+    KillError,
+    LimitError,
+    NetworkError,
+    StartError,
+    StateError,
+)
 from rce_container.folder import ContainerFolder
 from rce_container.limits.warden import Warden
 from rce_container.logs import last_line
@@ -92,6 +101,7 @@ class Unit:
         self._spec: EndpointSpec | None = None
         self._pids: dict[int, int] = {}
         self._deadline: asyncio.Timeout | None = None
+        self._features: frozenset[str] = frozenset()
         self._stopping = False
         self._stop_reason = ""
         self._hurry = False
@@ -132,6 +142,24 @@ class Unit:
     def _tell_of_arrival(self) -> None:
         if self._channel is not None:
             self._channel.send(m.encode(m.Shelved()))
+
+    def execute(self, command: Command, sock: socket.socket) -> None:
+        """Have the environment run a command (:mod:`rce.control.execution`).
+
+        Args:
+            command: The command.
+            sock: What the environment is to talk to; the caller closes its copy.
+
+        Raises:
+            ExecutionError: The environment cannot do it.
+        """
+        if self._channel is None or self._stopping or not self.reported.is_set():
+            raise ExecutionError("the container is not running")
+        if EXEC not in self._features:
+            raise ExecutionError(
+                "the container was started by an earlier release; destroy and create it anew"
+            )
+        self._channel.send(m.encode(m.Execute(command=command)), sock.fileno())
 
     def poll(self) -> None:
         """Ask for new :attr:`counters`, and tell of limits that struck."""
@@ -242,7 +270,8 @@ class Unit:
         while (line := await channel.receive()) is not None:
             pace.pay(intake.PER_LINE + len(line))
             match intake.read(line):
-                case m.Report(status=status):
+                case m.Report(status=status, features=features):
+                    self._features = frozenset(features) & {EXEC}
                     self._report(self._sound(status), pace)
                 case m.Fault(text=text):
                     pace.pay(intake.PER_FAULT)

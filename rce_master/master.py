@@ -22,6 +22,7 @@ from rce_master.bundles.office import PackageOffice
 from rce_master.desk import Desk
 from rce_master.events import EventLog
 from rce_master.exceptions import MasterError
+from rce_master.executions import Executions
 from rce_master.http.routes import Services
 from rce_master.http.server import make_app
 from rce_master.quotas import Quotas
@@ -111,18 +112,19 @@ class Master:
         self._contents = ContentStore(self._settings.state_dir / "bundles")
         packages = PackageOffice(realm, self._contents)
         services = Services(
-            realm,
-            reconciler,
-            authenticator,
-            events,
-            time.time,
-            lifetime,
-            packages,
-            tokens,
-            quotas,
-            audit,
-            self._settings.dev,
-            TrustedProxies(self._settings.trusted_proxies),
+            realm=realm,
+            reconciler=reconciler,
+            authenticator=authenticator,
+            events=events,
+            clock=time.time,
+            token_lifetime=lifetime,
+            packages=packages,
+            tokens=tokens,
+            proxies=TrustedProxies(self._settings.trusted_proxies),
+            executions=Executions(),
+            quotas=quotas,
+            dev=self._settings.dev,
+            audit=audit,
         )
         try:
             async with asyncio.TaskGroup() as group:
@@ -163,6 +165,7 @@ class Master:
             port=settings.control_port,
             contents=self._contents.read,
             tls=for_task_sets.mutual_server if for_task_sets else None,
+            on_execution=services.executions.arrived,
         )
         http = HttpServer(app, settings.bind, settings.http_port, for_clients.server if for_clients else None)
         if for_clients is None or for_task_sets is None:

@@ -23,7 +23,7 @@ from rce.control.messages import (
     ToTaskSet,
     Usage,
 )
-from rce_master.exceptions import Refused
+from rce_master.exceptions import NotFound, Refused, TaskSetAway
 from rce_master.logs import LogReader, LogRequest, read_log
 from rce_master.state import commands
 from rce_master.state.lifecycle import RobotSession
@@ -44,6 +44,10 @@ class Peer(LogReader, Protocol):
     @property
     def process(self) -> str:
         """Its name."""
+
+    @property
+    def features(self) -> frozenset[str]:
+        """What it can do that one of an earlier release could not."""
 
     def send(self, message: ToTaskSet) -> None:
         """Send a message; one that does not get through is made up for by the next ``Sync``."""
@@ -127,6 +131,22 @@ class Reconciler:
         """
         request = LogRequest(id_, node, offset, limit, wish)
         return await read_log(self._realm.tables, self._peers, request)
+
+    def task_set_of(self, id_: str) -> Peer:
+        """Return the connected task set of a container.
+
+        Raises:
+            NotFound: There is no such container.
+            TaskSetAway: Its task set is not connected, or it waits for a machine.
+        """
+        container = self._realm.tables.container(id_)
+        tag = id_.partition("/")[2]
+        if container is None:
+            raise NotFound(f"there is no container {tag!r}")
+        peer = self._peers.get(container.task_set)
+        if peer is None:
+            raise TaskSetAway(f"container {tag!r} cannot be reached now")
+        return peer
 
     @property
     def usage(self) -> Mapping[str, Usage]:

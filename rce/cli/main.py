@@ -1,21 +1,33 @@
 """Puts the ``rce`` program together from the commands that the packages plug in.
 
 A package adds a command by an entry point of the group ``rce.commands``: the entry point's name is the
-command, its value a function or a :class:`typer.Typer` of subcommands. So ``rce`` imports nothing above it.
+command, its value a function, a :class:`Plugged` or a :class:`typer.Typer` of subcommands. So ``rce`` imports
+nothing above it.
 """
 
 from __future__ import annotations
 
 import sys
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import typer
 
 from rce import __version__
 from rce.extras import missing_for
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
 GROUP = "rce.commands"
+
+
+class Plugged(NamedTuple):
+    """A command that reads its command line in a way of its own."""
+
+    function: Callable[..., None]
+    settings: dict[str, Any]
+    """For :class:`click.Context`, such as ``allow_interspersed_args``."""
 
 
 def _version(asked: bool) -> None:
@@ -50,6 +62,8 @@ def build_app(points: list[EntryPoint]) -> typer.Typer:
             continue
         if isinstance(plugged, typer.Typer):
             app.add_typer(plugged, name=point.name)
+        elif isinstance(plugged, Plugged):
+            app.command(name=point.name, context_settings=plugged.settings)(plugged.function)
         else:
             app.command(name=point.name)(plugged)
     return app

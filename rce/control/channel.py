@@ -29,6 +29,7 @@ from rce.control.messages import (
     decode_to_task_set,
     encode,
 )
+from rce.control.tags import Unknown
 from rce.control.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, MAX_QUEUED, MAX_TEXT, ControlTimeouts
 from rce.dialing import open_url_socket
 from rce.tls.exceptions import CertificateError
@@ -279,8 +280,10 @@ class TaskSetChannel:
                 return
             await self._take(message)
 
-    async def _take(self, message: ToTaskSet) -> None:
+    async def _take(self, message: ToTaskSet | Unknown) -> None:
         match message:
+            case Unknown(name=name):
+                _log.info("the master sent a %s, which this release does not know", name)
             case Welcome():
                 _log.info("connected to master %s at %s", message.master, self._url)
                 self._failures = 0

@@ -3,6 +3,11 @@
 A task set dials the master and sends :class:`Hello`. The master answers :class:`Welcome` and
 :class:`Sync` with all that it desires there, and from then on single :class:`Put` and :class:`Drop`.
 Messages with a ``request`` number are answered by the reply with the same number.
+
+Programs of two releases that follow each other talk to one another: the master takes task sets of this
+version and of the one before. What is added later is either a field with a default, which the other side
+passes over, or a message that is sent only to a peer whose ``features`` name it. A message that is not known
+is passed over too.
 """
 
 from __future__ import annotations
@@ -13,6 +18,7 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
+from rce.control.execution import Command
 from rce.control.logs import LogWish
 from rce.control.model import (
     EndpointSpec,
@@ -20,8 +26,11 @@ from rce.control.model import (
     EndpointUsage,
     LinkAddress,
 )
+from rce.control.tags import Unknown, names_of, unknown
 
-CONTROL_VERSION = 1
+CONTROL_VERSION = 2
+ACCEPTED_VERSIONS = (1, CONTROL_VERSION)
+"""Of task sets: a new master works with those that are not upgraded yet."""
 
 
 class TaskSetKind(Enum):
@@ -80,6 +89,9 @@ class Hello(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """All that is there now."""
     bearer: bool = False
     """Robot task sets: whether robots may show their credential in the header ``Authorization``."""
+    features: tuple[str, ...] = ()
+    """What this task set can do that one of an earlier release could not, such as
+    :data:`rce.control.execution.FEATURE`."""
 
 
 class Status(_Message, frozen=True, kw_only=True, omit_defaults=True):
@@ -248,8 +260,20 @@ class ReadLog(_Message, frozen=True, kw_only=True, omit_defaults=True):
     wish: LogWish = LogWish()
 
 
+class Execute(_Message, frozen=True, kw_only=True, omit_defaults=True):
+    """Run a command in a container, and dial for it (:mod:`rce.control.execution`)."""
+
+    id: str
+    """Endpoint id of the container."""
+    run: str
+    """Names the run, 32 hexadecimal digits."""
+    command: Command
+
+
 ToMaster = Hello | Status | Gone | Fault | Usage | Login | Left | ClientRequest | LogChunk
-ToTaskSet = Welcome | Refused | Sync | Put | Drop | Notify | Probe | LoginReply | ClientReply | ReadLog
+ToTaskSet = (
+    Welcome | Refused | Sync | Put | Drop | Notify | Probe | LoginReply | ClientReply | ReadLog | Execute
+)
 
 _encoder = msgspec.json.Encoder()
 _to_master: msgspec.json.Decoder[ToMaster] = msgspec.json.Decoder(ToMaster)
@@ -261,19 +285,35 @@ def encode(message: ToMaster | ToTaskSet) -> str:
     return _encoder.encode(message).decode()
 
 
-def decode_to_master(text: str | bytes) -> ToMaster:
+_NAMES_TO_MASTER = names_of(ToMaster)
+_NAMES_TO_TASK_SET = names_of(ToTaskSet)
+
+
+def decode_to_master(text: str | bytes) -> ToMaster | Unknown:
     """Read a message that came from a task set.
 
     Raises:
         msgspec.ValidationError: It is none; the text names the place.
     """
-    return _to_master.decode(text)
+    try:
+        return _to_master.decode(text)
+    except msgspec.ValidationError:
+        later = unknown(text, _NAMES_TO_MASTER)
+        if later is None:
+            raise
+        return later
 
 
-def decode_to_task_set(text: str | bytes) -> ToTaskSet:
+def decode_to_task_set(text: str | bytes) -> ToTaskSet | Unknown:
     """Read a message that came from the master.
 
     Raises:
         msgspec.ValidationError: It is none; the text names the place.
     """
-    return _to_task_set.decode(text)
+    try:
+        return _to_task_set.decode(text)
+    except msgspec.ValidationError:
+        later = unknown(text, _NAMES_TO_TASK_SET)
+        if later is None:
+            raise
+        return later

@@ -47,6 +47,11 @@ class Peer:
         """Which kind of task set it is."""
         return self.hello.kind
 
+    @property
+    def features(self) -> frozenset[str]:
+        """What it can do that a task set of an earlier release could not."""
+        return frozenset(self.hello.features)
+
     def send(self, message: ToTaskSet) -> None:
         """Send a message; never blocks. A peer that is too far behind is cut off and will say Hello again."""
         if self._left:

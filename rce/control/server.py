@@ -13,7 +13,9 @@ from websockets.exceptions import ConnectionClosed
 
 from rce.control.contents import answer, is_for_contents
 from rce.control.exceptions import PeerRefusedError
+from rce.control.execution import run_of
 from rce.control.messages import (
+    ACCEPTED_VERSIONS,
     CONTROL_VERSION,
     Hello,
     LogChunk,
@@ -23,6 +25,7 @@ from rce.control.messages import (
     encode,
 )
 from rce.control.peer import Peer
+from rce.control.tags import Unknown
 from rce.control.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, ControlTimeouts
 from rce.guard.lobby import PER_ADDRESS, Lobby
 from rce.guard.websocket import GuardedConnection, guarded
@@ -70,6 +73,8 @@ class ControlServer:
         contents: Gives contents to task sets that ask for them (:mod:`rce.control.contents`).
         tls: Gives the TLS context for each connection, which demands the task sets' certificates; none for a
             plain channel.
+        on_execution: Takes a connection that a task set dialed for a run (:mod:`rce.control.execution`), and
+            returns when it is done with it.
     """
 
     def __init__(
@@ -85,11 +90,13 @@ class ControlServer:
         timeouts: ControlTimeouts = DEFAULT_TIMEOUTS,
         contents: ReadContent | None = None,
         tls: Context | None = None,
+        on_execution: Callable[[str, ServerConnection], Awaitable[None]] | None = None,
     ) -> None:
         self._secret = secret
         self._tls = tls
         self._gate: TlsGate | None = None
         self._contents = contents
+        self._on_execution = on_execution
         self._on_hello = on_hello
         self._on_message = on_message
         self._on_gone = on_gone
@@ -160,6 +167,10 @@ class ControlServer:
         return socket.respond(HTTPStatus.UNAUTHORIZED, "Task sets prove themselves by the engine's secret.\n")
 
     async def _serve(self, socket: ServerConnection) -> None:
+        run = run_of(socket.request.path) if socket.request is not None else None
+        if run is not None and self._on_execution is not None:
+            await self._on_execution(run, socket)
+            return
         try:
             hello = await self._greet(socket)
             if hello is not None:
@@ -179,12 +190,16 @@ class ControlServer:
         if not isinstance(message, Hello):
             await socket.close(_POLICY, "the first message must be Hello")
             return None
-        if message.version != CONTROL_VERSION:
-            await self._refuse(socket, f"control version {message.version} does not fit {CONTROL_VERSION}")
+        if message.version not in ACCEPTED_VERSIONS:
+            await self._refuse(
+                socket,
+                f"control version {message.version} is not one of {', '.join(map(str, ACCEPTED_VERSIONS))}; "
+                "upgrade the older one of master and task set",
+            )
             return None
         return message
 
-    async def _receive(self, socket: ServerConnection) -> ToMaster | None:
+    async def _receive(self, socket: ServerConnection) -> ToMaster | Unknown | None:
         """Take one message; on garbage close the connection and return None."""
         frame = await socket.recv()
         try:
@@ -251,6 +266,8 @@ class ControlServer:
                 case Hello():
                     await socket.close(_POLICY, "Hello came twice")
                     return
+                case Unknown(name=name):
+                    _log.info("%r sent a %s, which this release does not know", peer, name)
                 case _:
                     await self._on_message(peer, message)
 

@@ -12,7 +12,9 @@ from pathlib import Path
 
 import msgspec
 
+from rce.control.execution import FEATURE as EXEC
 from rce.control.model import EndpointKind, EndpointSpec, EndpointState, EndpointStatus, InterfaceSpec
+from rce.control.tags import Unknown
 from rce.link import Endpoint, LinkHub
 from rce.link.handover import HandoverReceiver
 from rce.protocol.names import EndpointId
@@ -30,6 +32,7 @@ from rce_container.environment import messages as m
 from rce_container.environment.bundles import Bundles
 from rce_container.environment.channel import Channel, accept
 from rce_container.environment.exceptions import ChannelError
+from rce_container.environment.executions import Executions
 from rce_container.environment.interfaces import InterfaceMaker, Readiness
 from rce_container.environment.logs.rosout import RosoutLog
 from rce_container.environment.nodes.causes import Causes
@@ -93,6 +96,7 @@ class Environment:
         """Live; returns when every process, socket and task of the container has ended."""
         async with contextlib.AsyncExitStack() as stack:
             reaper = stack.enter_context(Reaper(self._cradle))
+            self._executions = Executions(reaper, self._environ, self._boot.mark, self._boot.home)
             self._core = await stack.enter_async_context(self._make_core())
             types = TypeRegistry(self._packages)
             node = await stack.enter_async_context(
@@ -141,6 +145,7 @@ class Environment:
         self._ending.set()
 
     async def _close(self) -> None:
+        await self._executions.close()
         await self._endpoint.close()
         await self._nodes.close()
         if not self._boot.isolated:
@@ -246,7 +251,7 @@ class Environment:
         )
         if status != self._told and self._channel is not None:
             self._told = status
-            self._channel.send(m.encode(m.Report(status=status)))
+            self._channel.send(m.encode(m.Report(status=status, features=(EXEC,))))
 
     @property
     def _state(self) -> EndpointState:
@@ -321,7 +326,7 @@ class Environment:
                 if not self._ending.is_set():
                     self._wait_for_manager()
 
-    async def _handle(self, channel: Channel, message: m.ToEnvironment) -> None:
+    async def _handle(self, channel: Channel, message: m.ToEnvironment | Unknown) -> None:
         match message:
             case m.Apply(spec=spec):
                 self._apply(spec)
@@ -338,8 +343,17 @@ class Environment:
                 if self._handover is not None:
                     await self._handover.close()
                 self._handover = HandoverReceiver(socket.socket(fileno=channel.take_fd()), self._hub.adopt)
+            case _:
+                self._take_order(channel, message)
+
+    def _take_order(self, channel: Channel, message: m.ToEnvironment | Unknown) -> None:
+        match message:
+            case m.Execute(command=command):
+                self._executions.start(command, socket.socket(fileno=channel.take_fd()))
             case m.Stop():
                 self.end("the manager says so")
+            case Unknown(name=name):
+                log.info("the manager sent a %s, which this release does not know", name)
 
     def _ask(self, message: m.Dial | m.Killed) -> bool:
         if self._channel is None:

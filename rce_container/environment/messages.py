@@ -1,7 +1,8 @@
 """The messages between the manager and an environment (JSON lines on the control socket, tagged by ``t``).
 
-Both are of one release and run on one machine. A manager may die and another one come: the newest connection
-is the one that counts, and the first thing an environment says on it is a :class:`Report`.
+Both run on one machine, and are of one release but for a manager that was upgraded while its containers ran:
+what is added later has a default, or is sent only to an environment whose ``features`` name it. A manager may
+die and another one come: the newest connection counts, and an environment first says a :class:`Report` on it.
 """
 
 from __future__ import annotations
@@ -9,7 +10,9 @@ from __future__ import annotations
 import msgspec
 from msgspec import Struct
 
+from rce.control.execution import Command
 from rce.control.model import EndpointSpec, EndpointStatus, InterfaceUsage, LinkAddress
+from rce.control.tags import Unknown, names_of, unknown
 
 
 class Boot(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -87,6 +90,12 @@ class Poll(_Message):
     """Asks for :class:`Counters`."""
 
 
+class Execute(_Message):
+    """Run a command. Comes with a socket that keeps message boundaries (:mod:`rce.control.execution`)."""
+
+    command: Command
+
+
 class Stop(_Message):
     """Stop all nodes and end."""
 
@@ -99,6 +108,8 @@ class Report(_Message):
 
     status: EndpointStatus
     """Without incarnation and address, which the manager knows; pids as the environment sees them."""
+    features: tuple[str, ...] = ()
+    """What this environment can do that one of an earlier release could not."""
 
 
 class Fault(_Message):
@@ -128,11 +139,43 @@ class Killed(_Message):
     request: int
 
 
-ToEnvironment = Apply | Shelved | Handover | Dialed | Cause | Poll | Stop
+ToEnvironment = Apply | Shelved | Handover | Dialed | Cause | Poll | Execute | Stop
 ToManager = Report | Fault | Counters | Dial | Killed
 
 encode = msgspec.json.Encoder().encode
 """Write a message as JSON; holds no newline."""
-decode_to_environment = msgspec.json.Decoder(ToEnvironment).decode
-decode_to_manager = msgspec.json.Decoder(ToManager).decode
+_to_environment: msgspec.json.Decoder[ToEnvironment] = msgspec.json.Decoder(ToEnvironment)
+_to_manager: msgspec.json.Decoder[ToManager] = msgspec.json.Decoder(ToManager)
+_NAMES_TO_ENVIRONMENT = names_of(ToEnvironment)
+_NAMES_TO_MANAGER = names_of(ToManager)
 decode_boot = msgspec.json.Decoder(Boot).decode
+
+
+def decode_to_environment(line: str | bytes) -> ToEnvironment | Unknown:
+    """Read a message that came from a manager.
+
+    Raises:
+        msgspec.DecodeError: It is none.
+    """
+    try:
+        return _to_environment.decode(line)
+    except msgspec.ValidationError:
+        later = unknown(line, _NAMES_TO_ENVIRONMENT)
+        if later is None:
+            raise
+        return later
+
+
+def decode_to_manager(line: str | bytes) -> ToManager | Unknown:
+    """Read a message that came from an environment.
+
+    Raises:
+        msgspec.DecodeError: It is none.
+    """
+    try:
+        return _to_manager.decode(line)
+    except msgspec.ValidationError:
+        later = unknown(line, _NAMES_TO_MANAGER)
+        if later is None:
+            raise
+        return later

@@ -31,6 +31,7 @@ UPLOAD_S = 300.0
 RETRY_S = 1.0
 _OK = 400
 _REDIRECTS = 300, 400
+_CLOSE = aiohttp.ClientWSTimeout(ws_close=5.0)
 
 
 class ApiClient:
@@ -89,6 +90,32 @@ class ApiClient:
             ) as reply:
                 return await _result(reply)
         except (aiohttp.ClientError, TimeoutError, ValueError) as error:
+            raise CliError(f"cannot use the master at {self._base}: {_words(error)}") from error
+
+    @contextlib.asynccontextmanager
+    async def websocket(
+        self, path: str, query: dict[str, str], max_size: int
+    ) -> AsyncIterator[aiohttp.ClientWebSocketResponse]:
+        """Open a WebSocket.
+
+        Args:
+            path: As for :meth:`call`.
+            query: Query parameters.
+            max_size: Bytes of the longest message that may come.
+
+        Raises:
+            ApiError: The master refused.
+            CliError: The master could not be reached.
+        """
+        try:
+            async with self._session.ws_connect(
+                self._base + path, params=query, max_msg_size=max_size, heartbeat=REQUEST_S, timeout=_CLOSE
+            ) as socket:
+                yield socket
+        except aiohttp.WSServerHandshakeError as error:
+            await self.call("GET", path, query=dict(query))  # says why, which a handshake cannot
+            raise ApiError(error.status, error.message) from error
+        except aiohttp.ClientError as error:
             raise CliError(f"cannot use the master at {self._base}: {_words(error)}") from error
 
     async def upload(self, path: str, file: BinaryIO, query: dict[str, str]) -> Any:

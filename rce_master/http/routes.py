@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from rce_master.bundles.office import PackageOffice
     from rce_master.events import EventLog
     from rce_master.quotas import Quotas
+    from rce_master.executions import Executions
     from rce_master.realm import Realm
     from rce_master.reconciler import Reconciler
     from rce_master.state.records import User
@@ -52,6 +53,7 @@ class Services:
     token_lifetime: float
     """Seconds."""
     packages: PackageOffice
+    executions: Executions
     tokens: Tokens
     quotas: Quotas
     audit: AuditLog

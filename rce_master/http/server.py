@@ -29,6 +29,7 @@ from rce_master.http import (
     api_account,
     api_audit,
     api_control,
+    api_exec,
     api_machines,
     api_packages,
     api_read,
@@ -63,6 +64,7 @@ ROUTES: list[Route] = [
     *api_usage.routes,
     *api_packages.routes,
     *api_stream.routes,
+    *api_exec.routes,
 ]
 
 

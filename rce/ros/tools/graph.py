@@ -45,7 +45,11 @@ class Graph:
         """
         kind = self.types.get(topic, ANY)
         if kind == ANY:
-            known = "no node publishes it or subscribes to it" if topic not in self.topics else "its type is not known"
+            known = (
+                "no node publishes it or subscribes to it"
+                if topic not in self.topics
+                else "its type is not known"
+            )
             raise ToolError(f"topic {topic}: {known}; 'topic list' shows the topics of this graph")
         return kind
 
@@ -93,7 +97,9 @@ async def service_type(name: str, master: MasterClient) -> str:
     """
     uri = await master.lookup_service(name)
     if uri is None:
-        raise ToolError(f"no node provides the service {name}; 'service list' shows the services of this graph")
+        raise ToolError(
+            f"no node provides the service {name}; 'service list' shows the services of this graph"
+        )
     place = urlsplit(uri)
     probe = {"callerid": master.caller, "service": name, "md5sum": ANY, "probe": "1"}
     try:

@@ -107,10 +107,13 @@ def read_fields(text: str, kind: MessageType) -> dict[str, Any]:
         return {}
     if isinstance(value, dict):
         return {str(name): item for name, item in value.items()}
-    values = value if isinstance(value, list) and not (len(names) == 1 and kind.fields[0].is_array) else [value]
+    values = (
+        value if isinstance(value, list) and not (len(names) == 1 and kind.fields[0].is_array) else [value]
+    )
     if len(values) != len(names):
         raise ValueError(
-            f"{kind.name} has {len(names)} fields ({', '.join(names) or 'none'}), but {len(values)} values came; "
+            f"{kind.name} has {len(names)} fields ({', '.join(names) or 'none'}), "
+            f"but {len(values)} values came; "
             "write a mapping such as {" + ", ".join(f"{name}: VALUE" for name in names[:2]) + "}"
         )
     return dict(zip(names, values, strict=True))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
+from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 from rce.ros.tools.exceptions import ToolError
@@ -106,7 +107,7 @@ class Rate:
         if len(self._times) < 2:  # noqa: PLR2004 - a rate needs two
             return ""
         times = list(self._times)
-        gaps = [after - before for before, after in zip(times, times[1:], strict=False)]
+        gaps = [after - before for before, after in pairwise(times)]
         mean = sum(gaps) / len(gaps)
         deviation = (sum((gap - mean) ** 2 for gap in gaps) / len(gaps)) ** 0.5
         rate = f"{1 / mean:.3f}" if mean else "very high"

@@ -90,6 +90,42 @@ class Reaper:
         die_before_others(OF_NODES, process.pid)
         return self._keep(Child(process.pid, ended, process))
 
+    def spawn_attached(
+        self,
+        argv: Sequence[str],
+        *,
+        env: Mapping[str, str],
+        cwd: str,
+        streams: tuple[int, int, int],
+        terminal: bool,
+    ) -> Child:
+        """Start a process in a new session with given standard input, output and error.
+
+        Args:
+            argv: The program and its arguments.
+            env: All of its environment variables.
+            cwd: Where it starts.
+            streams: The descriptors.
+            terminal: The first of them becomes the session's terminal.
+
+        Raises:
+            OSError: It cannot be started.
+        """
+        ended: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+        stdin, stdout, stderr = streams
+        process = subprocess.Popen(  # noqa: S603 - a user's command in the user's own container
+            argv,
+            env=env,
+            cwd=cwd,
+            stdin=stdin,
+            stdout=stdout,
+            stderr=stderr,
+            start_new_session=True,
+            preexec_fn=_take_terminal if terminal else None,  # noqa: PLW1509 - no other way; one system call
+        )
+        die_before_others(OF_NODES, process.pid)
+        return self._keep(Child(process.pid, ended, process))
+
     def _keep(self, child: Child) -> Child:
         self._children[child.pid] = child
         return child
@@ -105,3 +141,11 @@ class Reaper:
             child = self._children.pop(pid, None)
             if child is not None:
                 child.finish(os.waitstatus_to_exitcode(status))
+
+
+def _take_terminal() -> None:
+    """Make standard input the terminal of this session."""
+    import fcntl
+    import termios
+
+    fcntl.ioctl(0, termios.TIOCSCTTY, 0)

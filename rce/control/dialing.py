@@ -1,0 +1,59 @@
+"""A task set's connections to the master for single runs (:mod:`rce.control.execution`)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from websockets.asyncio.client import connect
+
+from rce.control.execution import MAX_DATA, path_of
+from rce.control.timeouts import DEFAULT_TIMEOUTS, ControlTimeouts
+
+if TYPE_CHECKING:
+    from rce.config.secret import Secret
+    from rce.tls.identity import Context
+
+
+class RunDialer:
+    """Dials the master for runs.
+
+    Args:
+        url: Where the master is, as for :class:`rce.control.channel.TaskSetChannel`.
+        secret: Proves that this is a task set of the same engine.
+        timeouts: Times of this end.
+        tls: Gives the TLS context for each connection to a ``wss://`` URL.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        secret: Secret,
+        timeouts: ControlTimeouts = DEFAULT_TIMEOUTS,
+        *,
+        tls: Context | None = None,
+    ) -> None:
+        self._tls = tls
+        self._url = url.rstrip("/")
+        self._secret = secret
+        self._timeouts = timeouts
+
+    def dial(self, run: str) -> connect:
+        """Connect for a run; use what is returned with ``async with``.
+
+        Raises:
+            OSError: The master cannot be reached.
+            WebSocketException: It does not take the connection.
+        """
+        return connect(
+            self._url + path_of(run),
+            additional_headers={"Authorization": f"Bearer {self._secret.reveal()}"},
+            compression=None,
+            proxy=None,
+            open_timeout=self._timeouts.open,
+            ping_interval=self._timeouts.ping_interval,
+            ping_timeout=None,
+            close_timeout=self._timeouts.close,
+            max_size=MAX_DATA + 2,
+            max_queue=4,
+            ssl=None if self._tls is None else self._tls(),
+        )

@@ -1,0 +1,157 @@
+"""Commands that are run in containers on a user's behalf: what is asked, and the frames of one run. Pure.
+
+A run is a conversation of binary frames in both directions, each one byte that says what it is
+(:class:`Part`) and its contents. The same frames go from the user's program to the master (a WebSocket at
+``/api/v1/containers/{container}/exec``), from there to the container's machine (a WebSocket that the task set
+dials, ``/exec/RUN`` on the control port) and into the container (a ``SOCK_SEQPACKET`` socket), so nothing on
+the way reads more than the first byte. Each hop waits for the next one, so a slow reader slows the command.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from enum import Enum
+from typing import NamedTuple
+
+import msgspec
+from msgspec import Struct
+
+FEATURE = "exec"
+"""What a task set or an environment says it knows if it can do this."""
+MAX_DATA = 32 << 10
+"""Bytes of the contents of one frame."""
+MAX_ARGUMENTS = 1024
+MAX_COMMAND = 128 << 10
+"""Bytes of a command with all its arguments and variables."""
+NOT_RUN = 125
+"""Exit code of a command that could not be run by the engine."""
+PATH_PREFIX = "/exec/"
+_RUN = re.compile(rf"{PATH_PREFIX}([0-9a-f]{{32}})")
+_SIZE = struct.Struct("!HH")
+
+
+class Part(Enum):
+    """What a frame holds."""
+
+    INPUT = b"i"
+    """Bytes for the command's standard input."""
+    END_OF_INPUT = b"c"
+    SIZE = b"w"
+    """The terminal's new size: rows and columns, two numbers of 16 bits in network order."""
+    SIGNAL = b"s"
+    """A signal's number, one byte, for the command's process group."""
+    OUTPUT = b"o"
+    ERROR = b"e"
+    """Bytes of the command's standard error; with a terminal all is OUTPUT."""
+    STARTED = b"b"
+    """The command runs."""
+    ENDED = b"x"
+    """:class:`Ended` as JSON; the last frame."""
+
+
+class Frame(NamedTuple):
+    """A frame."""
+
+    part: Part
+    data: bytes = b""
+
+    def encode(self) -> bytes:
+        """Write it."""
+        return self.part.value + self.data
+
+
+class Command(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What is to be run."""
+
+    argv: tuple[str, ...] = ()
+    """The program and its arguments; empty: a shell."""
+    tool: bool = False
+    """``argv`` are the arguments of the engine's own :mod:`rce.ros.tools`."""
+    terminal: bool = False
+    """Give the command a terminal."""
+    rows: int = 24
+    columns: int = 80
+    variables: dict[str, str] = {}
+    """Further environment variables, such as TERM."""
+
+
+class Ended(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """How a command ended."""
+
+    code: int
+    """Its exit code, 128 and the signal's number if one ended it, or :data:`NOT_RUN`."""
+    reason: str = ""
+    """Why it could not be run, or was ended."""
+
+
+def decode(frame: bytes) -> Frame:
+    """Read a frame.
+
+    Raises:
+        ValueError: It is none.
+    """
+    if len(frame) > MAX_DATA + 1:
+        raise ValueError(f"a frame of {len(frame)} bytes; at most {MAX_DATA + 1} are allowed")
+    return Frame(Part(frame[:1]), frame[1:])
+
+
+def size_frame(rows: int, columns: int) -> Frame:
+    """Make the frame that tells a terminal's size."""
+    return Frame(Part.SIZE, _SIZE.pack(min(rows, 65535), min(columns, 65535)))
+
+
+def read_size(data: bytes) -> tuple[int, int]:
+    """Read rows and columns.
+
+    Raises:
+        ValueError: It is no size.
+    """
+    if len(data) != _SIZE.size:
+        raise ValueError(f"a terminal's size has {_SIZE.size} bytes, not {len(data)}")
+    rows, columns = _SIZE.unpack(data)
+    return rows, columns
+
+
+def ended_frame(code: int, reason: str = "") -> Frame:
+    """Make the last frame."""
+    return Frame(Part.ENDED, msgspec.json.encode(Ended(code=code, reason=reason[:2000])))
+
+
+def read_ended(data: bytes) -> Ended:
+    """Read the last frame.
+
+    Raises:
+        msgspec.ValidationError: It is none.
+    """
+    return msgspec.json.decode(data, type=Ended)
+
+
+def read_command(text: str | bytes) -> Command:
+    """Read what a user wants to be run.
+
+    Raises:
+        ValueError: It is no such thing, or too much; the text says what.
+    """
+    if len(text) > MAX_COMMAND:
+        raise ValueError(f"the command has {len(text)} bytes; at most {MAX_COMMAND} are allowed")
+    command = msgspec.json.decode(text, type=Command)
+    if len(command.argv) > MAX_ARGUMENTS:
+        raise ValueError(
+            f"the command has {len(command.argv)} arguments; at most {MAX_ARGUMENTS} are allowed"
+        )
+    texts = [*command.argv, *command.variables, *command.variables.values()]
+    if any("\0" in one for one in texts) or any("=" in name or not name for name in command.variables):
+        raise ValueError("arguments and variables hold no NUL, names of variables no '='")
+    return command
+
+
+def path_of(run: str) -> str:
+    """Where a task set dials for a run."""
+    return f"{PATH_PREFIX}{run}"
+
+
+def run_of(path: str) -> str | None:
+    """Tell for which run a path is; None if it is another path."""
+    found = _RUN.fullmatch(path)
+    return found[1] if found else None

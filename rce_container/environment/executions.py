@@ -1,0 +1,261 @@
+"""Commands that users run in the container beside its nodes (:mod:`rce.control.execution`)."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable, Mapping
+from typing import Self
+
+from rce.control.execution import MAX_DATA, NOT_RUN, Command, Frame, Part, decode, ended_frame, read_size
+from rce_container.environment.descriptors import read_some, write_all
+from rce_container.environment.nodes.launch import NODE_MARK
+from rce_container.environment.nodes.reaper import Child, Reaper
+from rce_container.environment.process import strike_all
+
+log = logging.getLogger(__name__)
+
+MAX_EXECUTIONS = 16
+"""Commands that run at the same time in one container."""
+HANGUP_S = 2.0
+"""What a command gets to end after SIGHUP, when its user is gone."""
+REST_S = 1.0
+"""How long what it wrote last may take to be read, once the command has ended."""
+PART_S = 5.0
+"""How long the user's side may take to take what the command wrote last."""
+SHELLS = ("/bin/bash", "/bin/sh")
+_SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGKILL})
+_NOT_FOUND, _NOT_EXECUTABLE = 127, 126
+
+
+class Executions:
+    """Runs commands; each has a socket to its user, and ends with it.
+
+    Args:
+        reaper: Starts processes and waits for them.
+        environ: Gives the environment variables of the container's nodes.
+        mark: The container's; all processes of a command carry one made of it.
+        home: Where commands start.
+    """
+
+    def __init__(
+        self, reaper: Reaper, environ: Callable[[], Mapping[str, str]], mark: str, home: str
+    ) -> None:
+        self._reaper = reaper
+        self._environ = environ
+        self._mark = mark
+        self._home = home
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._number = 0
+
+    def start(self, command: Command, sock: socket.socket) -> None:
+        """Run a command; ``sock`` keeps message boundaries, and is this object's now."""
+        self._number += 1
+        task = asyncio.create_task(self._run(command, sock, self._number), name=f"command {self._number}")
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def close(self) -> None:
+        """End all commands."""
+        tasks = list(self._tasks)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _run(self, command: Command, sock: socket.socket, number: int) -> None:
+        sock.setblocking(False)
+        loop = asyncio.get_running_loop()
+        with sock:
+            try:
+                if len(self._tasks) > MAX_EXECUTIONS:
+                    last = ended_frame(
+                        NOT_RUN, f"{MAX_EXECUTIONS} commands run in this container already; end one of them"
+                    )
+                else:
+                    last = await self._execute(command, sock, f"{self._mark}.command.{number}")
+                await loop.sock_sendall(sock, last.encode())
+                await _part(sock)
+            except OSError as error:  # the user is gone
+                log.info("command %d: %s", number, error)
+
+    async def _execute(self, command: Command, sock: socket.socket, mark: str) -> Frame:
+        argv = list(command.argv) or [next(filter(os.path.exists, SHELLS), SHELLS[-1])]
+        if command.tool:
+            argv = [sys.executable, "-m", "rce.ros.tools", *argv]
+        env = {**self._environ(), **command.variables, NODE_MARK: mark}
+        streams = _Terminal(command.rows, command.columns) if command.terminal else _Pipes()
+        with streams:
+            try:
+                child = self._reaper.spawn_attached(
+                    argv, env=env, cwd=self._home, streams=streams.of_child, terminal=command.terminal
+                )
+            except OSError as error:
+                code = _NOT_FOUND if isinstance(error, FileNotFoundError) else _NOT_EXECUTABLE
+                return ended_frame(code, f"{argv[0]}: {error.strerror}")
+            finally:
+                streams.close_childs()
+            try:
+                await asyncio.get_running_loop().sock_sendall(sock, Frame(Part.STARTED).encode())
+                return await _Conversation(child, streams, sock).hold(mark)
+            finally:
+                child.signal_group(signal.SIGKILL)
+                await strike_all(mark, variable=NODE_MARK)
+
+
+async def _part(sock: socket.socket) -> None:
+    """Wait until the user's side has taken all; closing with input unread would throw it away."""
+    sock.shutdown(socket.SHUT_WR)
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(PART_S):
+            while await asyncio.get_running_loop().sock_recv(sock, MAX_DATA + 2):
+                pass
+
+
+class _Pipes:
+    """Three pipes."""
+
+    def __init__(self) -> None:
+        pairs = os.pipe2(os.O_CLOEXEC), os.pipe2(os.O_CLOEXEC), os.pipe2(os.O_CLOEXEC)
+        self.of_child = (pairs[0][0], pairs[1][1], pairs[2][1])
+        self.input = pairs[0][1]
+        self.outputs = {Part.OUTPUT: pairs[1][0], Part.ERROR: pairs[2][0]}
+        for fd in (self.input, *self.outputs.values()):
+            os.set_blocking(fd, False)
+        self._open = {fd for pair in pairs for fd in pair}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close(*self._open)
+
+    def close_childs(self) -> None:
+        """Close the ends that are the child's."""
+        self._close(*self.of_child)
+
+    def close_input(self) -> None:
+        """Tell the command that no more input comes."""
+        self._close(self.input)
+
+    def resize(self, rows: int, columns: int) -> None:
+        """Pipes have no size."""
+
+    def _close(self, *fds: int) -> None:
+        for fd in self._open.intersection(fds):
+            os.close(fd)
+        self._open.difference_update(fds)
+
+
+class _Terminal:
+    """A pseudo terminal."""
+
+    def __init__(self, rows: int, columns: int) -> None:
+        self.input, inner = os.openpty()
+        self.outputs = {Part.OUTPUT: self.input}
+        self.of_child = (inner, inner, inner)
+        self._open = {self.input, inner}
+        os.set_blocking(self.input, False)
+        self.resize(rows, columns)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close(*self._open)
+
+    def close_childs(self) -> None:
+        """Close the end that is the child's."""
+        self._close(self.of_child[0])
+
+    def close_input(self) -> None:
+        """A terminal has no end; Ctrl-D is a character."""
+
+    def resize(self, rows: int, columns: int) -> None:
+        """Set the size; the kernel tells the command."""
+        import termios
+
+        with contextlib.suppress(OSError, termios.error):
+            termios.tcsetwinsize(self.input, (rows, columns))
+
+    def _close(self, *fds: int) -> None:
+        for fd in self._open.intersection(fds):
+            os.close(fd)
+        self._open.difference_update(fds)
+
+
+class _Conversation:
+    """Passes a running command's streams between it and its user."""
+
+    def __init__(self, child: Child, streams: _Pipes | _Terminal, sock: socket.socket) -> None:
+        self._child = child
+        self._streams = streams
+        self._sock = sock
+        self._loop = asyncio.get_running_loop()
+        self._turn = asyncio.Lock()
+
+    async def hold(self, mark: str) -> Frame:
+        """Go on until the command has ended, or its user is gone.
+
+        Returns:
+            The last frame.
+        """
+        outputs = [asyncio.create_task(self._read(part, fd)) for part, fd in self._streams.outputs.items()]
+        listening = asyncio.create_task(self._listen())
+        try:
+            await asyncio.wait((self._child.ended, listening), return_when=asyncio.FIRST_COMPLETED)
+            if not self._child.ended.done():
+                await self._hang_up()
+            # What it left running in the background would keep its streams open.
+            await strike_all(mark, variable=NODE_MARK)
+            await asyncio.wait(outputs, timeout=REST_S)
+        finally:
+            tasks = (*outputs, listening)
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+        code = self._child.ended.result()
+        return ended_frame(code if code >= 0 else 128 - code)
+
+    async def _hang_up(self) -> None:
+        self._child.signal_group(signal.SIGHUP)
+        await asyncio.wait((self._child.ended,), timeout=HANGUP_S)
+        self._child.signal_group(signal.SIGKILL)
+        await self._child.ended
+
+    async def _read(self, part: Part, fd: int) -> None:
+        while data := await read_some(fd, MAX_DATA):
+            async with self._turn:
+                await self._loop.sock_sendall(self._sock, Frame(part, data).encode())
+
+    async def _listen(self) -> None:
+        """Do what the user says; returns when the user is gone or says nothing that makes sense."""
+        while received := await self._loop.sock_recv(self._sock, MAX_DATA + 2):
+            try:
+                frame = decode(received)
+                await self._obey(frame)
+            except ValueError as error:
+                log.warning("a command is ended: %s", error)
+                return
+            except OSError:  # the command does not read, or has closed its input
+                self._streams.close_input()
+
+    async def _obey(self, frame: Frame) -> None:
+        match frame.part:
+            case Part.INPUT:
+                await write_all(self._streams.input, frame.data)
+            case Part.END_OF_INPUT:
+                self._streams.close_input()
+            case Part.SIZE:
+                self._streams.resize(*read_size(frame.data))
+            case Part.SIGNAL:
+                number = signal.Signals(frame.data[0] if frame.data else 0)
+                if number not in _SIGNALS:
+                    raise ValueError(f"{number.name} cannot be sent to a command")
+                self._child.signal_group(number)
+            case Part.OUTPUT | Part.ERROR | Part.STARTED | Part.ENDED:
+                raise ValueError(f"a user sent {frame.part.name}")

@@ -1,0 +1,87 @@
+"""Joins commands in containers with the users who run them, by way of the master."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import socket
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from websockets.exceptions import ConnectionClosed, WebSocketException
+
+from rce.control.execution import MAX_DATA, NOT_RUN, Command, ended_frame
+from rce_container.exceptions import ExecutionError
+
+if TYPE_CHECKING:
+    from websockets.asyncio.client import ClientConnection
+
+    from rce.control.dialing import RunDialer
+    from rce.control.messages import Execute
+
+log = logging.getLogger(__name__)
+
+Start = Callable[[str, Command, socket.socket], None]
+"""Hands a command and a socket to a container (by its endpoint id); raises ExecutionError."""
+
+
+class Executions:
+    """Carries the frames of runs between the master and environments; looks into none of them.
+
+    Args:
+        dialer: Connects to the master.
+        start: Gives a command to a container's environment.
+    """
+
+    def __init__(self, dialer: RunDialer, start: Start) -> None:
+        self._dialer = dialer
+        self._start = start
+
+    async def execute(self, message: Execute) -> None:
+        """Run a command to its end."""
+        try:
+            async with self._dialer.dial(message.run) as master:
+                await self._join(message, master)
+        except (OSError, TimeoutError, WebSocketException) as error:
+            log.warning("a command in %s is ended: %s", message.id, error)
+
+    async def _join(self, message: Execute, master: ClientConnection) -> None:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        ours.setblocking(False)
+        with ours:
+            try:
+                with theirs:
+                    self._start(message.id, message.command, theirs)
+            except ExecutionError as error:
+                await master.send(ended_frame(NOT_RUN, str(error)).encode())
+                return
+            await _carry(ours, master)
+
+
+async def _carry(sock: socket.socket, master: ClientConnection) -> None:
+    """Carry frames both ways until either side is gone."""
+    loop = asyncio.get_running_loop()
+
+    async def upwards() -> None:
+        while frame := await loop.sock_recv(sock, MAX_DATA + 2):
+            await master.send(frame)
+
+    async def downwards() -> None:
+        async for frame in master:
+            if isinstance(frame, bytes) and frame:
+                with contextlib.suppress(
+                    OSError
+                ):  # the command has ended; what it said last is still carried
+                    await loop.sock_sendall(sock, frame)
+
+    tasks = [asyncio.create_task(upwards()), asyncio.create_task(downwards())]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            with contextlib.suppress(ConnectionClosed, OSError):  # either side may go at any time
+                task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)

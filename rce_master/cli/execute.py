@@ -1,0 +1,211 @@
+"""``rce exec``: a command in a container, with this terminal as its own."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import shutil
+import signal
+import sys
+from typing import TYPE_CHECKING, Annotated
+
+import aiohttp
+import msgspec
+import typer
+
+from rce.cli.main import Plugged
+from rce.control.execution import (
+    MAX_DATA,
+    NOT_RUN,
+    Command,
+    Frame,
+    Part,
+    decode,
+    read_ended,
+    size_frame,
+)
+from rce_master.cli import credentials
+from rce_master.cli.client import ApiClient
+from rce_master.cli.exceptions import CliError
+from rce_master.exceptions import MasterError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from aiohttp import ClientWebSocketResponse
+
+_INTERRUPTED = 130
+_PASSED_ON = ("TERM", "LANG", "COLORTERM")
+"""Variables of this terminal that a command in a terminal gets."""
+
+
+def _execute(
+    container: Annotated[str, typer.Argument(help="The container's tag.")],
+    command: Annotated[
+        list[str] | None, typer.Argument(metavar="[--] [COMMAND]...", help="What to run; default: a shell.")
+    ] = None,
+    tty: Annotated[
+        bool | None,
+        typer.Option("--tty/--no-tty", "-t/-T", help="Give it a terminal [if this is one]."),
+    ] = None,
+    stdin: Annotated[bool, typer.Option("--stdin/--no-stdin", help="Pass standard input on.")] = True,
+    user: Annotated[str, typer.Option(help="Whose container; administrators only.")] = "",
+) -> None:
+    """Run a command in a container, beside its nodes and within its limits.
+
+    The exit code is the command's; 125 if it could not be run. Whatever it started ends with it.
+    """
+    argv = tuple(command or ())
+    if argv[:1] == ("--",):
+        argv = argv[1:]
+    terminal = _is_terminal() if tty is None else tty
+    asked = Command(argv=argv, terminal=terminal, variables=_variables() if terminal else {})
+    raise typer.Exit(run_command(container, asked, user=user, stdin=stdin))
+
+
+def run_command(container: str, command: Command, *, user: str = "", stdin: bool = True) -> int:
+    """Run a command with this program's standard streams; print why if that fails.
+
+    Returns:
+        The exit code.
+    """
+    if command.terminal:
+        size = shutil.get_terminal_size()
+        command = msgspec.structs.replace(command, rows=size.lines, columns=size.columns)
+    try:
+        return asyncio.run(_run(container, command, user, stdin))
+    except (CliError, MasterError) as error:
+        typer.echo(f"rce: {error}", err=True)
+        return NOT_RUN
+    except KeyboardInterrupt:
+        return _INTERRUPTED
+
+
+def _is_terminal() -> bool:
+    return sys.stdin.isatty() and sys.stdout.isatty()
+
+
+def _variables() -> dict[str, str]:
+    return {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
+
+
+async def _run(container: str, command: Command, user: str, stdin: bool) -> int:
+    query = {"user": user} if user else {}
+    async with (
+        ApiClient.of(credentials.load()) as client,
+        client.websocket(f"/containers/{container}/exec", query, MAX_DATA + 2) as socket,
+    ):
+        await socket.send_str(msgspec.json.encode(command).decode())
+        with _raw_terminal(command.terminal), _signals(socket, command.terminal):
+            typing = asyncio.create_task(_send_input(socket, stdin, command.terminal))
+            try:
+                return await _show(socket)
+            finally:
+                typing.cancel()
+                await asyncio.gather(typing, return_exceptions=True)
+
+
+async def _show(socket: ClientWebSocketResponse) -> int:
+    """Write what the command writes, until it has ended; returns its exit code."""
+    async for message in socket:
+        if message.type is not aiohttp.WSMsgType.BINARY:
+            continue
+        frame = decode(message.data)
+        match frame.part:
+            case Part.OUTPUT:
+                _write(1, frame.data)
+            case Part.ERROR:
+                _write(2, frame.data)
+            case Part.ENDED:
+                ended = read_ended(frame.data)
+                if ended.reason:
+                    _write(2, f"rce: {ended.reason}\n".encode())
+                return ended.code
+            case _:
+                pass
+    raise CliError("the connection to the master was lost; the command has been ended")
+
+
+def _write(fd: int, data: bytes) -> None:
+    rest = memoryview(data)
+    while rest:
+        rest = rest[os.write(fd, rest) :]
+
+
+async def _send_input(socket: ClientWebSocketResponse, stdin: bool, terminal: bool) -> None:
+    """Send what is typed or piped in, and its end."""
+    if stdin:
+        while data := await _read_input():
+            await socket.send_bytes(Frame(Part.INPUT, data).encode())
+    if not terminal:
+        await socket.send_bytes(Frame(Part.END_OF_INPUT).encode())
+
+
+async def _read_input() -> bytes:
+    loop = asyncio.get_running_loop()
+    ready = loop.create_future()
+    try:
+        loop.add_reader(0, _wake, ready)
+    except PermissionError:  # a file: it is always ready
+        await asyncio.sleep(0)
+    else:
+        try:
+            await ready
+        finally:
+            loop.remove_reader(0)
+    return os.read(0, MAX_DATA)
+
+
+def _wake(ready: asyncio.Future[None]) -> None:
+    if not ready.done():
+        ready.set_result(None)
+
+
+@contextlib.contextmanager
+def _raw_terminal(wanted: bool) -> Iterator[None]:
+    """Leave what is typed to the terminal in the container."""
+    if not wanted or not sys.stdin.isatty():
+        yield
+        return
+    import termios
+    import tty
+
+    before = termios.tcgetattr(0)
+    tty.setraw(0)
+    try:
+        yield
+    finally:
+        termios.tcsetattr(0, termios.TCSADRAIN, before)
+
+
+@contextlib.contextmanager
+def _signals(socket: ClientWebSocketResponse, terminal: bool) -> Iterator[None]:
+    """Pass signals on to the command, and the terminal's size."""
+    loop = asyncio.get_running_loop()
+    tasks: set[asyncio.Task[None]] = set()
+
+    def send(frame: Frame) -> None:
+        task = loop.create_task(socket.send_bytes(frame.encode()))
+        tasks.add(task)
+        task.add_done_callback(tasks.discard)
+
+    def resized() -> None:
+        size = shutil.get_terminal_size()
+        send(size_frame(size.lines, size.columns))
+
+    handlers = {number: Frame(Part.SIGNAL, bytes([number])) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number, frame in handlers.items():
+        loop.add_signal_handler(number, send, frame)
+    if terminal:
+        loop.add_signal_handler(signal.SIGWINCH, resized)
+    try:
+        yield
+    finally:
+        for number in (*handlers, signal.SIGWINCH):
+            loop.remove_signal_handler(number)
+        for task in tasks:
+            task.cancel()
+
+
+execute = Plugged(_execute, {"allow_interspersed_args": False})

@@ -1,0 +1,114 @@
+"""REST: running commands in containers, over a WebSocket."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING
+
+import msgspec
+from aiohttp import WSMsgType, web
+from websockets.exceptions import ConnectionClosed
+
+from rce.control.execution import MAX_COMMAND, NOT_RUN, ended_frame, read_command
+from rce_master.exceptions import Invalid, MasterError
+from rce_master.http.routes import OF_USER, Call, RouteTable
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import ServerConnection
+
+    from rce.control.execution import Command
+
+routes = RouteTable("exec")
+
+FIRST_MESSAGE_S = 10.0
+HEARTBEAT_S = 15.0
+CHECK_S = 2.0
+"""How often it is checked that the user may still do this."""
+
+
+@routes.route(
+    "GET",
+    "/containers/{container}/exec",
+    "Run a command in a container: a WebSocket, on which the command is sent as JSON and frames follow",
+    query=(OF_USER,),
+    media="application/octet-stream",
+    status=101,
+)
+async def execute(call: Call) -> web.StreamResponse:
+    """Run a command."""
+    id_ = f"{call.owner}/{call.path('container')}"
+    peer = call.services.reconciler.task_set_of(id_)
+    user = web.WebSocketResponse(compress=False, heartbeat=HEARTBEAT_S, max_msg_size=MAX_COMMAND + 1)
+    if not user.can_prepare(call.request):
+        raise Invalid("this path is for WebSockets; 'rce exec' uses it")
+    await user.prepare(call.request)
+    try:
+        command = await _first(user)
+        async with call.services.executions.open(peer, id_, command) as machine:
+            await _relay(call, user, machine)
+    except (MasterError, ValueError, TimeoutError) as error:
+        text = str(error) or f"no command came within {FIRST_MESSAGE_S:g} s"
+        with contextlib.suppress(ConnectionResetError):
+            await user.send_bytes(ended_frame(NOT_RUN, text).encode())
+    await user.close()
+    return user
+
+
+async def _first(user: web.WebSocketResponse) -> Command:
+    """Receive the command.
+
+    Raises:
+        ValueError: Something else came.
+        TimeoutError: Nothing came.
+    """
+    async with asyncio.timeout(FIRST_MESSAGE_S):
+        message = await user.receive()
+    if message.type is not WSMsgType.TEXT:
+        raise ValueError("the first message must be the command, as JSON text")
+    try:
+        return read_command(message.data)
+    except msgspec.MsgspecError as error:
+        raise ValueError(f"the command: {error}") from error
+
+
+async def _relay(call: Call, user: web.WebSocketResponse, machine: ServerConnection) -> None:
+    """Pass frames on until either side has gone, or the user may not do this any more."""
+    work = (_to_machine(user, machine), _to_user(machine, user), _watch(call))
+    tasks = [asyncio.create_task(one) for one in work]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            with contextlib.suppress(ConnectionClosed, ConnectionResetError):  # either side may just go
+                task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _to_machine(user: web.WebSocketResponse, machine: ServerConnection) -> None:
+    async for message in user:
+        if message.type is not WSMsgType.BINARY:
+            raise ValueError("only binary frames may follow the command")
+        with contextlib.suppress(
+            ConnectionClosed
+        ):  # the command has ended; its last frames are still passed on
+            await machine.send(message.data)
+
+
+async def _to_user(machine: ServerConnection, user: web.WebSocketResponse) -> None:
+    async for frame in machine:
+        if isinstance(frame, bytes):
+            await user.send_bytes(frame)
+
+
+async def _watch(call: Call) -> None:
+    """Return never; raise when the login has ended.
+
+    Raises:
+        ValueError: It has.
+    """
+    while call.is_still_valid:  # noqa: ASYNC110 - a token tells nobody that it expires
+        await asyncio.sleep(CHECK_S)
+    raise ValueError("your login has ended")
