@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from support.engine import Engine, running_engine, until
+from support.owner import Owner
 from support.stranger import stranger
 
 from rce.ros.core import Core
@@ -30,35 +31,6 @@ def write_files(folder: Path, url: str) -> None:
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text.replace("http://127.0.0.1:9000/", url))
-
-
-class Owner:
-    """Somebody with a folder of their own, at a terminal."""
-
-    def __init__(self, engine: Engine, name: str) -> None:
-        self.engine = engine
-        self.folder = engine.folder / f"home-{name}"
-        self.folder.mkdir()
-        self.name = name
-        self.env = {**engine.env, "RCE_LOGIN_FILE": str(self.folder / "login.json")}
-
-    async def rce(self, *words: str, typed: str = "", fails: bool = False) -> str:
-        process = await asyncio.create_subprocess_exec(
-            str(Path(sys.executable).parent / "rce"),
-            *words,
-            cwd=self.folder,
-            env={**self.env, "COLUMNS": "200"},
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.STDOUT,
-        )
-        output, _ = await process.communicate(typed.encode())
-        text = output.decode()
-        assert (process.returncode != 0) == fails, text
-        return text
-
-    async def login(self) -> None:
-        await self.rce("login", self.engine.url, "--user", self.name, "--password-stdin", typed=self.name)
 
 
 @asynccontextmanager

@@ -1,0 +1,41 @@
+"""A user of an engine, at a terminal."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from pathlib import Path
+
+from support.engine import Engine
+
+
+class Owner:
+    """Somebody with a folder of their own, at a terminal."""
+
+    def __init__(self, engine: Engine, name: str) -> None:
+        self.engine = engine
+        self.folder = engine.folder / f"home-{name}"
+        self.folder.mkdir()
+        self.name = name
+        self.env = {**engine.env, "RCE_LOGIN_FILE": str(self.folder / "login.json")}
+
+    async def start(self, *words: str, **streams: int) -> asyncio.subprocess.Process:
+        """Start ``rce`` with pipes, but for the streams that are given."""
+        pipes = dict.fromkeys(("stdin", "stdout", "stderr"), asyncio.subprocess.PIPE)
+        return await asyncio.create_subprocess_exec(
+            str(Path(sys.executable).parent / "rce"),
+            *words,
+            cwd=self.folder,
+            env={**self.env, "COLUMNS": "200"},
+            **{**pipes, **streams},  # type: ignore[arg-type]
+        )
+
+    async def rce(self, *words: str, typed: str = "", fails: bool = False) -> str:
+        process = await self.start(*words, stderr=asyncio.subprocess.STDOUT)
+        output, _ = await process.communicate(typed.encode())
+        text = output.decode()
+        assert (process.returncode != 0) == fails, text
+        return text
+
+    async def login(self) -> None:
+        await self.rce("login", self.engine.url, "--user", self.name, "--password-stdin", typed=self.name)
