@@ -78,7 +78,7 @@ class Manager:
         links: Host and port where it does.
         limiter: Enforces the containers' limits.
         library: Gives packages that users bring.
-        dialer: Connects to the master for commands that users run.
+        dialer: Connects to the master for commands that users run; without it there are none.
 
     Attributes:
         send: Sends a message to the master, or drops it while there is none.
@@ -97,7 +97,7 @@ class Manager:
         links: tuple[str, int],
         limiter: Limiter,
         library: Library,
-        dialer: RunDialer,
+        dialer: RunDialer | None = None,
     ) -> None:
         self._name = name
         self._info = info
@@ -126,7 +126,7 @@ class Manager:
             archive=state.archive,
             library=library,
         )
-        self._executions = Executions(dialer, self._execute)
+        self._executions = Executions(dialer, self._execute) if dialer is not None else None
         self._units: dict[str, Unit] = {}
         """All lives of which something may be left, by mark."""
         self._queue: deque[str] = deque()
@@ -148,7 +148,7 @@ class Manager:
             process=self._name,
             machine=self._info,
             endpoints=self._core.statuses,
-            features=(EXEC,),
+            features=(EXEC,) if self._executions is not None else (),
         )
 
     async def handle(self, message: ToTaskSet) -> None:
@@ -162,7 +162,7 @@ class Manager:
                 self._feed(events.Sync(specs))
             case ReadLog():
                 self._log_reads.take(message)
-            case Execute(id=id_):
+            case Execute(id=id_) if self._executions is not None:
                 self._tasks.create_task(self._executions.execute(message), name=f"command in {id_}")
             case _:
                 log.debug("not for a container task set: %s", type(message).__name__)

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from rce_master.auth import Authenticator
     from rce_master.bundles.office import PackageOffice
     from rce_master.events import EventLog
-    from rce_master.quotas import Quotas
     from rce_master.executions import Executions
+    from rce_master.quotas import Quotas
     from rce_master.realm import Realm
     from rce_master.reconciler import Reconciler
     from rce_master.state.records import User

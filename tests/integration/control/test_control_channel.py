@@ -253,7 +253,7 @@ async def test_browser_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    "frame", ["{", "[" * 100_000, '{"t":"Nonsense"}', '{"t":"Left","id":3}', b"\x00\xff"]
+    "frame", ["{", "[" * 100_000, '{"x":"Nonsense"}', '{"t":"Left","id":3}', b"\x00\xff"]
 )
 @pytest.mark.parametrize("greet", [False, True])
 async def test_garbage_closes_the_peer_with_a_reason_and_nothing_else(
@@ -305,8 +305,53 @@ async def test_other_version_is_refused(caplog: pytest.LogCaptureFixture) -> Non
     async with Master().server as server:
         url = f"ws://127.0.0.1:{server.port}"
         async with connect(url, additional_headers=headers(), proxy=None) as old:
-            await old.send(encode(hello()).replace('"version":1', '"version":99'))
-            assert '"t":"Refused"' in str(await old.recv())
+            await old.send(encode(hello()).replace(f'"version":{CONTROL_VERSION}', '"version":99'))
+            refusal = str(await old.recv())
+            assert '"t":"Refused"' in refusal
+            assert "upgrade the older one" in refusal
+
+
+async def test_a_task_set_of_the_release_before_works_beside_newer_ones() -> None:
+    master = Master()
+    async with master.server, TaskSet(master.server.port).running() as robots:
+        await robots.channel.wait_connected()
+        url = f"ws://127.0.0.1:{master.server.port}"
+        async with connect(url, additional_headers=headers(), proxy=None) as old:
+            text = '{"t":"Hello","version":1,"kind":"container","process":"old","machine":{"name":"m"}}'
+            await old.send(text)
+            assert '"t":"Welcome"' in str(await old.recv())
+            (_, first), (peer, second) = [await master.hellos.get() for _ in range(2)]
+            assert (first.version, second.version) == (CONTROL_VERSION, 1)
+            assert peer.features == frozenset()
+            await old.send('{"t":"Teleport","where":"mars"}')  # of a later release: passed over
+            await old.send(encode(Left(id="u/r", reason="of old")))
+            while not isinstance(message := await master.messages.get(), Left):
+                pass
+            assert message.reason == "of old"
+        await robots.channel.login("still here", "r", "p")
+
+
+async def test_orders_of_a_later_master_are_passed_over() -> None:
+    taken: asyncio.Queue[ToTaskSet] = asyncio.Queue()
+
+    async def serve_one(socket: ServerConnection) -> None:
+        await socket.recv()
+        await socket.send(encode(Welcome(version=CONTROL_VERSION, master="m")))
+        await socket.send('{"t":"Teleport","where":"mars"}')
+        await socket.send(encode(Notify(id="u", text="after it")))
+        await socket.wait_closed()
+
+    async with serve(serve_one, "127.0.0.1", 0) as server:
+        port = server.sockets[0].getsockname()[1]
+        channel = TaskSetChannel(f"ws://127.0.0.1:{port}", SECRET, hello, taken.put, timeouts=QUICK)
+        task = asyncio.create_task(channel.run())
+        try:
+            while not isinstance(message := await taken.get(), Notify):
+                pass
+            assert message.text == "after it"
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
 
 
 async def test_refusal_is_logged_and_tried_again(caplog: pytest.LogCaptureFixture) -> None:
