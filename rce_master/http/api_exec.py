@@ -34,10 +34,11 @@ CHECK_S = 60.0
     query=(OF_USER,),
     media="application/octet-stream",
     status=101,
+    acts=True,
 )
 async def execute(call: Call) -> web.StreamResponse:
     """Run a command."""
-    id_ = f"{call.owner}/{call.path('container')}"
+    id_ = f"{call.controlled_owner}/{call.path('container')}"
     peer = call.services.reconciler.task_set_of(id_)
     user = web.WebSocketResponse(compress=False, heartbeat=HEARTBEAT_S, max_msg_size=MAX_COMMAND + 1)
     if not user.can_prepare(call.request):
@@ -45,6 +46,10 @@ async def execute(call: Call) -> web.StreamResponse:
     await user.prepare(call.request)
     try:
         command = await _first(user)
+        program = command.argv[0] if command.argv else "a shell"  # arguments may hold secrets
+        call.services.audit.add(
+            call.caller.name, "execute", id_, detail=f"program {program}", address=call.address
+        )
         async with call.services.executions.open(peer, id_, command) as machine:
             await _relay(call, user, machine)
     except (MasterError, ValueError, TimeoutError) as error:

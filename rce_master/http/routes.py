@@ -119,8 +119,16 @@ class Call:
             Forbidden: Somebody else's are asked for.
             NotFound: There is no such user.
         """
+        return self._owner(looks=self.request.method == "GET")
+
+    @property
+    def controlled_owner(self) -> str:
+        """The same for a GET that changes something, such as a command's WebSocket."""
+        return self._owner(looks=False)
+
+    def _owner(self, *, looks: bool) -> str:
         name = self.request.query.get("user", self.caller.name)
-        looks = self.request.method == "GET" and self.caller.role.sees_all
+        looks = looks and self.caller.role.sees_all
         if name != self.caller.name and not self.is_admin and not looks:
             raise Forbidden("only an administrator controls, and only roles above user see, what others have")
         if name not in self.services.realm.tables.users:
@@ -187,6 +195,8 @@ class Route:
     """Whether who may only look may use it all the same."""
     open: bool = False
     """Whether it can be used without a token."""
+    acts: bool = False
+    """Whether it changes something though it is a GET."""
     query: tuple[Query, ...] = ()
     upload: str = ""
     """Media type of a body that the handler reads itself."""

@@ -176,6 +176,12 @@ async def test_only_the_owner_and_administrators_run_commands() -> None:
         assert code == 125
         assert b"administrator" in error
         assert (await execute(owner, "--user", "testUser", "box", "true"))[0] == 0
+        for role in ("viewer", "operator"):
+            await owner.rce("user", "add", role, "--role", role, "--password-stdin", typed=f"{role}\n")
+            looker = Owner(engine, role)
+            await looker.login()
+            assert (await execute(looker, "--user", "testUser", "box", "id"))[0] == 125
+        assert "execute" in await owner.rce("audit")
         url = f"{engine.url}api/v1/containers/box/exec"
         async with aiohttp.ClientSession() as session:
             async with session.get(url) as reply:
