@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hmac
+import logging
 import os
 import secrets
 import stat
@@ -18,6 +19,8 @@ from rce.config.folders import run_dir
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+_log = logging.getLogger(__name__)
 
 SECRET_VARIABLE = "RCE_SECRET"  # noqa: S105 - the variable's name
 SECRET_FILE_VARIABLE = "RCE_SECRET_FILE"  # noqa: S105
@@ -42,8 +45,13 @@ class Secret:
         return cls(secrets.token_urlsafe(32))
 
     def reveal(self) -> str:
-        """Return the text."""
+        """Return the text to show."""
         return self._text
+
+    def was_refused(self, text: str) -> bool:
+        """Note that a text that was shown was refused; return whether there is another one to show."""
+        del text
+        return False
 
     def matches(self, text: str) -> bool:
         """Compare in a time that does not depend on where the two differ."""
@@ -63,6 +71,63 @@ class Secret:
         return "Secret('***')"
 
     __str__ = __repr__
+
+
+class SecretFile(Secret):
+    """The secret in a file, which may change while programs run.
+
+    Each line is a secret: the first is the current one, the others are still accepted. So a secret is changed
+    without an end to anything: the new one goes before the old one (:func:`rotate_secret`), then into every
+    machine's file, and at last the old one goes (:func:`retire_secrets`). A file that cannot be read for a
+    moment changes nothing.
+
+    Raises:
+        SecretError: The file cannot be read, holds no good secret, or others can read it.
+    """
+
+    __slots__ = ("_file", "_refused", "_seen", "_texts")
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._seen = _stamp(file)
+        self._texts = _read_lines(file)
+        self._refused: set[str] = set()
+        super().__init__(self._texts[0])
+
+    def reveal(self) -> str:
+        """Return the text to show: the current one, or another that was not refused where that was."""
+        self._look()
+        return next((text for text in self._texts if text not in self._refused), self._texts[0])
+
+    def matches(self, text: str) -> bool:
+        """Compare with all that are accepted, in a time that does not depend on where they differ."""
+        self._look()
+        given = text.encode("utf-8", "surrogateescape")
+        found = [hmac.compare_digest(known.encode(), given) for known in self._texts]
+        return any(found)
+
+    def was_refused(self, text: str) -> bool:
+        """Note that a text that was shown was refused; return whether there is another one to show."""
+        self._refused.add(text)
+        if all(known in self._refused for known in self._texts):
+            self._refused.clear()
+            return False
+        return True
+
+    def _look(self) -> None:
+        """Read the file again if it changed."""
+        try:
+            stamp = _stamp(self._file)
+            if stamp == self._seen:
+                return
+            self._seen = stamp
+            self._texts = _read_lines(self._file)
+        except SecretError as error:
+            _log.error("the former secret stays in use: %s", error)
+            return
+        self._text = self._texts[0]
+        self._refused.clear()
+        _log.info("%s was read again: %d accepted", self._file, len(self._texts))
 
 
 def load_secret(
@@ -131,6 +196,45 @@ def read_secret(file: Path) -> Secret:
     Raises:
         SecretError: It cannot be read, is too short, or others can read it.
     """
+    return SecretFile(file) if file.is_file() else Secret(_read_lines(file)[0])
+
+
+def rotate_secret(file: Path) -> None:
+    """Put a new secret before the one in a file, which stays accepted.
+
+    Raises:
+        SecretError: The file cannot be read or written, or holds a former secret still.
+    """
+    texts = _read_lines(file)
+    if len(texts) > 1:
+        raise SecretError(
+            f"{file} holds a former secret still; when every machine has the file, run: rce secret retire"
+        )
+    _replace(file, [Secret.generate().reveal(), *texts])
+
+
+def retire_secrets(file: Path) -> int:
+    """Remove all secrets from a file but the current one; return how many.
+
+    Raises:
+        SecretError: The file cannot be read or written.
+    """
+    current, *former = _read_lines(file)
+    if former:
+        _replace(file, [current])
+    return len(former)
+
+
+def _stamp(file: Path) -> tuple[int, int, int]:
+    try:
+        found = file.stat()
+    except OSError as error:
+        raise SecretError(f"cannot read the secret from {file}: {error}") from error
+    return found.st_ino, found.st_mtime_ns, found.st_size
+
+
+def _read_lines(file: Path) -> list[str]:
+    """Read the secrets of a file, the current one first."""
     try:
         mode = file.stat().st_mode
         text = file.read_text("ascii")
@@ -138,7 +242,27 @@ def read_secret(file: Path) -> Secret:
         raise SecretError(f"cannot read the secret from {file}: {error}") from error
     if stat.S_ISREG(mode) and mode & (stat.S_IRWXG | stat.S_IRWXO) & ~stat.S_IRGRP:
         raise SecretError(f"{file} can be read by everybody; run: chmod 600 {file}")
-    return Secret(text)
+    lines = [line for line in text.splitlines() if line.strip()]
+    return [Secret(line).reveal() for line in lines or [""]]
+
+
+def _replace(file: Path, texts: list[str]) -> None:
+    """Write a file whole or not at all, with the owner and the rights that it has."""
+    aside = file.with_name(f".{file.name}.{os.getpid()}")
+    try:
+        was = file.stat()
+        descriptor = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+        with os.fdopen(descriptor, "w", encoding="ascii") as output:
+            output.write("".join(f"{text}\n" for text in texts))
+            output.flush()
+            os.fsync(descriptor)
+            os.fchmod(descriptor, stat.S_IMODE(was.st_mode))
+            if (was.st_uid, was.st_gid) != (os.geteuid(), os.getegid()):
+                os.fchown(descriptor, was.st_uid, was.st_gid)
+        aside.replace(file)
+    except OSError as error:
+        aside.unlink(missing_ok=True)
+        raise SecretError(f"cannot write the secret {file}: {error}") from error
 
 
 def shared_dev_secret(folder: Path) -> Secret:

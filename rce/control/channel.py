@@ -195,13 +195,14 @@ class TaskSetChannel:
 
     async def _connect_once(self) -> float:
         """Run one connection to its end; return how long to wait before the next, in seconds."""
+        shown = self._secret.reveal()
         try:
             async with asyncio.timeout(self._timeouts.open):
                 sock = await open_url_socket(self._url)
             async with connect(
                 self._url,
                 sock=sock,
-                additional_headers={"Authorization": f"Bearer {self._secret.reveal()}"},
+                additional_headers={"Authorization": f"Bearer {shown}"},
                 ssl=None if self._tls is None else self._tls(),
                 compression=None,
                 proxy=None,
@@ -218,6 +219,9 @@ class TaskSetChannel:
         except InvalidStatus as error:
             status = error.response.status_code
             if status in (HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN):
+                if self._secret.was_refused(shown):
+                    _log.info("the master at %s refuses one of our secrets; showing the other", self._url)
+                    return self._next_delay()
                 _log.error("the master at %s refuses our secret (HTTP %d)", self._url, status)
                 return self._timeouts.backoff_refused
             body = bytes(error.response.body or b"")[:_MOST_SAID].decode(errors="replace").strip()

@@ -138,6 +138,7 @@ class ContentClient:
         return Piece(body, int(found[1]))
 
     async def _get(self, path: str, offset: int) -> tuple[int, dict[str, str], bytes]:
+        shown = self._secret.reveal()
         tls = None if self._tls is None else self._tls()
         sock = await open_socket(self._host, self._port)
         reader, writer = await asyncio.open_connection(
@@ -150,12 +151,15 @@ class ContentClient:
                 target=path,
                 headers=[
                     ("Host", f"{self._host}:{self._port}"),
-                    ("Authorization", f"Bearer {self._secret.reveal()}"),
+                    ("Authorization", f"Bearer {shown}"),
                     ("Range", f"bytes={offset}-"),
                 ],
             )
             writer.write(connection.send(request) or b"")
-            return await _response(connection, reader)
+            answer = await _response(connection, reader)
+            if answer[0] == HTTPStatus.UNAUTHORIZED:
+                self._secret.was_refused(shown)  # the next attempt shows the other one, if there is one
+            return answer
         finally:
             writer.close()
             with contextlib.suppress(OSError):

@@ -6,6 +6,7 @@ import asyncio
 import logging
 from http import HTTPStatus
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 import msgspec
 from websockets.asyncio.server import serve
@@ -49,6 +50,9 @@ _log = logging.getLogger(__name__)
 
 STRANGERS_PER_ADDRESS = PER_ADDRESS
 """Connections from one address that have not shown the secret yet."""
+
+SECRET_CHECK_S = 1.0
+"""How often it is looked whether the secrets that were shown are still accepted."""
 
 _GARBAGE, _POLICY, _INTERNAL, _GOING_AWAY = 1007, 1008, 1011, 1001
 _MAX_REASON = 123  # bytes of a WebSocket close frame's reason
@@ -105,6 +109,9 @@ class ControlServer:
         self._port = port
         self._timeouts = timeouts
         self._peers: dict[str, Peer] = {}
+        self._shown: WeakKeyDictionary[ServerConnection, str] = WeakKeyDictionary()
+        """What each task set that is connected proved itself by."""
+        self._watcher: asyncio.Task[None] | None = None
         self._server: Server | None = None
 
     @property
@@ -139,16 +146,29 @@ class ControlServer:
             close_timeout=self._timeouts.close,
             max_size=MAX_FRAME,
         )
+        self._watcher = asyncio.create_task(self._watch_secret())
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         assert self._server is not None
+        if self._watcher is not None:
+            self._watcher.cancel()
         self._server.close(code=_GOING_AWAY, reason="the master is shutting down")
         if self._gate is not None:
             await self._gate.close()
         await self._server.wait_closed()
+
+    async def _watch_secret(self) -> None:
+        """End the connections of task sets that proved themselves by a secret that is accepted no more."""
+        while True:
+            await asyncio.sleep(SECRET_CHECK_S)
+            for socket, shown in list(self._shown.items()):
+                if not self._secret.matches(shown):
+                    del self._shown[socket]
+                    _log.info("the task set at %s must show the new secret", socket.remote_address)
+                    await socket.close(_POLICY, "the engine's secret was changed; show the new one")
 
     async def _admit(self, socket: ServerConnection, request: Request) -> Response | None:
         refusal = self._authenticate(socket, request)
@@ -161,6 +181,7 @@ class ControlServer:
         scheme, _, token = given[0].partition(" ") if len(given) == 1 else ("", "", "")
         if scheme.lower() == "bearer" and self._secret.matches(token.strip()):
             assert isinstance(socket, GuardedConnection)
+            self._shown[socket] = token.strip()
             socket.become_known()
             return None
         _log.warning("a task set at %s came with a wrong secret", socket.remote_address)
