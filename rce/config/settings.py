@@ -77,6 +77,36 @@ class MasterSettings(Section, frozen=True, kw_only=True):
             "Addresses or networks of proxies whose `X-Forwarded-For` is believed.", option="trusted-proxy"
         ),
     ] = ()
+    requests_per_second: Annotated[
+        float,
+        Meta(ge=0),
+        Setting(
+            "Requests of one user each second over REST, and as many over WebSockets; 0: no limit. No limit "
+            "of one user applies to administrators, but those of packages."
+        ),
+    ] = 100.0
+    request_burst: Annotated[
+        int, Meta(ge=1), Setting("Requests of one user that may come at once, after a rest.")
+    ] = 2000
+    max_streams: Annotated[
+        int, Meta(ge=0), Setting("Streams of events and usage of one user at a time; 0: no limit.")
+    ] = 64
+    max_log_reads: Annotated[int, Meta(ge=1), Setting("Reads of logs of one user at a time.")] = 4
+    user_share: Annotated[
+        float,
+        Meta(ge=0, le=1),
+        Setting(
+            "Share of the slots, cores and memory of all machines that the containers of one user may take "
+            "together; 0: no limit."
+        ),
+    ] = 0.75
+    max_containers: Annotated[int, Meta(ge=0), Setting("Containers of one user; 0: no limit.")] = 200
+    max_packages: Annotated[
+        int, Meta(ge=0), Setting("Versions of packages that one user may keep; 0: no limit.")
+    ] = 200
+    max_disk: Annotated[Memory, Setting("What the files of one user's packages may take; 0: no limit.")] = (
+        4 << 30
+    )
     max_slots: Annotated[
         int,
         Meta(ge=0),

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from rce.config.folders import default_state_dir
 from rce_master.auth import Authenticator, client_digest
-from rce_master.cli import credentials
+from rce_master.cli import credentials, limits
 from rce_master.cli.client import ApiClient, run
 from rce_master.cli.exceptions import CliError, NotLoggedIn
 from rce_master.cli.session import read_password
@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 
     from rce_master.store import Store
 
-app = typer.Typer(no_args_is_help=True, help="Add, list and remove users, change passwords.")
+app = typer.Typer(no_args_is_help=True, help="Add, list and remove users, change passwords and limits.")
+app.command("show")(limits.show)
+app.command("limit")(limits.limit)
 
 StateDir = Annotated[
     Path | None,

@@ -92,6 +92,21 @@ class PasswordIn(_In):
     """The password until now; needed to change one's own."""
 
 
+class LimitsIn(_In):
+    """What a user may have from now on; left out: as before. 0: no limit; ``default``: as all users."""
+
+    containers: Amount | None = None
+    slots: Amount | None = None
+    cpu: Amount | None = None
+    """Cores."""
+    memory: Amount | None = None
+    """MB, or a text such as ``8G``."""
+    packages: Amount | None = None
+    """Versions."""
+    disk: Amount | None = None
+    """Of the packages' files; MB, or a text such as ``2G``."""
+
+
 class ContainerIn(_In):
     """A container to make. Zero or empty means: no wish."""
 
@@ -245,6 +260,23 @@ class UserOut(BaseModel):
     created: float
     robots: int
     containers: int
+
+
+class LimitOut(BaseModel):
+    """How much of something a user may have, and has. Memory and disk in bytes."""
+
+    limit: float
+    """0: no limit."""
+    used: float
+    source: str
+    """``user``: set for this one; ``all``: for all users; ``machines``: a share of what the machines have."""
+
+
+class UserLimitsOut(UserOut):
+    """A user with what they may have."""
+
+    limits: dict[str, LimitOut]
+    """``containers``, ``slots``, ``cpu``, ``memory``, ``packages``, ``disk``."""
 
 
 class RobotOut(BaseModel):

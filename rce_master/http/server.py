@@ -30,6 +30,7 @@ from rce_master.http import (
     api_audit,
     api_control,
     api_exec,
+    api_limits,
     api_machines,
     api_packages,
     api_read,
@@ -56,6 +57,7 @@ MAX_BODY = 1 << 20
 
 ROUTES: list[Route] = [
     *api_account.routes,
+    *api_limits.routes,
     *api_tokens.routes,
     *api_audit.routes,
     *api_read.routes,

@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING
 from rce.control.limits import MEGABYTE, MIN_MEMORY
 from rce.control.messages import TaskSetKind
 from rce.control.model import Network, Resources
-from rce.protocol.quantities import write_cores
 from rce.protocol.wishes import DEFAULT_PREFIX
-from rce_master.exceptions import Conflict, Forbidden, Invalid, LimitReached
+from rce_master.exceptions import Conflict, Forbidden, Invalid
+from rce_master.state import limits
 from rce_master.state.placement import Room
 from rce_master.state.records import Container, TaskSet, UserRole, tombstone_key
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from rce_master.state.changes import Transaction
     from rce_master.state.tables import Tables
 
@@ -142,7 +140,7 @@ def check_wish(tx: Transaction, user: str, id_: str, wish: Resources) -> None:
     _check_group(wish, others)
     if tx.tables.users[user].role is not UserRole.ADMIN:
         _check_privileges(wish)
-        _check_sums(tx, [wish, *(c.resources for c in others)])
+    limits.check_wishes(tx, user, [wish, *(c.resources for c in others)])
 
 
 def _check_privileges(wish: Resources) -> None:
@@ -150,24 +148,6 @@ def _check_privileges(wish: Resources) -> None:
         raise Forbidden("network: host is for containers of administrators; use none or group")
     if wish.image.startswith("/"):
         raise Forbidden("image: folders of the machine are for administrators; use an OCI image's name")
-
-
-def _check_sums(tx: Transaction, wishes: list[Resources]) -> None:
-    settings = tx.settings
-    sums: list[tuple[float, Callable[[Resources], float], str]] = [
-        (settings.max_slots, lambda wish: max(1, wish.size), "slots"),
-        (settings.max_cpu, lambda wish: wish.cpu, "cores"),
-        (settings.max_memory / MEGABYTE, lambda wish: wish.memory / MEGABYTE, "MB of memory"),
-    ]
-    for most, amount, what in sums:
-        if not most:
-            continue
-        asked = sum(map(amount, wishes))
-        if asked > most + 1e-6:
-            raise LimitReached(
-                f"your containers would have {write_cores(asked)} {what} in all, and you may have "
-                f"{write_cores(most)}; make others smaller (rce resize) or destroy them"
-            )
 
 
 def _check_group(wish: Resources, others: list[Container]) -> None:

@@ -25,6 +25,7 @@ from rce_master.state.records import (
     Token,
     Tombstone,
     User,
+    UserLimits,
 )
 from rce_master.store.base import Row
 
@@ -139,6 +140,7 @@ class Transaction:
         record: User
         | Token
         | KnownLogin
+        | UserLimits
         | PackageKey
         | Bundle
         | Endpoint
@@ -235,6 +237,7 @@ class Transaction:
             User: tables.users,
             Token: tables.tokens,
             KnownLogin: tables.known_logins,
+            UserLimits: tables.user_limits,
             PackageKey: tables.package_keys,
             Bundle: tables.bundles,
             Robot: tables.endpoints,

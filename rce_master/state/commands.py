@@ -97,6 +97,15 @@ class RemoveToken:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SetLimits:
+    """Change what a user may have."""
+
+    user: str
+    limits: dict[str, float | None]
+    """By fields of :class:`rce_master.state.records.UserLimits`: how much, 0: no limit, None: as for all."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RememberLogin:
     """Keep the mark of a password that was right."""
 
@@ -353,6 +362,7 @@ Command: TypeAlias = (
     | RevokeToken
     | RevokeRobotToken
     | RememberLogin
+    | SetLimits
     | AddPackageKey
     | RemovePackageKey
     | AddBundle

@@ -18,7 +18,7 @@ from rce.control.model import (
 )
 from rce.protocol.wishes import find_circle
 from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
-from rce_master.state import capacity, draining, endpoints, packages, placing
+from rce_master.state import capacity, draining, endpoints, limits, packages, placing
 from rce_master.state.lifecycle import ContainerEvent, ContainerPhase, next_phase
 from rce_master.state.records import Container, ContainerLive
 
@@ -60,8 +60,7 @@ def create_container(tx: Transaction, command: CreateContainer) -> None:
         return
     if there is not None:
         raise Conflict(f"{command.tag!r} is a robot already; a container needs another tag")
-    if len(tx.tables.containers(command.user)) >= tx.settings.max_containers:
-        raise LimitReached(f"you have {tx.settings.max_containers} containers already; destroy one first")
+    limits.check_containers(tx, command.user)
     capacity.check_wish(tx, command.user, id_, command.resources)
     made = Container(
         id=id_,

@@ -13,6 +13,7 @@ from rce.bundles.versions import newest, split_package
 from rce.control.model import BundleSpec
 from rce.protocol.names import is_name, is_version
 from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
+from rce_master.state import limits
 from rce_master.state.records import Bundle, Container, bundle_key, package_key_key
 
 if TYPE_CHECKING:
@@ -97,18 +98,13 @@ def check_room(tables: Tables, settings: StateSettings, user: str, packed: int, 
     Raises:
         LimitReached: There are too many, or they are too large.
     """
-    kept = tables.bundles.by("user", user)
-    if len(kept) >= settings.max_packages:
-        raise LimitReached(f"you have {len(kept)} versions of packages already; remove one first")
-    for what, held, most in (
-        ("archives", packed + sum(bundle.packed for bundle in kept), settings.max_package_bytes),
-        ("files", size + sum(bundle.size for bundle in kept), settings.max_package_size),
-    ):
-        if held > most:
-            raise LimitReached(
-                f"the {what} of your packages would have {held} bytes, {most} are allowed;"
-                " remove a version first"
-            )
+    limits.check_packages(tables, settings, user, size)
+    held = packed + sum(bundle.packed for bundle in tables.bundles.by("user", user))
+    if held > settings.max_package_bytes:
+        raise LimitReached(
+            f"the archives of your packages would have {held} bytes, {settings.max_package_bytes} are"
+            " allowed; remove a version first"
+        )
 
 
 def remove_bundle(tx: Transaction, command: RemoveBundle) -> None:

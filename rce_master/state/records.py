@@ -92,6 +92,21 @@ class Token(Struct, frozen=True, kw_only=True):
         return bool(self.expires) and self.expires <= now
 
 
+class UserLimits(Struct, frozen=True, kw_only=True):
+    """What one user may have, where that is not as for all. None: as for all; 0: no limit."""
+
+    user: str
+    containers: float | None = None
+    slots: float | None = None
+    cpu: float | None = None
+    """Cores."""
+    memory: float | None = None
+    """Bytes."""
+    packages: float | None = None
+    disk: float | None = None
+    """Bytes of the packages' files."""
+
+
 class KnownLogin(Struct, frozen=True, kw_only=True):
     """A password that was right once, so that it need not be hashed again."""
 

@@ -24,10 +24,13 @@ class StateSettings:
     max_robots: int = 2000
     """Of one user."""
     max_containers: int = 1000
-    """Of one user."""
+    """Of one user; 0 for no limit. This and the next four do not apply to administrators. They, and those
+    of packages, can be set for single users."""
+    user_share: float = 0.0
+    """Share of what all machines have (slots, cores, memory) that one user's containers may take together;
+    0 for no limit."""
     max_slots: int = 0
-    """All containers of one user together, as ``size`` counts them; 0 for no limit. This and the next two
-    do not apply to administrators."""
+    """All containers of one user together, as ``size`` counts them; 0 for no limit."""
     max_cpu: float = 0.0
     """Cores that one user's containers may ask for together; 0 for no limit."""
     max_memory: int = 0

@@ -25,6 +25,7 @@ from rce_master.state.records import (
     Token,
     Tombstone,
     User,
+    UserLimits,
 )
 
 if TYPE_CHECKING:
@@ -141,7 +142,7 @@ class Table(Generic[R]):
 class Tables:
     """All tables.
 
-    - ``known_logins``: at most one for each user.
+    - ``known_logins``, ``user_limits``: at most one for each user.
     - ``endpoints``: robots and containers; both in one table, because a tag is unique among both.
     - ``links``: one for each pair of endpoints that has a connection.
     - ``live``: exactly one record for each endpoint.
@@ -155,6 +156,7 @@ class Tables:
         self.users = Table[User]("users", type_=User, key=lambda u: u.name)
         self.tokens = Table[Token]("tokens", type_=Token, key=lambda t: t.digest, user=lambda t: [t.user])
         self.known_logins = Table[KnownLogin]("known_logins", type_=KnownLogin, key=lambda k: k.user)
+        self.user_limits = Table[UserLimits]("user_limits", type_=UserLimits, key=lambda u: u.user)
         self.package_keys = Table[PackageKey](
             "package_keys", type_=PackageKey, key=lambda k: k.id, user=lambda k: [k.user]
         )
@@ -195,6 +197,7 @@ class Tables:
             self.users,
             self.tokens,
             self.known_logins,
+            self.user_limits,
             self.package_keys,
             self.bundles,
             self.endpoints,

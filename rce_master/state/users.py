@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from rce.protocol.names import is_name
 from rce_master.exceptions import Conflict, Invalid, NotFound
-from rce_master.state import endpoints, packages, robots, tokens
+from rce_master.state import endpoints, limits, packages, robots, tokens
 from rce_master.state.records import User, UserRole
 
 if TYPE_CHECKING:
@@ -67,6 +67,7 @@ def remove_user(tx: Transaction, command: RemoveUser) -> None:
     for token in tx.tables.tokens.by("user", user.name):
         tokens.forget(tx, token, "the user was removed")
     packages.forget_user(tx, user.name)
+    limits.forget(tx, user.name)
     tx.delete(tx.tables.users, user.name)
     tx.happen("user_removed", user.name, user="")
 

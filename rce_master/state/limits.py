@@ -1,0 +1,173 @@
+"""What one user may have, and what they have: containers, what these ask for, packages."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+from msgspec.structs import asdict, replace
+
+from rce.control.limits import MEGABYTE
+from rce.control.messages import TaskSetKind
+from rce.protocol.quantities import write_cores
+from rce_master.exceptions import LimitReached, NotFound
+from rce_master.state.records import UserLimits, UserRole
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from rce.control.model import Resources
+    from rce_master.state.changes import Transaction
+    from rce_master.state.commands import SetLimits
+    from rce_master.state.settings import StateSettings
+    from rce_master.state.tables import Tables
+
+KINDS = ("containers", "slots", "cpu", "memory", "packages", "disk")
+_OF_MACHINES = ("slots", "cpu", "memory")
+_UNITS = {"cpu": "cores", "memory": "MB of memory"}
+_EPSILON = 1e-6
+
+
+class Limit(NamedTuple):
+    """How much of a kind a user may have. Memory and disk are in bytes."""
+
+    kind: str
+    most: float
+    """0: no limit."""
+    source: str
+    """``user``: set for this one; ``all``: for all users; ``machines``: a share of what the machines have."""
+
+
+def set_limits(tx: Transaction, command: SetLimits) -> None:
+    """Change what a user may have; what is there already stays."""
+    if command.user not in tx.tables.users:
+        raise NotFound(f"there is no user {command.user!r}")
+    there = tx.tables.user_limits.get(command.user) or UserLimits(user=command.user)
+    tx.put(replace(there, **command.limits))
+    told = ", ".join(
+        f"{kind} {'as for all' if most is None else most}" for kind, most in command.limits.items()
+    )
+    tx.happen("user_limits_changed", command.user, told, user=command.user)
+
+
+def forget(tx: Transaction, user: str) -> None:
+    """Forget what was set for a user."""
+    if user in tx.tables.user_limits:
+        tx.delete(tx.tables.user_limits, user)
+
+
+def limit_of(tables: Tables, settings: StateSettings, user: str, kind: str) -> Limit:
+    """Tell how much of a kind a user may have."""
+    own = tables.user_limits.get(user)
+    if own is not None and (most := asdict(own)[kind]) is not None:
+        return Limit(kind, most, "user")
+    if tables.users[user].role is UserRole.ADMIN and kind not in ("packages", "disk"):
+        return Limit(kind, 0, "all")
+    most = getattr(settings, _SETTINGS[kind])
+    share = settings.user_share * _offered(tables, kind) if kind in _OF_MACHINES else 0
+    if share and (not most or share < most):
+        return Limit(kind, max(1, int(share)) if kind == "slots" else share, "machines")
+    return Limit(kind, most, "all")
+
+
+def used_of(tables: Tables, user: str) -> dict[str, float]:
+    """Tell how much of each kind a user has."""
+    wishes = [container.resources for container in tables.containers(user)]
+    bundles = tables.bundles.by("user", user)
+    return {
+        "containers": len(wishes),
+        **{kind: _asked(wishes, kind) for kind in _OF_MACHINES},
+        "packages": len(bundles),
+        "disk": sum(bundle.size for bundle in bundles),
+    }
+
+
+def check_containers(tx: Transaction, user: str) -> None:
+    """Check that a user may have one more container.
+
+    Raises:
+        LimitReached: There are as many as they may have.
+    """
+    limit = limit_of(tx.tables, tx.settings, user, "containers")
+    if limit.most and len(tx.tables.containers(user)) >= limit.most:
+        raise LimitReached(
+            f"you have {limit.most:g} containers already; destroy one first, or {_advice(user, 'containers')}"
+        )
+
+
+def check_wishes(tx: Transaction, user: str, wishes: list[Resources]) -> None:
+    """Check what a user's containers ask for together.
+
+    Raises:
+        LimitReached: It is more than they may have.
+    """
+    for kind in _OF_MACHINES:
+        limit = limit_of(tx.tables, tx.settings, user, kind)
+        asked = _asked(wishes, kind)
+        if limit.most and asked > limit.most + _EPSILON:
+            share = (
+                f", {tx.settings.user_share:.0%} of what the machines have"
+                if limit.source == "machines"
+                else ""
+            )
+            raise LimitReached(
+                f"your containers would have {_plain(kind, asked)} {_UNITS.get(kind, kind)} in all, and you "
+                f"may have {_plain(kind, limit.most)}{share}; make others smaller (rce resize) or destroy "
+                f"them, or {_advice(user, kind)}"
+            )
+
+
+def check_packages(tables: Tables, settings: StateSettings, user: str, size: int) -> None:
+    """Check that a user may keep one more version of a package.
+
+    Args:
+        tables: What there is.
+        settings: The limits.
+        user: Whose it is.
+        size: Bytes of its files, as far as they are known.
+
+    Raises:
+        LimitReached: There are too many, or they are too large.
+    """
+    used = used_of(tables, user)
+    limit = limit_of(tables, settings, user, "packages")
+    if limit.most and used["packages"] >= limit.most:
+        raise LimitReached(
+            f"you have {used['packages']:g} versions of packages already; remove one first, "
+            f"or {_advice(user, 'packages')}"
+        )
+    limit = limit_of(tables, settings, user, "disk")
+    if limit.most and used["disk"] + size > limit.most:
+        raise LimitReached(
+            f"the files of your packages would have {used['disk'] + size:.0f} bytes, {limit.most:.0f} are "
+            f"allowed; remove a version first, or {_advice(user, 'disk')}"
+        )
+
+
+_SETTINGS = {
+    "containers": "max_containers",
+    "slots": "max_slots",
+    "cpu": "max_cpu",
+    "memory": "max_memory",
+    "packages": "max_packages",
+    "disk": "max_package_size",
+}
+
+
+def _offered(tables: Tables, kind: str) -> float:
+    """Count what all machines have that are known, also of those that are away."""
+    machines = [s.machine for s in tables.task_sets if s.kind is TaskSetKind.CONTAINER]
+    return sum({"slots": m.slots, "cpu": m.cores, "memory": m.memory}[kind] for m in machines)
+
+
+def _asked(wishes: Iterable[Resources], kind: str) -> float:
+    if kind == "slots":
+        return sum(max(1, wish.size) for wish in wishes)
+    return sum(wish.cpu if kind == "cpu" else wish.memory for wish in wishes)
+
+
+def _plain(kind: str, amount: float) -> str:
+    return write_cores(amount / MEGABYTE if kind == "memory" else amount)
+
+
+def _advice(user: str, kind: str) -> str:
+    return f"have an administrator allow more: rce user limit {user} --{kind}"
