@@ -9,9 +9,10 @@ from typing import Any
 
 import uvloop
 
-from benchmarks import abuse, containers, fanout, rate, roundtrip, sandboxes, stalled
+from benchmarks import abuse, bridge, containers, fanout, rate, roundtrip, sandboxes, stalled
 from benchmarks.engine import RunningEngine, engine
 from benchmarks.figures import plot_round_trips, save, show
+from benchmarks.targets import RATIOS
 
 Rows = list[dict[str, Any]]
 
@@ -22,7 +23,7 @@ async def _memory(running: RunningEngine) -> Rows:
 
 def suites(*, quick: bool) -> dict[str, tuple[str, Callable[[RunningEngine], Awaitable[Rows]]]]:
     """What can be measured, by name."""
-    sizes = roundtrip.SIZES[::4] if quick else roundtrip.SIZES
+    sizes = tuple(RATIOS["converter"]) if quick else roundtrip.SIZES
     passes, seconds = (1, 3.0) if quick else (3, 10.0)
     return {
         "memory": ("Memory of each task set, idle", _memory),
@@ -42,6 +43,7 @@ def suites(*, quick: bool) -> dict[str, tuple[str, Callable[[RunningEngine], Awa
             "Beside another user's abuse",
             lambda e: abuse.run(e, seconds=5.0 if quick else 20.0),
         ),
+        "bridge": ("rce-ros on a robot", lambda e: bridge.run(e, seconds=seconds)),
         "stalled": ("One client stops reading", lambda e: stalled.run(e, seconds=seconds)),
     }
 

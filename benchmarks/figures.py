@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
+import subprocess
 import time
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
@@ -33,6 +34,8 @@ def spread(seconds: Sequence[float]) -> dict[str, float]:
 def machine() -> dict[str, Any]:
     """What was measured on."""
     return {
+        "commit": commit(),
+        "processor": processor(),
         "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "cores": psutil.cpu_count(),
         "load_1min": round(psutil.getloadavg()[0], 1),
@@ -41,6 +44,26 @@ def machine() -> dict[str, Any]:
         "python": platform.python_version(),
         "rce": version("rce"),
     }
+
+
+def commit() -> str:
+    """The commit that was measured, with ``+`` if files were changed since; empty outside of a checkout."""
+    folder = Path(__file__).resolve().parent
+    argv = ["git", "-C", str(folder), "describe", "--always", "--abbrev=10", "--dirty=+", "--exclude=*"]
+    try:
+        done = subprocess.run(argv, check=False, capture_output=True, text=True)
+    except OSError:
+        return ""
+    return done.stdout.strip()
+
+
+def processor() -> str:
+    """The processor's name; empty where the kernel does not tell it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return ""
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
 
 
 def show(title: str, rows: Sequence[Mapping[str, Any]]) -> None:

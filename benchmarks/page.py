@@ -1,0 +1,117 @@
+"""Makes the tables of ``docs/performance.md`` from ``benchmarks/summary.json`` (``python -m benchmarks.page``).
+
+A table stands between ``<!-- figures: NAME -->`` and ``<!-- end -->``: the name of a suite, ``roundtrips`` for
+round trips side by side, or ``targets``. With ``--check`` nothing is written; a page that differs ends with 1.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from benchmarks.summary import SUMMARY
+from benchmarks.targets import TARGETS, Target
+
+PAGE = Path(__file__).resolve().parent.parent / "docs" / "performance.md"
+
+_BLOCK = re.compile(r"(<!-- figures: (?P<name>[\w.]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+_PATHS = ("bare websockets echo", "forwarder", "converter", "service")
+
+
+def made(page: str, summary: dict[str, Any]) -> str:
+    """Return a page with its tables made anew."""
+
+    def fill(found: re.Match[str]) -> str:
+        return f"{found[1]}\n{block(found['name'], summary)}\n{found[3]}"
+
+    return _BLOCK.sub(fill, page)
+
+
+def block(name: str, summary: dict[str, Any]) -> str:
+    """Return a table, and what it was measured on."""
+    if name == "targets":
+        return "\n".join(_targets(summary)) + "\n"
+    suite = "roundtrip" if name == "roundtrips" else name
+    if suite not in summary:
+        return f'Not measured yet: `make bench ARGS="--only {suite}"`.\n'
+    rows = summary[suite]["rows"]
+    lines = _round_trips(rows) if name == "roundtrips" else _table(rows)
+    return f"{_measured(summary[suite]['machine'])}\n\n" + "\n".join(lines) + "\n"
+
+
+def _measured(machine: dict[str, Any]) -> str:
+    commit = f", commit {machine['commit']}" if machine.get("commit") else ""
+    return (
+        f"{machine['date'][:10]}{commit}; {machine['cores']} cores{_processor(machine)},"
+        f" {machine['memory_gb']:g} GB, Python {machine['python']}; load of the machine {machine['load_1min']:g}."
+    )
+
+
+def _processor(machine: dict[str, Any]) -> str:
+    return f" ({machine['processor']})" if machine.get("processor") else ""
+
+
+def _table(rows: list[dict[str, Any]]) -> Iterator[str]:
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    yield f"| {' | '.join(columns)} |"
+    yield "|" + "---|" * len(columns)
+    for row in rows:
+        yield f"| {' | '.join(_shown(row.get(name, '')) for name in columns)} |"
+
+
+def _round_trips(rows: list[dict[str, Any]]) -> Iterator[str]:
+    """Paths side by side, p10 / p50 in ms; then the median in times of the bare echo's."""
+    found = {(row["path"], row["bytes"]): row for row in rows}
+    engine = _PATHS[1:]
+    yield f"| bytes | {' | '.join(_PATHS)} | {' | '.join(f'{path}, x bare' for path in engine)} |"
+    yield "|" + "---:|" * (1 + len(_PATHS) + len(engine))
+    for size in dict.fromkeys(row["bytes"] for row in rows):
+        cells = [str(size)]
+        for path in _PATHS:
+            row = found.get((path, size))
+            cells.append(f"{row['p10_ms']:.2f} / {row['p50_ms']:.2f}" if row else "")
+        cells += [_shown(found.get((path, size), {}).get("x bare", "")) for path in engine]
+        yield f"| {' | '.join(cells)} |"
+
+
+def _targets(summary: dict[str, Any]) -> Iterator[str]:
+    yield "| | measured | target | |"
+    yield "|---|---:|---:|---|"
+    for target in TARGETS:
+        entry = summary.get(target.suite)
+        figure = None if entry is None else target.read(entry["rows"])
+        yield f"| {target.what} | {_judged(target, figure)} |"
+
+
+def _judged(target: Target, figure: float | None) -> str:
+    wanted = f"{'≥' if target.at_least else '≤'} {target.limit:g} {target.unit}"
+    if figure is None:
+        return f"not measured | {wanted} | "
+    verdict = "met" if target.is_met(figure) else "**missed**"
+    return f"{figure:g} {target.unit} | {wanted} | {verdict}"
+
+
+def _shown(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def main(check: bool) -> int:
+    """Write the page, or tell whether it is current."""
+    summary = json.loads(SUMMARY.read_text(encoding="utf-8"))
+    page = PAGE.read_text(encoding="utf-8")
+    wanted = made(page, summary)
+    if page == wanted:
+        return 0
+    if check:
+        print(f"{PAGE.name} is not what {SUMMARY.name} gives: run `python -m benchmarks.page`")
+        return 1
+    PAGE.write_text(wanted, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main("--check" in sys.argv[1:]))

@@ -1,0 +1,84 @@
+"""What the engine should reach, and which row of which suite tells whether it does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+Rows = Sequence[Mapping[str, Any]]
+
+RATIOS = {
+    "converter": {20: 2.9, 784: 2.7, 6951: 3.0, 61584: 3.0, 545559: 3.0, 4832930: 3.5, 10000000: 3.0},
+    "forwarder": {20: 2.5, 784: 2.5, 6951: 2.5, 61584: 3.0, 545559: 2.5, 4832930: 2.5, 10000000: 2.0},
+}
+"""Round trip in times of a bare echo's in the same run, by bytes: half of rosbridge's time or less."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A figure that is wanted."""
+
+    what: str
+    suite: str
+    read: Callable[[Rows], float | None]
+    """Finds the figure; None: the rows do not hold it."""
+    limit: float
+    unit: str
+    at_least: bool = False
+
+    def is_met(self, figure: float) -> bool:
+        """Tell whether a figure is good enough."""
+        return figure >= self.limit if self.at_least else figure <= self.limit
+
+
+def _column(column: str, **where: Any) -> Callable[[Rows], float | None]:
+    """Read a column of the last row in which other columns have these values."""
+
+    def read(rows: Rows) -> float | None:
+        found = [row for row in rows if all(row.get(key) == value for key, value in where.items())]
+        return _number(found[-1].get(column)) if found else None
+
+    return read
+
+
+def _number(value: Any) -> float | None:
+    """Read a figure; texts such as ``7.6 s`` by their number."""
+    return None if value is None else float(str(value).split()[0])
+
+
+_ROUND_TRIPS = [
+    Target(
+        f"{path}, {size} bytes, p50",
+        "roundtrip",
+        _column("x bare", path=path, bytes=size),
+        limit,
+        "x bare echo",
+    )
+    for path, limits in RATIOS.items()
+    for size, limit in limits.items()
+]
+
+TARGETS = [
+    *_ROUND_TRIPS,
+    Target(
+        "messages of 64 B, 32 in flight, converter",
+        "rate",
+        _column("messages/s", path="converter"),
+        6000,
+        "/s",
+        at_least=True,
+    ),
+    Target("fan-out to 200 at 20 Hz, p95", "fanout", _column("p95_ms", clients=200), 20, "ms"),
+    Target(
+        "one client stalls: what the others get",
+        "stalled",
+        _column("share %", phase="it still stalls"),
+        95,
+        "%",
+        at_least=True,
+    ),
+    Target("container start to first message, p50", "start", _column("p50_ms"), 250, "ms"),
+    Target("100 containers at once", "many", _column("all at once", containers=100), 20, "s"),
+    Target("idle container, PSS", "many", _column("idle container PSS MB"), 15, "MB"),
+]
