@@ -1,7 +1,8 @@
-"""Makes the tables of ``docs/performance.md`` from ``benchmarks/summary.json`` (``python -m benchmarks.page``).
+"""Makes the tables of the performance page from the summary of the benchmarks: ``python -m benchmarks.page``.
 
-A table stands between ``<!-- figures: NAME -->`` and ``<!-- end -->``: the name of a suite, ``roundtrips`` for
-round trips side by side, or ``targets``. With ``--check`` nothing is written; a page that differs ends with 1.
+A table stands between ``<!-- figures: NAME -->`` and ``<!-- end -->``: the name of a suite, ``roundtrips``
+for round trips side by side, or ``targets``. With ``--check`` nothing is written; a page that differs ends
+with 1.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ def _measured(machine: dict[str, Any]) -> str:
     commit = f", commit {machine['commit']}" if machine.get("commit") else ""
     return (
         f"{machine['date'][:10]}{commit}; {machine['cores']} cores{_processor(machine)},"
-        f" {machine['memory_gb']:g} GB, Python {machine['python']}; load of the machine {machine['load_1min']:g}."
+        f" {machine['memory_gb']:g} GB, Python {machine['python']}; load {machine['load_1min']:g}."
     )
 
 

@@ -1,7 +1,8 @@
 """Keeps the newest result of each suite in ``benchmarks/summary.json``: ``python -m benchmarks.summary``.
 
 Raw results are in ``benchmarks/results/`` and belong to a machine; the summary is committed, and the
-performance page is made from it (``python -m benchmarks.page``). A suite that was not measured again keeps its result.
+performance page is made from it (``python -m benchmarks.page``). A suite that was not measured again keeps
+its result.
 """
 
 from __future__ import annotations
