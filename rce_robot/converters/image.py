@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 MAX_PIXELS = 1 << 25
 """Largest image that is decoded: a small file can hold a huge one."""
+MAX_BYTES = 64 << 20
+"""The same for its pixels in memory; a larger message is not passed on."""
 
 _FAST = 1
 """Level of PNG compression; more costs much time and saves little on camera images."""
@@ -109,6 +111,9 @@ def _load(data: bytes | bytearray | memoryview) -> tuple[Image, dict[str, str]]:
             raise ValueError(
                 f"the image has {image.width} x {image.height} pixels, at most {MAX_PIXELS} are taken"
             )
+        size = image.width * image.height * len(image.getbands())
+        if size > MAX_BYTES:
+            raise ValueError(f"the image's pixels take {size} bytes, at most {MAX_BYTES} are taken")
         image.load()
     except UnidentifiedImageError:
         raise ValueError("the binary value is neither PNG nor JPEG") from None

@@ -128,3 +128,47 @@ async def test_all_users_together_have_a_bound_too(robot_of: Any) -> None:
         data = {"iTag": "none", "type": STRING, "msgID": "m", "msg*": f"{1:032x}"}
         await good.send(json.dumps({"type": "DM", "data": data}))
         assert "none" in (await robot_of(good).get("ER")), "what the other user sent first is still there"
+
+
+async def test_latched_messages_over_the_limit_are_given_up_oldest_first() -> None:
+    """The robot is away; 60 latched topics bring 60 MB, of which its user may hold 20."""
+    async with running_cloud(PATIENT, user_memory=20 * MIB) as cloud:
+        ends = [await cloud.wire(f"map{number}", "PublisherForwarder", STRING) for number in range(60)]
+        async with dial(cloud, "testUser", "testRobot"):
+            for end in ends:
+                await end.active.until(lambda end=end: end.is_active)
+        for end in ends:
+            end.port.send(bytes(MIB), latched=True)
+        await cloud.master.changed.until(
+            lambda: cloud.master.usage is not None and cloud.master.usage.held > 15 * MIB
+        )
+        assert cloud.master.usage is not None
+        assert cloud.master.usage.held <= 20 * MIB
+
+
+async def test_a_burst_of_latched_messages_reaches_a_robot_that_reads() -> None:
+    """More than the queues of a robot hold comes at once, when it comes back."""
+    count, size = 12, 8 * MIB
+    async with running_cloud(PATIENT) as cloud:
+        ends = [await cloud.wire(f"map{number}", "PublisherForwarder", STRING) for number in range(count)]
+        async with dial(cloud, "testUser", "testRobot"):
+            for end in ends:
+                await end.active.until(lambda end=end: end.is_active)
+        for end in ends:
+            end.port.send(bytes(size), latched=True)
+        await cloud.master.changed.until(
+            lambda: cloud.master.usage is not None and cloud.master.usage.held >= count * size
+        )
+        query = f"userID=testUser&robotID=testRobot&password={DIGEST}"
+        async with connect(f"{cloud.ws_url}?{query}", proxy=None, compression=None, max_size=None) as robot:
+            tags = set()
+            binaries = 0
+            async with asyncio.timeout(60):
+                while len(tags) < count or binaries < count:
+                    frame = await robot.recv()
+                    if isinstance(frame, bytes):
+                        binaries += 1
+                        assert len(frame) == size + 32
+                    elif (message := json.loads(frame))["type"] == "DM":
+                        tags.add(message["data"]["iTag"])
+            assert tags == {f"map{number}" for number in range(count)}

@@ -92,8 +92,8 @@ def test_pictures_of_other_programs_are_taken(data: Any, encoding: str) -> None:
     assert image.step * image.height == len(image.data)
 
 
-def _bomb(width: int, height: int) -> bytes:
-    head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+def _bomb(width: int, height: int, colour: int = 0) -> bytes:
+    head = struct.pack(">IIBBBBB", width, height, 8, colour, 0, 0, 0)
     chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(b"\0")), (b"IEND", b""))
     made = (struct.pack(">I", len(b)) + k + b + struct.pack(">I", zlib.crc32(k + b)) for k, b in chunks)
     return b"\x89PNG\r\n\x1a\n" + b"".join(made)
@@ -106,6 +106,7 @@ def _bomb(width: int, height: int) -> bytes:
         (picture(form="GIF"), "neither PNG nor JPEG"),
         (picture("L", (64, 64))[:-40], "damaged"),
         (_bomb(MAX_PIXELS, 2), "pixels"),
+        (_bomb(5000, 5000, 6), "pixels take 100000000 bytes"),
         (_bomb(10**5, 10**5), "too large"),
         ("cG5n", "PNG or JPEG as binary value, or an object"),
         (5, "PNG or JPEG as binary value, or an object"),
