@@ -7,6 +7,7 @@ import contextlib
 import hashlib
 import io
 import json
+import os
 import struct
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -198,4 +199,5 @@ async def attack(kind: str, url: str) -> None:
 
 
 if __name__ == "__main__":
+    os.nice(19)  # who attacks has a machine of their own
     uvloop.run(attack(sys.argv[1], sys.argv[2]))

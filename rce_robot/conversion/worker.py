@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 MAX_TEXT = 64 << 20
 """Longest text that is sent to a robot, in bytes; clients take no longer ones."""
-_NICE = 5
+_NICE = 10
 _MAX_WARNINGS = 256
 
 
