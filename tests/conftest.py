@@ -29,9 +29,11 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("rce")
 
+# A shell's background jobs ignore it, or nohup, and so would all programs that tests start and interrupt.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    # A shell's background jobs ignore it, and so would all programs that tests start and interrupt.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def _runs(*argv: str) -> bool:

@@ -129,6 +129,7 @@ def _kill(traces: Traces, name: str) -> None:
 
 async def main(seed: int, count: int) -> int:
     """Go through moments; returns how many left something."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # what nohup ignores, its programs ignore, too
     dice = random.Random(seed)
     bad = 0
     for number in range(count):
