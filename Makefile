@@ -41,7 +41,7 @@ fuzz: install
 		$(wildcard tests/integration/*/test_*_fuzz.py tests/integration/*/test_openapi.py) $(ARGS)
 
 test-quick: install
-	$(BIN)/python -m pytest -n logical --durations=5 tests/unit $(ARGS)
+	$(BIN)/python -m pytest -n logical --hypothesis-profile=quick --durations=5 tests/unit $(ARGS)
 
 lint: install
 	$(BIN)/ruff check .

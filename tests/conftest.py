@@ -27,6 +27,7 @@ WORKERS_PER_CORE = 2
 hypothesis.settings.register_profile(
     "rce", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
 )
+hypothesis.settings.register_profile("quick", hypothesis.settings.get_profile("rce"), max_examples=20)
 hypothesis.settings.load_profile("rce")
 
 # A shell's background jobs ignore it, or nohup, and so would all programs that tests start and interrupt.
@@ -183,6 +184,19 @@ def missing(tool: str) -> str | None:
     return None if check() else reason
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_configure(config: pytest.Config) -> None:
+    """Keep ``tmp_path`` short in parallel runs: paths of sockets in it have at most 107 bytes."""
+    if _is_worker(config):
+        config.option.basetemp = tempfile.mkdtemp(prefix="rce-t-", dir="/tmp")
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Remove a worker's folder, unless a test failed that one may want to look into."""
+    if _is_worker(session.config) and not session.testsfailed:
+        shutil.rmtree(session.config.option.basetemp, ignore_errors=True)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Keep tests together, in one worker of a parallel run, that share what is made once or is the machine's.
 
@@ -230,13 +244,6 @@ def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.Tes
         report.outcome = "failed"
         report.longrepr = f"{reason}; a skip is a failure here (RCE_REQUIRE_ALL=1)"
     return report
-
-
-@pytest.fixture
-def short_folder() -> Iterator[Path]:
-    """A folder for sockets: their paths have at most 107 bytes, and ``tmp_path`` is long in parallel runs."""
-    with tempfile.TemporaryDirectory(prefix="rce-", dir="/tmp") as name:
-        yield Path(name)
 
 
 @pytest.fixture(scope="session")

@@ -182,13 +182,13 @@ def test_what_vanishes_while_it_is_looked_at_is_passed_over(
     assert archive.find("of_bob") is not None
 
 
-def test_the_logs_of_a_state_folder_outlive_the_container(short_folder: Path) -> None:
-    with StateFolder(short_folder / "state", short_folder / "run") as state:
+def test_the_logs_of_a_state_folder_outlive_the_container(tmp_path: Path) -> None:
+    with StateFolder(tmp_path / "state", tmp_path / "run") as state:
         folder = state.create(BOX)
         (folder.logs / "node.000000000000.log").write_bytes(b"ohello\n")
         assert [one.logs for one in state.existing()] == [folder.logs]
         folder.remove()
         state.archive.end(BOX, folder.mark, "destroyed", 10.0)
-    with StateFolder(short_folder / "state", short_folder / "run") as state:
+    with StateFolder(tmp_path / "state", tmp_path / "run") as state:
         assert read(state.archive) == "hello\n"
-        assert (short_folder / "state" / "logs").stat().st_mode & 0o077 == 0
+        assert (tmp_path / "state" / "logs").stat().st_mode & 0o077 == 0

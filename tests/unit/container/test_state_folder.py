@@ -10,11 +10,11 @@ from rce_container.exceptions import StateError
 from rce_container.folder import Record, StateFolder
 
 
-def test_the_name_is_kept(short_folder: Path) -> None:
-    with StateFolder(short_folder / "state", short_folder / "run") as state:
+def test_the_name_is_kept(tmp_path: Path) -> None:
+    with StateFolder(tmp_path / "state", tmp_path / "run") as state:
         name = state.name("")
         assert state.name("") == name
-    with StateFolder(short_folder / "state", short_folder / "run") as state:
+    with StateFolder(tmp_path / "state", tmp_path / "run") as state:
         assert state.name("") == name
         assert state.name("mine") == "mine"
         assert state.name("") == "mine"
@@ -22,32 +22,32 @@ def test_the_name_is_kept(short_folder: Path) -> None:
             state.name("a b")
 
 
-def test_one_task_set_at_a_time(short_folder: Path) -> None:
+def test_one_task_set_at_a_time(tmp_path: Path) -> None:
     with (
-        StateFolder(short_folder / "state", short_folder / "run"),
+        StateFolder(tmp_path / "state", tmp_path / "run"),
         pytest.raises(StateError, match="another rce-container"),
-        StateFolder(short_folder / "state", short_folder / "run"),
+        StateFolder(tmp_path / "state", tmp_path / "run"),
     ):
         pass
 
 
-def test_a_run_folder_that_is_too_long(short_folder: Path) -> None:
+def test_a_run_folder_that_is_too_long(tmp_path: Path) -> None:
     with (
         pytest.raises(StateError, match="XDG_RUNTIME_DIR"),
-        StateFolder(short_folder / "state", short_folder / ("x" * 90)),
+        StateFolder(tmp_path / "state", tmp_path / ("x" * 90)),
     ):
         pass
 
 
-def test_records_and_removal(short_folder: Path) -> None:
-    with StateFolder(short_folder / "state", short_folder / "run") as state:
+def test_records_and_removal(tmp_path: Path) -> None:
+    with StateFolder(tmp_path / "state", tmp_path / "run") as state:
         folder = state.create("user/box")
         assert folder.read_record() is None
         record = Record(id="user/box", mark=folder.mark, runtime="process", pid=1, start=2)
         folder.write_record(record)
         (found,) = state.existing()
         assert found.read_record() == record
-        outside = short_folder / "outside"
+        outside = tmp_path / "outside"
         outside.mkdir()
         (outside / "file").touch()
         locked = folder.home / "locked"
@@ -58,4 +58,4 @@ def test_records_and_removal(short_folder: Path) -> None:
         found.remove()
         assert list(state.existing()) == []
         assert (outside / "file").exists()
-    assert not list((short_folder / "run").iterdir())
+    assert not list((tmp_path / "run").iterdir())
