@@ -9,7 +9,7 @@ from typing import Any
 
 import uvloop
 
-from benchmarks import abuse, bridge, containers, fanout, rate, roundtrip, sandboxes, stalled
+from benchmarks import abuse, bridge, containers, fanout, rate, roundtrip, sandboxes, stalled, tls
 from benchmarks.engine import RunningEngine, engine
 from benchmarks.figures import plot_round_trips, save, show
 from benchmarks.targets import RATIOS
@@ -44,6 +44,7 @@ def suites(*, quick: bool) -> dict[str, tuple[str, Callable[[RunningEngine], Awa
             lambda e: abuse.run(e, seconds=5.0 if quick else 20.0),
         ),
         "bridge": ("rce-ros on a robot", lambda e: bridge.run(e, seconds=seconds)),
+        "tls": ("TLS on the robot's connection", lambda e: tls.run(e, passes=passes)),
         "stalled": ("One client stops reading", lambda e: stalled.run(e, seconds=seconds)),
     }
 

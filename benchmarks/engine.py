@@ -27,6 +27,7 @@ class RunningEngine:
     url: str
     folder: Path
     pid: int
+    control_port: int
 
     def processes(self) -> list[psutil.Process]:
         """Every process of the engine: task sets, environments, nodes."""
@@ -121,7 +122,7 @@ async def engine(runtime: str = "auto") -> AsyncIterator[RunningEngine]:
         else:
             raise RuntimeError("the engine did not start:\n" + "\n".join(log))
         drain = asyncio.create_task(_drain(child))
-        yield RunningEngine(f"http://127.0.0.1:{ports[0]}/", folder, child.pid)
+        yield RunningEngine(f"http://127.0.0.1:{ports[0]}/", folder, child.pid, ports[1])
     finally:
         await child.stop(timeout=60)
         if drain is not None:

@@ -43,7 +43,7 @@ async def measure(trip: Trip, size: int) -> list[float]:
 
 def forwarder_trip(client: Robot) -> Trip:
     """By topic, serialized messages passed through."""
-    payloads = {size: serialized_string(size) for size in SIZES}
+    payloads = {size: serialized_string(size) for size in (20, *SIZES)}
 
     async def trip(size: int) -> None:
         await client.send_forwarded("request", payloads[size])
@@ -55,7 +55,7 @@ def forwarder_trip(client: Robot) -> Trip:
 
 def converter_trip(client: Robot) -> Trip:
     """By topic, JSON on the robot's side."""
-    texts = {size: "x" * size for size in SIZES}
+    texts = {size: "x" * size for size in (20, *SIZES)}
 
     async def trip(size: int) -> None:
         message = {"iTag": "request", "type": STRING, "msgID": "nil", "msg": {"data": texts[size]}}
@@ -68,7 +68,7 @@ def converter_trip(client: Robot) -> Trip:
 
 def service_trip(client: Robot) -> Trip:
     """By service, JSON on the robot's side."""
-    texts = {size: "x" * size for size in SIZES}
+    texts = {size: "x" * size for size in (20, *SIZES)}
 
     async def trip(size: int) -> None:
         message = {"iTag": "service", "type": ECHO, "msgID": "1", "msg": {"data": texts[size]}}

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
+import ssl
 import struct
 import urllib.request
 from collections.abc import AsyncIterator
@@ -92,15 +93,26 @@ class Robot:
         await self.socket.send(_ID + payload)
 
 
+async def locate(master: str) -> str:
+    """Ask a master for the URL of a robot endpoint."""
+    query = "userID=testUser&version=20130902"
+    with await asyncio.to_thread(urllib.request.urlopen, f"{master}?{query}", timeout=10) as reply:
+        return str(_read(reply.read())["url"])
+
+
 @contextlib.asynccontextmanager
 async def robot(master: str, name: str) -> AsyncIterator[Robot]:
     """Connect a robot of testUser."""
-    query = "userID=testUser&version=20130902"
-    with await asyncio.to_thread(urllib.request.urlopen, f"{master}?{query}", timeout=10) as reply:
-        url = _read(reply.read())["url"]
+    async with robot_at(await locate(master), name) as found:
+        yield found
+
+
+@contextlib.asynccontextmanager
+async def robot_at(url: str, name: str, tls: ssl.SSLContext | None = None) -> AsyncIterator[Robot]:
+    """Connect a robot of testUser to a certain endpoint."""
     password = hashlib.sha256(b"testUser").hexdigest()
     target = f"{url}?userID=testUser&robotID={name}&password={password}"
-    async with connect(target, max_size=None, compression=None, ping_interval=None) as socket:
+    async with connect(target, ssl=tls, max_size=None, compression=None, ping_interval=None) as socket:
         yield Robot(socket, name)
 
 

@@ -102,6 +102,9 @@ class RobotSocket(GuardedConnection):
         _add_frame(buffers, _FIN_TEXT, b"", message.text)
         for head, body in message.binaries:
             _add_frame(buffers, _FIN_BINARY, head, body)
+        if len(buffers) > 1 and sum(map(len, buffers)) < _JOIN_BELOW:
+            self.transport.write(b"".join(buffers))  # one system call, and in TLS one record
+            return
         last = buffers.pop()
         if buffers:
             self.transport.writelines(buffers)

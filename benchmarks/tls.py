@@ -1,0 +1,108 @@
+"""What TLS on the robot's connection costs: round trips to a node with and without it, in turn."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import os
+import ssl
+from collections.abc import AsyncIterator
+from time import perf_counter
+from typing import Any
+
+from benchmarks.engine import BIN, RunningEngine, free_ports
+from benchmarks.figures import percentile
+from benchmarks.roundtrip import converter_trip, forwarder_trip
+from benchmarks.wire import Robot, locate, robot_at, wire_echo
+from rce.supervision.process import Child
+from rce.tls.folder import CertificateFolder
+
+SIZES = (20, 6951, 61584)
+PAIRS = 600
+WARM_UP = 50
+TARGET = {20: 1.15}
+"""Most that the median may grow, by bytes."""
+_TRIPS = {"Converter": converter_trip, "Forwarder": forwarder_trip}
+
+
+@contextlib.asynccontextmanager
+async def tls_endpoint(running: RunningEngine) -> AsyncIterator[tuple[str, ssl.SSLContext]]:
+    """Run another robot endpoint of the engine, whose robots connect in TLS.
+
+    Yields:
+        Its URL, and what trusts it.
+    """
+    certificates = CertificateFolder(running.folder / "bench-certificates")
+    certificates.make_authority()
+    certificates.issue("endpoint", ("127.0.0.1",))
+    (port,) = free_ports(1)
+    argv = [str(BIN / "rce-robot"), "127.0.0.1", "--dev", "--control-port", str(running.control_port)]
+    argv += ["--ws-port", str(port), "--link-port", "0"]
+    argv += ["--tls-cert", str(certificates.certificate("endpoint"))]
+    argv += ["--tls-key", str(certificates.key("endpoint"))]
+    env = os.environ | {"XDG_RUNTIME_DIR": str(running.folder)}
+    child = await Child.start("rce-robot", argv, env=env)
+    try:
+        lines = child.lines()
+        async for line in lines:
+            if "ready:" in line:
+                break
+        drain = asyncio.create_task(_drain(child))
+        yield f"wss://127.0.0.1:{port}/", ssl.create_default_context(cafile=certificates.authority)
+        drain.cancel()
+    finally:
+        await child.stop()
+
+
+async def _drain(child: Child) -> None:
+    async for _ in child.lines():
+        pass
+
+
+async def run(running: RunningEngine, *, passes: int) -> list[dict[str, Any]]:
+    """Measure both, trip by trip in turn, with new containers in each pass."""
+    times: dict[tuple[str, int, str], list[float]] = {}
+    plain_url = await locate(running.url)  # while there is one endpoint only
+    async with tls_endpoint(running) as (url, trusting):
+        for number in range(passes):
+            for form in _TRIPS:
+                async with (
+                    robot_at(plain_url, f"plain{form}{number}") as plain,
+                    robot_at(url, f"tls{form}{number}", trusting) as secured,
+                ):
+                    for client in (plain, secured):
+                        await wire_echo(client, form, f"c{client.name}")
+                    await _measure(form, plain, secured, times)
+                    for client in (plain, secured):
+                        await client.send("DC", {"containerTag": f"c{client.name}"})
+    return [_row(form, size, times) for form in _TRIPS for size in SIZES]
+
+
+async def _measure(
+    form: str, plain: Robot, secured: Robot, times: dict[tuple[str, int, str], list[float]]
+) -> None:
+    trips = {"plain": _TRIPS[form](plain), "tls": _TRIPS[form](secured)}
+    for size in SIZES:
+        gc.collect()
+        for number in range(WARM_UP + PAIRS):
+            for name, trip in trips.items():
+                start = perf_counter()
+                await trip(size)
+                if number >= WARM_UP:
+                    times.setdefault((form, size, name), []).append(perf_counter() - start)
+
+
+def _row(form: str, size: int, times: dict[tuple[str, int, str], list[float]]) -> dict[str, Any]:
+    plain, secured = times[form, size, "plain"], times[form, size, "tls"]
+    ratio = percentile(secured, 0.5) / percentile(plain, 0.5)
+    target = TARGET.get(size)
+    return {
+        "form": form,
+        "bytes": size,
+        "plain p50_ms": round(1e3 * percentile(plain, 0.5), 4),
+        "tls p50_ms": round(1e3 * percentile(secured, 0.5), 4),
+        "x plain (p50)": round(ratio, 3),
+        "x plain (p10)": round(percentile(secured, 0.1) / percentile(plain, 0.1), 3),
+        "target": "" if target is None else f"{target:.2f} {'met' if ratio <= target else 'missed'}",
+    }
