@@ -90,3 +90,6 @@ async def test_https(open_door: Any, tmp_path: Path) -> None:
             "wss://here:1/",
             False,
         )
+        door.body = '{"url": "ws://here:1/"}'
+        with pytest.raises(RefusedError, match="sends robots to ws://here:1/, which is not encrypted"):
+            await locate(door.url, "u", tls=ssl.create_default_context(cafile=str(cert)))

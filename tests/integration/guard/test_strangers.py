@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import ssl
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING
 
@@ -19,10 +20,15 @@ from rce.link.frames import FrameReader, check_answer, encode_hello
 from rce.link.handover import Doorman, HandoverReceiver, HandoverSender
 from rce.link.hub import LinkHub
 from rce.link.settings import LinkLimits, LinkTimeouts
+from rce.tls.folder import CertificateFolder
+from rce.tls.identity import TlsFiles, TlsIdentity
 from rce.web.server import HttpServer
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from rce.tls.identity import Context
 
 ADDRESS = "127.0.0.1"
 FEW = 8
@@ -94,13 +100,13 @@ async def _stream(request: web.Request) -> web.StreamResponse:
 
 
 @asynccontextmanager
-async def web_server() -> AsyncIterator[tuple[HttpServer, asyncio.Event]]:
+async def web_server(tls: Context | None = None) -> AsyncIterator[tuple[HttpServer, asyncio.Event]]:
     app = web.Application()
     go = asyncio.Event()
     app[GO] = go
     app.router.add_get("/", _answer)
     app.router.add_get("/stream", _stream)
-    async with HttpServer(app, ADDRESS, 0, lobby=Lobby("test", per_address=FEW)) as server:
+    async with HttpServer(app, ADDRESS, 0, tls, lobby=Lobby("test", per_address=FEW)) as server:
         yield server, go
 
 
@@ -112,6 +118,26 @@ async def test_http_answers(first: bytes) -> None:
         port = int(server.url.rstrip("/").rpartition(":")[2])
         async with held_open(port, first), session.get(server.url) as response:
             assert await response.text() == "here"
+        assert server.lobby.turned_away >= MANY - FEW
+        assert len(server.lobby) <= FEW
+
+
+@pytest.mark.parametrize("first", [b"", b"\x16", b"\x16\x03\x01\x02\x00\x01\x00"])
+async def test_https_answers_beside_unfinished_handshakes(first: bytes, tmp_path: Path) -> None:
+    """Connections are counted from the first byte on, not from the end of the handshake."""
+    certificates = CertificateFolder(tmp_path)
+    certificates.make_authority()
+    certificates.issue("here", (ADDRESS,))
+    files = TlsFiles(certificates.certificate("here"), certificates.key("here"))
+    async with web_server(TlsIdentity(files).server) as (server, _):
+        port = int(server.url.rstrip("/").rpartition(":")[2])
+        async with held_open(port, first):
+            trusting = ssl.create_default_context(cafile=certificates.authority)
+            reader, writer = await asyncio.open_connection(ADDRESS, port, ssl=trusting)
+            writer.write(b"GET / HTTP/1.1\r\nHost: h\r\nConnection: close\r\n\r\n")
+            assert (await reader.read()).endswith(b"here")
+            writer.close()
+            await writer.wait_closed()
         assert server.lobby.turned_away >= MANY - FEW
         assert len(server.lobby) <= FEW
 
