@@ -20,6 +20,7 @@ import pytest
 import pytest_asyncio
 from support.engine import engine_processes, free_ports, until
 
+from rce.ros.core import Core
 from rce.tls.folder import CertificateFolder
 from rce_client import Connection
 from rce_client.exceptions import RefusedError
@@ -252,6 +253,49 @@ async def test_login_keeps_the_authority_for_other_commands(world: World) -> Non
     code, text = await world.run(BIN / "rce", "user", "list")
     assert code == 0, text
     assert "testUser" in text
+
+
+@in_world
+@pytest.mark.parametrize("way", ["option", "key of the file"])
+async def test_rce_ros_connects_with_the_authority(world: World, tmp_path: Path, way: str) -> None:
+    file = tmp_path / "robot.config"
+    config = {"url": world.url, "userID": "testUser", "password": "testUser", "robotID": "bridged"}
+    if way != "option":
+        config["authority"] = world.authority
+    file.write_text(json.dumps(config))
+    async with Core(port=0) as core:
+        process = await asyncio.create_subprocess_exec(
+            *(str(BIN / "rce-ros"), str(file), "--ros-master-uri", core.uri),
+            *(["--authority", world.authority] if way == "option" else []),
+            stdout=asyncio.subprocess.PIPE,
+            env=world.env,
+        )
+        assert process.stdout is not None
+        async with asyncio.timeout(60):
+            assert b"rce-ros ready: robot bridged connected" in await process.stdout.readline()
+        process.send_signal(signal.SIGTERM)
+        await process.communicate()
+
+
+@in_world
+async def test_station_serves_its_page_in_tls(world: World) -> None:
+    (port,) = free_ports(1)
+    async with Core(port=0) as core:
+        process = await asyncio.create_subprocess_exec(
+            *(str(BIN / "rce"), "ui", "--ros-master", core.uri, "--port", str(port), "--tls"),
+            *("--certificates", str(world.certificates.path)),
+            env=world.env,
+        )
+        url = f"https://127.0.0.1:{port}/"
+
+        async def answers() -> bool:
+            assert process.returncode is None
+            code, text = await world.curl("--cacert", world.authority, url)
+            return code == 0 and "<html" in text
+
+        await until(answers, timeout=60, what="the station's page")
+        process.send_signal(signal.SIGTERM)
+        await process.wait()
 
 
 @in_world

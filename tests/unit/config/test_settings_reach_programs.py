@@ -10,7 +10,7 @@ import typer.main
 from msgspec.structs import replace
 from typer import Typer
 
-from rce.cli.up import bound_to, programs
+from rce.cli.up import bound_to, programs, warning
 from rce.config.fields import fields_of, sections_of
 from rce.config.settings import (
     ContainerSettings,
@@ -21,6 +21,7 @@ from rce.config.settings import (
     Runtime,
     TlsSettings,
 )
+from rce.tls.choice import WARNED_VARIABLE
 from rce_container.__main__ import OPTIONS as CONTAINER
 from rce_container.__main__ import app as container
 from rce_master.__main__ import OPTIONS as MASTER
@@ -104,6 +105,22 @@ def test_one_address_for_all_programs(host: str) -> None:
     assert {one.master.bind for one in found.values()} == {host}, "the command line counts, even here"
     assert {one.robot.bind for one in found.values()} == {host}
     assert {one.container.bind for one in found.values()} == {host}
+
+
+@pytest.mark.parametrize(
+    ("host", "tls", "warns"),
+    [("0.0.0.0", False, True), ("127.0.0.1", False, False), ("0.0.0.0", True, False)],
+)
+def test_one_warning_beyond_loopback_without_tls(
+    host: str, tls: bool, warns: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of ``rce up`` itself; its programs are told to be silent."""
+    monkeypatch.delenv(WARNED_VARIABLE, raising=False)
+    settings = bound_to(host, EngineSettings(tls=TlsSettings(enabled=tls)))
+    text = warning(settings)
+    assert (text is not None) == warns
+    assert "\n" not in (text or "")
+    assert all(WARNED_VARIABLE in program.env for program in programs(settings))
 
 
 def test_bad_address_is_refused() -> None:
