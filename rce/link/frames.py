@@ -21,13 +21,13 @@ into it.
 
 from __future__ import annotations
 
-import io
 import struct
 from enum import IntEnum
 from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
+from rce.buffers import unfilled
 from rce.link.exceptions import LinkRefused, ProtocolError
 from rce.link.settings import KIB
 
@@ -184,11 +184,7 @@ def check_answer(frame: Frame) -> None:
 
 
 class _Message:
-    """A message that is being received.
-
-    ``BytesIO`` is used because it is the one place of the standard library where bytes can be filled in place
-    and then taken as ``bytes`` without copying them.
-    """
+    """A message that is being received; handed on only when all of its memory was filled."""
 
     __slots__ = ("_buffer", "filled", "first", "total", "view")
 
@@ -196,9 +192,7 @@ class _Message:
         self.first = first
         self.total = total
         self.filled = 0
-        self._buffer = io.BytesIO()
-        self._buffer.seek(total - 1)
-        self._buffer.write(b"\0")
+        self._buffer = unfilled(total)
         self.view = self._buffer.getbuffer()
 
     def write(self, data: memoryview) -> None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import io
 import struct
 
+from rce.buffers import unfilled
 from rce.ros.errors import MalformedFrame
 
 MAX_FRAME = 2**28
@@ -139,9 +140,9 @@ class FrameReader:
     def _begin_large(self, body: int, length: int) -> None:
         """Give an incomplete frame memory of its own and move there what has come of it."""
         self._need = length
-        self._large = io.BytesIO()
         self._have = self._end - body
-        self._extend(min(length, max(_FIRST_TRUST, self._have)))
+        self._large = unfilled(min(length, max(_FIRST_TRUST, self._have)))
+        self._view = self._large.getbuffer()
         self._view[: self._have] = self._scratch[body : self._end]
         self._begin = self._end
 
