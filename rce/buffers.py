@@ -13,8 +13,8 @@ _new_bytes.argtypes = (ctypes.c_char_p, ctypes.c_ssize_t)
 def unfilled(size: int) -> io.BytesIO:
     """Return a buffer of a size with whatever was in its memory before.
 
-    ``getbuffer`` lends the memory to be filled, and ``getvalue`` then hands it over as ``bytes``, both without
-    copying. Setting it to zero first would take as long as filling it. All of it must be filled before
+    ``getbuffer`` lends the memory to be filled, and ``getvalue`` then hands it over as ``bytes``; neither
+    copies. Setting it to zero first would take as long as filling it. All of it must be filled before
     anything of it is passed on.
 
     Args:
