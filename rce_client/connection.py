@@ -17,7 +17,8 @@ from enum import Enum
 from typing import TYPE_CHECKING, Any, NoReturn, Self, TypeVar
 
 from rce.protocol.codec import encode
-from rce.protocol.messages import NO_ID, DataMessage, ErrorReport, InterfaceStatus
+from rce.protocol.http import LATCH
+from rce.protocol.messages import NO_ID, DataMessage, ErrorReport, InterfaceStatus, LatchedSources
 from rce.protocol.stream import Fault
 from rce_client.courier import Courier, Target, Timing
 from rce_client.desired import Desired
@@ -42,8 +43,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 E = TypeVar("E", bound="End")
-_MOST_EARLY = 16
-"""Topics of which the last message is kept until the program makes their interface."""
+_MOST_EARLY = 64
+"""Topics, and sources of latched ones, whose last message is kept until the program makes their interface."""
 
 CONNECTING = "looking for the engine"
 """The words of the first report of an attempt; the reports of failures tell what went wrong."""
@@ -110,8 +111,8 @@ class Connection(Requests, OwnInterfaces):
         self._courier = Courier(target, self, timing, limits)
         self._desired = Desired()
         self._ends: dict[str, End] = {}
-        self._early: dict[str, DataMessage] = {}
-        """The last message of each topic that came before its interface was made here, oldest first."""
+        self._early: dict[tuple[str, str], DataMessage] = {}
+        """The last message of each topic and source that came before its interface was made here."""
         self._withdrawn: set[str] = set()
         """Own interfaces that were removed; what still comes for them is of no use."""
         self._tasks: asyncio.TaskGroup | None = None
@@ -223,9 +224,18 @@ class Connection(Requests, OwnInterfaces):
 
     # What the ends use: rce_client.ends.Way
 
-    def post_data(self, tag: str, frames: Sequence[Frame]) -> bool:
+    def post_data(self, tag: str, frames: Sequence[Frame], key: str | None = None) -> bool:
         """Send a topic's message; False if there is no connection."""
-        return self._courier.post_data(tag, frames)
+        return self._courier.post_data(tag, frames, key)
+
+    def is_active(self, tag: str) -> bool:
+        """Whether an interface is joined with a peer."""
+        return self.active.get(tag, False)
+
+    @property
+    def knows_sources(self) -> bool:
+        """Whether the engine takes the names of latched messages' sources."""
+        return LATCH in self._courier.features
 
     def post_control(self, frames: Sequence[Frame]) -> bool:
         """Send a service message; False if that is not possible now."""
@@ -290,7 +300,12 @@ class Connection(Requests, OwnInterfaces):
                     self._keep(event)
             case InterfaceStatus():
                 self.active[event.i_tag] = event.status
+                if event.status and event.i_tag in self._ends:
+                    self._ends[event.i_tag].on_active()
                 self._notify()
+            case LatchedSources():
+                if event.i_tag in self._ends:
+                    self._ends[event.i_tag].keep_latched(event.sources)
             case ErrorReport():
                 self._take_error(event.text)
             case Fault():
@@ -319,9 +334,10 @@ class Connection(Requests, OwnInterfaces):
             end.on_closed()
             raise InterfaceError(f"interface {end.tag} is there already")
         self._ends[end.tag] = end
-        early = self._early.pop(end.tag, None)
-        if early is not None and end.fits(early):
-            end.deliver(early)
+        for key in [key for key in self._early if key[0] == end.tag]:
+            early = self._early.pop(key)
+            if end.fits(early):
+                end.deliver(early)
         await self.add_interface(self.robot_id, end.tag, end.type, end.cls)
         return end
 
@@ -332,8 +348,9 @@ class Connection(Requests, OwnInterfaces):
         program, or an earlier life of this one, made them.
         """
         if message.msg_id == NO_ID and message.i_tag not in self._withdrawn:
-            self._early.pop(message.i_tag, None)
-            self._early[message.i_tag] = message
+            key = message.i_tag, message.latch
+            self._early.pop(key, None)
+            self._early[key] = message
             if len(self._early) > _MOST_EARLY:
                 del self._early[next(iter(self._early))]
 

@@ -14,6 +14,7 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
 
 from rce.dialing import open_url_socket
+from rce.protocol.http import FEATURES, FEATURES_HEADER, FEATURES_KEY
 from rce.protocol.limits import Limits
 from rce.protocol.stream import ProtocolStream
 from rce_client.backoff import Backoff, judge
@@ -130,6 +131,8 @@ class Courier:
         self._idle = asyncio.Event()
         self._idle.set()
         self.connected = False
+        self.features: frozenset[str] = frozenset()
+        """What the endpoint of this connection knows beyond the first protocol."""
         self.dropped = self._queue.dropped
         """Interface tag to the number of its messages that found no room to wait."""
 
@@ -156,11 +159,11 @@ class Courier:
             self._listener.on_lost(await self._use(socket))
             await asyncio.sleep(next(delays))
 
-    def post_data(self, tag: str, frames: Sequence[Frame]) -> bool:
+    def post_data(self, tag: str, frames: Sequence[Frame], key: str | None = None) -> bool:
         """Send a topic's message when its turn comes; False if there is no connection."""
         if self.connected:
             self._idle.clear()
-            self._queue.put_data(tag, Parcel.of(frames))
+            self._queue.put_data(tag, Parcel.of(frames, key))
         return self.connected
 
     def post_control(self, frames: Sequence[Frame]) -> bool:
@@ -207,7 +210,7 @@ class Courier:
         async with asyncio.timeout(timing.open):
             sock = await open_url_socket(found.url)
         socket = await connect(
-            urlunsplit(parts._replace(query=query)),
+            urlunsplit(parts._replace(query=f"{query}&{FEATURES_KEY}={','.join(sorted(FEATURES))}")),
             sock=sock,
             additional_headers=headers,
             ssl=(target.tls or True) if parts.scheme == "wss" else None,
@@ -227,6 +230,8 @@ class Courier:
     async def _use(self, socket: EngineSocket) -> LostError:
         """Send and receive until the connection ends; return why it did."""
         self.connected = True
+        told = socket.response.headers.get(FEATURES_HEADER, "") if socket.response is not None else ""
+        self.features = FEATURES & set(told.split(","))
         error = LostError("the connection was closed")
         try:
             async with asyncio.TaskGroup() as tasks:

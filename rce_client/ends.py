@@ -15,7 +15,8 @@ from abc import ABC, abstractmethod
 from collections import deque
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
-from rce.protocol.codec import encode_data
+from rce.protocol.codec import encode, encode_data
+from rce.protocol.messages import LatchedSources
 from rce.protocol.names import Form, InterfaceType, Role
 from rce_client.exceptions import CallError, CallTimeoutError, InterfaceError, NotConnectedError
 
@@ -29,6 +30,7 @@ _log = logging.getLogger(__name__)
 
 M = TypeVar("M")
 """What messages look like: ``dict[str, Any]`` with a converter, bytes-like with a forwarder."""
+M_contra = TypeVar("M_contra", contravariant=True)
 
 _CALL_FAULT = re.compile(r"(?P<tag>\w+), msgID (?P<id>\w+): (?P<text>.*)", re.DOTALL)
 
@@ -36,8 +38,18 @@ _CALL_FAULT = re.compile(r"(?P<tag>\w+), msgID (?P<id>\w+): (?P<text>.*)", re.DO
 class Way(Protocol):
     """What an end needs of its connection."""
 
-    def post_data(self, tag: str, frames: Sequence[Frame]) -> bool:
-        """Send a topic's message; False if there is no connection."""
+    def post_data(self, tag: str, frames: Sequence[Frame], key: str | None = None) -> bool:
+        """Send a topic's message; False if there is no connection.
+
+        One with a key is not dropped in the queue but for a newer one of the same key.
+        """
+
+    def is_active(self, tag: str) -> bool:
+        """Whether an interface is joined with a peer."""
+
+    @property
+    def knows_sources(self) -> bool:
+        """Whether the engine takes the names of latched messages' sources."""
 
     def post_control(self, frames: Sequence[Frame]) -> bool:
         """Send a service message; False if that is not possible now."""
@@ -50,6 +62,16 @@ class Way(Protocol):
 
     async def withdraw(self, end: End) -> None:
         """Remove the interface."""
+
+
+class LatchListener(Protocol[M_contra]):
+    """Takes the latched messages of a topic, for a program that latches them again."""
+
+    def received_latched(self, message: M_contra, source: str) -> None:
+        """Take a latched message; it replaces the last one of its source. Must not block."""
+
+    def keep_latched(self, sources: Sequence[str]) -> None:
+        """Learn that all other sources ended, and what they latched with them."""
 
 
 class End(ABC):
@@ -90,6 +112,12 @@ class End(ABC):
             and self.raw is isinstance(message.msg, bytes | bytearray | memoryview)
         )
 
+    def keep_latched(self, sources: Sequence[str]) -> None:  # noqa: B027 - subscribers only
+        """The engine's sources other than these ended."""
+
+    def on_active(self) -> None:  # noqa: B027 - most ends need not care
+        """The interface is joined with a peer, or again."""
+
     def on_lost(self) -> None:  # noqa: B027 - most ends need not care
         """The connection ended."""
 
@@ -101,18 +129,53 @@ class End(ABC):
 
 
 class Publisher(End, Generic[M]):
-    """Sends messages on a topic."""
+    """Sends messages on a topic.
+
+    The last latched message of each source is kept, and sent again whenever the interface is joined with a
+    peer; the engine gives it to the peers that come later.
+    """
 
     role = Role.SUBSCRIBER
 
-    def publish(self, message: M) -> bool:
+    def __init__(self, way: Way, tag: str, cls: str, *, raw: bool) -> None:
+        super().__init__(way, tag, cls, raw=raw)
+        self._latched: dict[str, M] = {}
+
+    def publish(self, message: M, *, latch: str = "") -> bool:
         """Send a message; never waits.
 
+        Args:
+            message: The message.
+            latch: Keep it for those who listen later, in place of the last one of this name. A program that
+                publishes for itself needs only one name, such as ``"1"``; at most 64 characters.
+
         Returns:
-            False if there is no connection now, and the message was dropped. A slow connection drops the
-            oldest messages that wait, which :attr:`rce_client.connection.Connection.dropped` counts.
+            False if there is no connection now, and the message was not sent; a latched one is sent when the
+            interface is joined with a peer. A slow connection drops the oldest messages that wait, which
+            :attr:`rce_client.connection.Connection.dropped` counts.
         """
-        return self._way.post_data(self.tag, encode_data(self.tag, self.cls, message))
+        if not latch:
+            return self._way.post_data(self.tag, encode_data(self.tag, self.cls, message))
+        self._latched[latch] = message
+        return self._way.is_active(self.tag) and self._post(message, latch)
+
+    def keep_latched(self, sources: Sequence[str]) -> None:
+        """Take back what was latched under all names but these."""
+        for source in self._latched.keys() - set(sources):
+            del self._latched[source]
+        if self._way.knows_sources:
+            known = LatchedSources(i_tag=self.tag, sources=tuple(self._latched))
+            self._way.post_data(self.tag, encode(known), "")
+
+    def on_active(self) -> None:
+        """Say again what is latched: the engine may have forgotten it, or never known."""
+        for source, message in self._latched.items():
+            self._post(message, source)
+        self.keep_latched(tuple(self._latched))
+
+    def _post(self, message: M, latch: str) -> bool:
+        source = latch if self._way.knows_sources else ""
+        return self._way.post_data(self.tag, encode_data(self.tag, self.cls, message, latch=source), latch)
 
     def deliver(self, message: DataMessage) -> None:
         """Ignore it; the engine sends nothing here."""
@@ -137,8 +200,10 @@ class Subscriber(End, Generic[M]):
         raw: bool,
         callback: Callable[[M], Awaitable[None] | None] | None,
         queue_size: int,
+        latches: LatchListener[M] | None = None,
     ) -> None:
         super().__init__(way, tag, cls, raw=raw)
+        self._latches = latches
         self._callback = callback
         self._queue: deque[M] = deque(maxlen=queue_size)
         self._filled = asyncio.Event()
@@ -149,7 +214,13 @@ class Subscriber(End, Generic[M]):
         self._pump = way.spawn(self._feed()) if is_async else None
 
     def deliver(self, message: DataMessage) -> None:
-        """Give a message to the callback or the queue."""
+        """Give a message to the callback or the queue, a latched one to its listener if there is one."""
+        if message.latch and self._latches is not None:
+            try:
+                self._latches.received_latched(message.msg, message.latch)
+            except Exception:  # noqa: BLE001 - logged; it must not end anything else
+                _log.exception("listener of subscriber %s", self.tag)
+            return
         if self._direct:
             assert self._callback is not None
             try:
@@ -161,6 +232,11 @@ class Subscriber(End, Generic[M]):
             self.dropped += 1
         self._queue.append(message.msg)
         self._filled.set()
+
+    def keep_latched(self, sources: Sequence[str]) -> None:
+        """Pass on which sources go on."""
+        if self._latches is not None:
+            self._latches.keep_latched(sources)
 
     async def __aiter__(self) -> AsyncIterator[M]:
         """Yield messages until the subscriber or the connection is closed by the program."""

@@ -10,7 +10,7 @@ from rce_client.ends import Publisher, ServiceClient, ServiceProvider, Subscribe
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from rce_client.ends import End, Way
+    from rce_client.ends import End, LatchListener, Way
 
 E = TypeVar("E", bound="End")
 
@@ -52,6 +52,7 @@ class OwnInterfaces(ABC):
         callback: Callable[[Json], Awaitable[None] | None] | None = None,
         *,
         queue_size: int = ...,
+        latches: LatchListener[Json] | None = ...,
     ) -> Subscriber[Json]: ...
     @overload
     async def subscriber(
@@ -62,6 +63,7 @@ class OwnInterfaces(ABC):
         *,
         raw: Literal[True],
         queue_size: int = ...,
+        latches: LatchListener[bytes] | None = ...,
     ) -> Subscriber[bytes]: ...
     async def subscriber(
         self,
@@ -71,10 +73,22 @@ class OwnInterfaces(ABC):
         *,
         raw: bool = False,
         queue_size: int = 64,
+        latches: LatchListener[Any] | None = None,
     ) -> Subscriber[Any]:
-        """Make an interface of this robot that receives messages; see :class:`rce_client.ends.Subscriber`."""
+        """Make an interface of this robot that receives messages; see :class:`rce_client.ends.Subscriber`.
+
+        Args:
+            tag: Interface tag.
+            cls: Message class, ``package/Type``.
+            callback: Takes the messages.
+            raw: As for :meth:`publisher`.
+            queue_size: How many messages wait for an ``async`` callback, or for ``async for``.
+            latches: Takes the latched messages in place of the callback, if the engine tells which they are.
+        """
         return await self._add_end(
-            Subscriber[Any](self._way, tag, cls, raw=raw, callback=callback, queue_size=queue_size)
+            Subscriber[Any](
+                self._way, tag, cls, raw=raw, callback=callback, queue_size=queue_size, latches=latches
+            )
         )
 
     @overload

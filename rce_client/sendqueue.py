@@ -31,13 +31,15 @@ class Parcel:
 
     frames: Sequence[Frame]
     size: int
+    key: str | None = None
+    """A message with a key is dropped only for a newer one of the same key: what is latched, by source."""
     sent: asyncio.Future[None] | None = None
     """Completed when the message was handed to the network, or could not be."""
 
     @classmethod
-    def of(cls, frames: Sequence[Frame]) -> Parcel:
+    def of(cls, frames: Sequence[Frame], key: str | None = None) -> Parcel:
         """Make a parcel of frames as :mod:`rce.protocol.codec` writes them."""
-        return cls(frames, sum(map(len, frames)))
+        return cls(frames, sum(map(len, frames)), key)
 
 
 class SendQueue:
@@ -72,10 +74,12 @@ class SendQueue:
         """Add a message of a topic; where the queue is full the oldest is dropped and counted."""
         queue = self._topics.setdefault(tag, deque())
         limits = self._limits
-        while queue and (
-            len(queue) >= limits.topic_messages or self._bytes[tag] + parcel.size > limits.topic_bytes
-        ):
-            self._bytes[tag] -= queue.popleft().size
+        while len(queue) >= limits.topic_messages or self._bytes[tag] + parcel.size > limits.topic_bytes:
+            index = _oldest_to_drop(queue, parcel.key)
+            if index is None:
+                break
+            self._bytes[tag] -= queue[index].size
+            del queue[index]
             self.dropped[tag] += 1
         queue.append(parcel)
         self._bytes[tag] += parcel.size
@@ -108,3 +112,13 @@ class SendQueue:
         while (parcel := self.pop()) is not None:
             if parcel.sent is not None and not parcel.sent.done():
                 parcel.sent.set_exception(LostError("the connection ended before the message was sent"))
+
+
+def _oldest_to_drop(queue: Sequence[Parcel], key: str | None) -> int | None:
+    """Return the oldest message that has no key, or one that a newer message or the next one has too."""
+    newest = {parcel.key: index for index, parcel in enumerate(queue)}
+    if key is not None:
+        newest.pop(key, None)
+    return next(
+        (i for i, parcel in enumerate(queue) if parcel.key is None or newest.get(parcel.key) != i), None
+    )

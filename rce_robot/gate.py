@@ -11,7 +11,7 @@ from websockets.protocol import State
 from rce.guard.loop_share import LoopShare
 from rce.guard.proxies import TrustedProxies
 from rce.protocol.exceptions import HandshakeError
-from rce.protocol.http import read_credentials
+from rce.protocol.http import FEATURES_HEADER, read_credentials, read_features
 from rce.protocol.names import EndpointId
 from rce_robot.session import Session
 from rce_robot.websocket import RobotSocket
@@ -70,7 +70,8 @@ class Gate:
         try:
             self._check_origin(request.headers.get_all("Origin"))
             authorization = request.headers.get_all("Authorization")
-            credentials = read_credentials(request.path.partition("?")[2].partition("#")[0], authorization)
+            query = request.path.partition("?")[2].partition("#")[0]
+            credentials = read_credentials(query, authorization)
             forwarded = request.headers.get_all("X-Forwarded-For")
             address = self._proxies.origin(connection.remote_address, forwarded)
             namespace = await self._claim(credentials, address)
@@ -78,7 +79,10 @@ class Gate:
             _log.info("refused %s: %s %s", connection.remote_address, error.status, error.reason)
             return connection.respond(error.status, f"{error.reason}\n")
         client = f"{address or 'an unknown address'} since {_clock()} UTC"
-        session = Session(connection, namespace, self._settings, namespace.dropped, client=client)
+        features = read_features(query)
+        session = Session(
+            connection, namespace, self._settings, namespace.dropped, client=client, features=features
+        )
         namespace.session = session
         connection.receiver = session
         connection.share_loop(self._share, namespace.id.user)
@@ -86,6 +90,13 @@ class Gate:
         if connection.protocol.state is not State.CONNECTING:
             session.on_lost("the robot left during the handshake")
         return None
+
+    async def answer(self, connection: ServerConnection, request: Request, response: Response) -> None:  # noqa: ARG002 - the library's call
+        """Tell a client that was let in which of the features that it asked for it gets."""
+        assert isinstance(connection, RobotSocket)
+        session = connection.receiver
+        if isinstance(session, Session) and session.features:
+            response.headers[FEATURES_HEADER] = ",".join(sorted(session.features))
 
     def _check_origin(self, origins: list[str]) -> None:
         """Refuse pages of other sites: a browser would let them in with whatever its user may reach."""

@@ -49,16 +49,24 @@ class RobotSide(Protocol):
     def show_active(self, tag: str, active: bool) -> None:
         """Send an ``ST``."""
 
-    def send_latched(self, tag: str, message: Queued, *, shared: bool) -> None:
-        """Send the latched message of an interface in the data lane: it is not dropped, but replaced.
+    @property
+    def knows_sources(self) -> bool:
+        """Whether the robot is there and names the sources of latched messages."""
+
+    def send_latched(self, tag: str, source: str, message: Queued, *, shared: bool) -> None:
+        """Send a latched message in the data lane: it is not dropped, but replaced.
 
         Args:
             tag: Of the interface.
-            message: Takes the place of an earlier one that was not sent yet.
+            source: Whose message it is.
+            message: Takes the place of an earlier one of the source that was not sent yet.
             shared: Its bytes are kept elsewhere too, and counted there.
         """
 
-    def drop_latched(self, tag: str) -> None:
+    def send_sources(self, tag: str, sources: Sequence[str]) -> None:
+        """Tell the robot, if it knows of sources, which ones' latched messages are in force."""
+
+    def drop_latched(self, tag: str, source: str) -> None:
         """Take :meth:`send_latched` back, if the message was not sent yet."""
 
     def hold(self, size: int, give_up: Callable[[], object] | None = None) -> Holding:
@@ -139,6 +147,9 @@ class RobotInterface(Interface):
         raise MisdirectedError(
             f"{self._name(large.address.msg_id)}: the interface takes nothing from the robot"
         )
+
+    def keep_latched(self, sources: Sequence[str]) -> None:
+        """Take note that the robot's sources other than these ended."""
 
     def refused(self, msg_id: str, problem: str) -> None:
         """Take note that a message of the robot with this id was refused, which the robot knows."""

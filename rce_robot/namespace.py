@@ -17,6 +17,7 @@ from rce.control.model import EndpointState, EndpointStatus, EndpointUsage
 from rce.guard.holdings import Holdings
 from rce.link import Endpoint, InterfaceError
 from rce.protocol.calls import call_at
+from rce.protocol.http import LATCH
 from rce.protocol.names import EndpointId, InterfaceType
 from rce_robot.exceptions import MisdirectedError
 from rce_robot.interfaces import make_interface
@@ -223,6 +224,12 @@ class Namespace:
         interface.refused(address.msg_id, f"{name}: {problem}")
         raise MisdirectedError(f"{name}: {problem}")
 
+    def keep_latched(self, i_tag: str, sources: Sequence[str]) -> None:
+        """Let what the robot's other sources latched at an interface end."""
+        interface = self._interfaces.get(i_tag)
+        if interface is not None:
+            interface.keep_latched(sources)
+
     def refused(self, call: CallId, problem: str) -> None:
         """End the service call of a message that was refused."""
         interface = self._interfaces.get(call.i_tag)
@@ -278,15 +285,25 @@ class Namespace:
         if self._live is not None:
             self._live.show_active(tag, active)
 
-    def send_latched(self, tag: str, message: Queued, *, shared: bool) -> None:
-        """Send the latched message of an interface, if the robot is there."""
-        if self._live is not None:
-            self._live.send_latched(tag, message, shared=shared)
+    @property
+    def knows_sources(self) -> bool:
+        """Whether the robot is there and names the sources of latched messages."""
+        return self._live is not None and LATCH in self._live.features
 
-    def drop_latched(self, tag: str) -> None:
-        """Take it back, if it was not sent yet."""
+    def send_latched(self, tag: str, source: str, message: Queued, *, shared: bool) -> None:
+        """Send the latched message of a source, if the robot is there."""
         if self._live is not None:
-            self._live.drop_latched(tag)
+            self._live.send_latched(tag, source, message, shared=shared)
+
+    def send_sources(self, tag: str, sources: Sequence[str]) -> None:
+        """Send an ``LT``, if the robot is there and knows of it."""
+        if self._live is not None:
+            self._live.send_sources(tag, sources)
+
+    def drop_latched(self, tag: str, source: str) -> None:
+        """Take a latched message back, if it was not sent yet."""
+        if self._live is not None:
+            self._live.drop_latched(tag, source)
 
     def hold(self, size: int, give_up: Callable[[], object] | None = None) -> Holding:
         """Count bytes that are held outside all queues."""

@@ -61,6 +61,32 @@ class Outgoing:
         return self
 
 
+class LatchedDelivery:
+    """A latched message on its way to a client that knows of sources."""
+
+    __slots__ = ("_message", "_source", "size")
+
+    def __init__(self, message: Queued, source: str) -> None:
+        self._message = message
+        self._source = source
+        self.size = message.size
+
+    def render(self) -> Outgoing | None:
+        """Add the name of the source to the message."""
+        outgoing = self._message.render()
+        if outgoing is None:
+            return None
+        text = bytes(outgoing.text)
+        if not text.startswith(_DATA_HEAD):
+            raise ValueError(f"a data message does not begin with {_DATA_HEAD.decode()}")
+        latch = b'"latch":"%b",' % self._source.encode()
+        return Outgoing(b"".join((_DATA_HEAD, latch, text[len(_DATA_HEAD) :])), outgoing.binaries)
+
+
+_DATA_HEAD = b'{"type":"DM","data":{'
+"""How every data message begins that is made here."""
+
+
 @dataclass(frozen=True, slots=True)
 class OutboxLimits:
     """How much may wait for one robot. A queue always takes one message, however large."""
@@ -80,56 +106,61 @@ class OutboxLimits:
 class _Flow:
     """The queue of one interface in the data lane. ``credit`` is what it may send now, in bytes."""
 
-    __slots__ = ("bytes", "credit", "latched", "messages", "overflow", "tag")
+    __slots__ = ("bytes", "credit", "latched", "messages", "overflow", "sources", "tag")
 
     def __init__(self, tag: str, overflow: Overflow) -> None:
         self.tag = tag
         self.overflow = overflow
         self.messages: deque[tuple[Queued, int]] = deque()
         self.bytes = 0
-        """Of all but the latched message."""
+        """Of all but the latched messages."""
         self.credit = 0
-        self.latched: tuple[tuple[Queued, int], int] | None = None
-        """The latched message as it is in the queue, and the bytes that it counts."""
+        self.latched: dict[str, tuple[tuple[Queued, int], int]] = {}
+        """By source: the latched message as it is in the queue, and the bytes that it counts."""
+        self.sources: dict[int, str] = {}
+        """The sources of latched messages, by the ``id`` of the queue's entries."""
 
     @property
     def droppable(self) -> int:
-        """How many messages may be dropped: all but the latched one."""
-        return len(self.messages) - (self.latched is not None)
+        """How many messages may be dropped: all but the latched ones."""
+        return len(self.messages) - len(self.latched)
 
     def push(self, message: Queued, size: int) -> None:
         self.messages.append((message, size))
         self.bytes += size
 
+    def push_latched(self, source: str, message: Queued, *, shared: bool) -> int:
+        """Add the latched message of a source; return the bytes that it counts."""
+        entry = (message, message.size)
+        counted = 0 if shared else entry[1]
+        self.messages.append(entry)
+        self.latched[source] = (entry, counted)
+        self.sources[id(entry)] = source
+        return counted
+
     def pop(self) -> tuple[Queued, int, int]:
         """Return the oldest message, its size, and the bytes that it counts as latched one."""
         entry = self.messages.popleft()
-        if self.latched is not None and self.latched[0] is entry:
-            counted = self.latched[1]
-            self.latched = None
-            return (*entry, counted)
+        source = self.sources.pop(id(entry), None)
+        if source is not None:
+            return (*entry, self.latched.pop(source)[1])
         self.bytes -= entry[1]
         return (*entry, -1)
 
     def drop_oldest(self) -> int:
         """Drop the oldest that is not latched; return its size."""
-        latched = None if self.latched is None else self.latched[0]
-        index = 1 if self.messages[0] is latched else 0
+        index = next(i for i, entry in enumerate(self.messages) if id(entry) not in self.sources)
         size = self.messages[index][1]
         del self.messages[index]
         self.bytes -= size
         return size
 
-    def drop_latched(self) -> int:
-        """Drop the latched message; return the bytes that it counted."""
-        if self.latched is None:
-            return 0
-        entry, counted = self.latched
-        self.latched = None
-        for index, other in enumerate(self.messages):
-            if other is entry:
-                del self.messages[index]
-                break
+    def drop_latched(self, source: str) -> int:
+        """Drop the latched message of a source; return the bytes that it counted."""
+        entry, counted = self.latched.pop(source)
+        del self.sources[id(entry)]
+        index = next(i for i, other in enumerate(self.messages) if other is entry)
+        del self.messages[index]
         return counted
 
 
@@ -202,33 +233,33 @@ class Outbox:
         self._data_bytes += size
         return True
 
-    def put_latched(self, tag: str, message: Queued, *, shared: bool) -> None:
-        """Queue the latched message of the topic ``tag``, in place of an earlier one.
+    def put_latched(self, tag: str, source: str, message: Queued, *, shared: bool) -> None:
+        """Queue the latched message of a source of the topic ``tag``, in place of an earlier one.
 
         It is no part of what the limits hold and what makes room for others: a burst of many topics' latched
         messages waits until the robot has read it.
 
         Args:
             tag: Of the interface.
+            source: Whose message it is; empty for what is said of all sources.
             message: The message.
             shared: Its bytes are kept elsewhere too and counted there.
         """
-        self.drop_latched(tag)
         flow = self._flows.get(tag)
         if flow is None:
             flow = self._flows[tag] = _Flow(tag, Overflow.DROP_OLDEST)
-        if not flow.messages:
+        if source in flow.latched:
+            self._latched_bytes -= flow.drop_latched(source)
+            self.dropped[tag] += bool(source)
+        elif not flow.messages:
             self._ring.append(flow)
-        entry = (message, message.size)
-        flow.messages.append(entry)
-        flow.latched = (entry, 0 if shared else entry[1])
-        self._latched_bytes += flow.latched[1]
+        self._latched_bytes += flow.push_latched(source, message, shared=shared)
 
-    def drop_latched(self, tag: str) -> None:
-        """Forget the latched message of a topic that was not sent yet."""
+    def drop_latched(self, tag: str, source: str) -> None:
+        """Forget the latched message of a source that was not sent yet."""
         flow = self._flows.get(tag)
-        if flow is not None and flow.latched is not None:
-            self._latched_bytes -= flow.drop_latched()
+        if flow is not None and source in flow.latched:
+            self._latched_bytes -= flow.drop_latched(source)
             self.dropped[tag] += 1
             self._leave_if_empty(flow)
 
@@ -251,7 +282,7 @@ class Outbox:
         if flow is not None and flow.messages:
             self._ring.remove(flow)
             self._data_bytes -= flow.bytes
-            self._latched_bytes -= flow.drop_latched()
+            self._latched_bytes -= sum(counted for _, counted in flow.latched.values())
 
     def shed(self, size: int) -> None:
         """Forget the oldest messages of the topics that hold most, until ``size`` bytes are free.
@@ -262,8 +293,9 @@ class Outbox:
         while self.bytes > goal and self._drop_of_largest_topic():
             pass
         for flow in list(self._ring):
-            if self.bytes > goal and flow.latched is not None and flow.latched[1]:
-                self.drop_latched(flow.tag)
+            for source, (_, counted) in list(flow.latched.items()):
+                if self.bytes > goal and counted:
+                    self.drop_latched(flow.tag, source)
 
     def clear(self) -> None:
         """Forget everything."""

@@ -51,6 +51,7 @@ async def serve_robots(
         _run_session,
         sock=listener,
         process_request=gate.admit,
+        process_response=gate.answer,
         create_connection=behind_gate(guarded(RobotSocket, lobby), handshakes),
         compression=None,
         open_timeout=settings.open_timeout,

@@ -17,6 +17,7 @@ from websockets.frames import CloseCode
 
 from rce.protocol.calls import call_at
 from rce.protocol.codec import encode
+from rce.protocol.http import LATCH
 from rce.protocol.limits import Limits
 from rce.protocol.messages import (
     ConfigureComponents,
@@ -24,11 +25,12 @@ from rce.protocol.messages import (
     DataMessage,
     ErrorReport,
     InterfaceStatus,
+    LatchedSources,
     type_of,
 )
 from rce.protocol.stream import Fault, LargeData, ProtocolStream
 from rce_robot.exceptions import RobotError
-from rce_robot.outbox import Outbox, Outgoing, Overflow
+from rce_robot.outbox import LatchedDelivery, Outbox, Outgoing, Overflow
 from rce_robot.websocket import LARGE_PART
 
 if TYPE_CHECKING:
@@ -56,6 +58,9 @@ class Owner(Protocol):
 
     def take_large(self, large: LargeData) -> None:
         """Handle a data message that was not parsed yet; raises :class:`RobotError` if it is refused."""
+
+    def keep_latched(self, i_tag: str, sources: Sequence[str]) -> None:
+        """The robot's sources at an interface other than these ended."""
 
     def refused(self, call: CallId, problem: str) -> None:
         """A message of a service call was refused before it could be handled."""
@@ -91,6 +96,7 @@ class Session:
         dropped: Counter[str],
         *,
         client: str = "",
+        features: frozenset[str] = frozenset(),
     ) -> None:
         self._socket = socket
         self._owner = owner
@@ -111,6 +117,8 @@ class Session:
         self._reason = ""
         self._abort: asyncio.TimerHandle | None = None
         """A robot that was dropped has a moment to hear why."""
+        self.features = features
+        """What the robot's client knows beyond the first protocol; see :mod:`rce.protocol.http`."""
         self.client = client
         """From where the robot is connected, and since when."""
         self.lost = False
@@ -191,17 +199,30 @@ class Session:
         self._owner.grew()
         return taken
 
-    def send_latched(self, tag: str, message: Queued, *, shared: bool) -> None:
-        """Send the latched message of an interface in the data lane, where nothing pushes it out."""
+    def send_latched(self, tag: str, source: str, message: Queued, *, shared: bool) -> None:
+        """Send the latched message of a source in the data lane, where nothing pushes it out."""
+        if LATCH in self.features:
+            message = LatchedDelivery(message, source)
         if self._socket.writable and not self._outbox:
             self._write(message)
         elif not self.lost:
-            self._outbox.put_latched(tag, message, shared=shared)
+            self._outbox.put_latched(tag, source, message, shared=shared)
             self._owner.grew()
 
-    def drop_latched(self, tag: str) -> None:
-        """Take it back, if it was not sent yet."""
-        self._outbox.drop_latched(tag)
+    def send_sources(self, tag: str, sources: Sequence[str]) -> None:
+        """Send an ``LT`` after what was sent before, to a client that knows of it."""
+        if LATCH not in self.features:
+            return
+        message = _outgoing(LatchedSources(i_tag=tag, sources=tuple(sources)))
+        if self._socket.writable and not self._outbox:
+            self._write(message)
+        elif not self.lost:
+            self._outbox.put_latched(tag, "", message, shared=False)
+            self._owner.grew()
+
+    def drop_latched(self, tag: str, source: str) -> None:
+        """Forget the latched message of a source that was not sent yet."""
+        self._outbox.drop_latched(tag, source)
 
     def await_binaries(self, large: LargeData, ids: Sequence[str]) -> None:
         """Have a large message come again when its binary values are there."""
@@ -318,6 +339,8 @@ class Session:
                     self.report(f"{name}: internal error; the engine's log tells more")
             case LargeData():
                 self._handle_large(event)
+            case LatchedSources():
+                self._owner.keep_latched(event.i_tag, event.sources)
             case Fault():
                 self.report(event.text)
                 if event.call is not None:
@@ -365,7 +388,7 @@ class Session:
             self._waiting_bytes -= size
 
 
-def _outgoing(message: ErrorReport | InterfaceStatus) -> Outgoing:
+def _outgoing(message: ErrorReport | InterfaceStatus | LatchedSources) -> Outgoing:
     (text,) = encode(message)
     return Outgoing(text.encode() if isinstance(text, str) else text)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rce.protocol.messages import NO_ID
 from rce_robot.conversion import ConversionQueue
@@ -13,7 +13,7 @@ from rce_robot.offload import Read, pack_value
 from rce_robot.outbox import Outgoing, Overflow
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
+    from collections.abc import Collection, Coroutine, Sequence
 
     from rce.guard.holdings import Holding
     from rce.link import Port
@@ -21,54 +21,92 @@ if TYPE_CHECKING:
     from rce.protocol.stream import LargeData
     from rce_robot.forms import Form
     from rce_robot.interface import RobotSide
+    from rce_robot.outbox import Buffer
+
+
+class _Converted(NamedTuple):
+    """What becomes of a message of the robot, or which of its sources go on."""
+
+    read: Read = Read()
+    msg_id: str = NO_ID
+    latch: str = ""
+    sources: Sequence[str] | None = None
 
 
 class FromRobot(RobotInterface):
-    """Subscriber: what the robot says goes to every peer."""
+    """Subscriber: what the robot says goes to every peer.
+
+    What it latches stays so while it is away, for the peers that come later.
+    """
 
     def __init__(self, port: Port, robot: RobotSide, form_in: Form, form_out: Form) -> None:
         super().__init__(port, robot, form_in, form_out)
-        self._queue = ConversionQueue[tuple[Read, str]](robot, self._send, self._dropped)
+        self._queue = ConversionQueue[_Converted](robot, self._send, self._dropped)
 
     def take(self, message: DataMessage) -> None:
         """Send it on."""
         if not (self.form_in.costly or self._queue.busy):
-            self.port.send(self._read(message, self._warn))
+            self._pass_on(self._read(message, self._warn), message.latch)
             return
         try:
             packed = pack_value(message.msg)
         except UnreadableError as error:
             raise UnreadableError(f"{self._name(message.msg_id)}: {error}") from error
-        self._put(len(packed), partial(self._convert_value, packed, message.msg_id))
+        self._put(len(packed), partial(self._convert_value, packed, message.msg_id, message.latch))
 
     def take_large(self, large: LargeData) -> None:
         """Send it on when it has been converted; what comes after it waits for that."""
         self._put(large.size, partial(self._convert_text, large))
 
+    def keep_latched(self, sources: Sequence[str]) -> None:
+        """Let other sources end, after what waits to be converted."""
+        if self._queue.busy:
+            if not self._queue.put(0, partial(self._note_sources, sources)):
+                self._dropped()
+        else:
+            self.port.keep_latched(sources)
+
+    def robot_joined(self) -> None:
+        """Keep what was latched only if the robot will tell how long."""
+        super().robot_joined()
+        if not self.robot.knows_sources:
+            self.port.keep_latched(())
+
     def robot_left(self) -> None:
         """Forget what waits to be converted."""
         self._queue.clear()
 
-    def _put(self, size: int, work: partial[Coroutine[Any, Any, tuple[Read, str]]]) -> None:
+    def _put(self, size: int, work: partial[Coroutine[Any, Any, _Converted]]) -> None:
         if not self._queue.put(size, work):
             raise BusyError(f"{self.tag}: messages come faster than they can be converted; one was dropped")
 
-    async def _convert_value(self, packed: bytes, msg_id: str) -> tuple[Read, str]:
-        return await self.offload.read_value(packed), msg_id
+    async def _convert_value(self, packed: bytes, msg_id: str, latch: str) -> _Converted:
+        return _Converted(await self.offload.read_value(packed), msg_id, latch)
 
-    async def _convert_text(self, large: LargeData) -> tuple[Read, str]:
+    async def _convert_text(self, large: LargeData) -> _Converted:
         read = await self.read_large(large)
-        return read, read.msg_id or large.address.msg_id
+        return _Converted(read, read.msg_id or large.address.msg_id, large.address.latch)
 
-    def _send(self, converted: tuple[Read, str]) -> None:
-        read, msg_id = converted
+    async def _note_sources(self, sources: Sequence[str]) -> _Converted:
+        return _Converted(sources=sources)
+
+    def _send(self, converted: _Converted) -> None:
+        read = converted.read
         if read.fault or read.text is not None:
             problem = read.fault or "a string is not an object of the fields of the message"
-            self.robot.report(f"{self._name(msg_id)}: {problem}")
+            self.robot.report(f"{self._name(converted.msg_id)}: {problem}")
         for warning in read.warnings:
             self._warn(warning)
         if read.payload is not None:
-            self.port.send(read.payload)
+            self._pass_on(read.payload, converted.latch)
+        if converted.sources is not None:
+            self.port.keep_latched(converted.sources)
+
+    def _pass_on(self, payload: Buffer, latch: str) -> None:
+        if latch:
+            self.port.send(payload, latched=True, source=latch)
+        else:
+            self.port.send(payload)
 
     def _dropped(self) -> None:
         self.robot.report(f"{self.tag}: memory is short; a message that waited to be converted was dropped")
@@ -77,17 +115,20 @@ class FromRobot(RobotInterface):
 class ToRobot(RobotInterface):
     """Publisher: what the peers say goes to the robot.
 
-    The last latched message is kept and given again to a robot that comes back, as a latched topic does to
-    every new subscriber. Other messages that come while the robot is away are dropped.
+    The last latched message of each source is kept, and given again to a robot that comes back, as a latched
+    topic does to every new subscriber. Other messages that come while the robot is away are dropped.
     """
 
     def __init__(self, port: Port, robot: RobotSide, form_in: Form, form_out: Form) -> None:
         super().__init__(port, robot, form_in, form_out)
-        self._latched: bytes | None = None
-        self._latched_holding: Holding | None = None
-        self._queue = ConversionQueue[tuple[Outgoing | None, str, bool]](
+        self._latched: dict[str, _Kept] = {}
+        self._queue = ConversionQueue[tuple[Outgoing | None, str, str]](
             robot, self._send_shown, self._dropped
         )
+
+    async def start(self) -> None:
+        """Tell the robot that nothing is latched here yet, whatever a former interface of this tag said."""
+        self.robot.send_sources(self.tag, ())
 
     def take(self, message: DataMessage) -> None:
         """Refuse it."""
@@ -96,64 +137,90 @@ class ToRobot(RobotInterface):
     def receive(self, payload: bytes, *, latched: bool) -> None:
         """Send a peer's message to the robot."""
         if latched:
-            self._forget_latched()
-            self._latched = payload
-            self._latched_holding = self.robot.hold(len(payload), self._give_up_latched)
-        self._send(payload, latched=latched)
+            self.receive_latched(payload, "0")
+        else:
+            self._send(payload, "")
+
+    def receive_latched(self, payload: bytes, source: str) -> None:
+        """Send a peer's message to the robot, and keep it."""
+        self._forget(source)
+        kept = self._latched[source] = _Kept(payload)
+        holding = self.robot.hold(len(payload), partial(self._give_up, source, kept))
+        if self._latched.get(source) is kept:  # else it was given up at once
+            kept.holding = holding
+        self._send(payload, source)
+
+    def unlatch(self, sources: Collection[str]) -> None:
+        """Give a robot that comes later nothing of sources that ended."""
+        for source in sources:
+            self._forget(source)
+        self.robot.send_sources(self.tag, tuple(self._latched))
 
     def robot_joined(self) -> None:
-        """Also give it the last latched message."""
+        """Also give it the last latched messages."""
         super().robot_joined()
-        if self._latched is not None:
-            self._send(self._latched, latched=True)
+        for source, kept in list(self._latched.items()):
+            self._send(kept.payload, source)
+        self.robot.send_sources(self.tag, tuple(self._latched))
 
     def robot_left(self) -> None:
         """Forget what waits to be converted."""
         self._queue.clear()
 
     async def close(self) -> None:
-        """Forget the latched message too."""
+        """Forget the latched messages too."""
         await super().close()
-        self._forget_latched()
+        for source in list(self._latched):
+            self._forget(source)
 
-    def _forget_latched(self) -> None:
-        self._latched = None
-        if self._latched_holding is not None:
-            self._latched_holding.release()
-            self._latched_holding = None
+    def _forget(self, source: str) -> None:
+        kept = self._latched.pop(source, None)
+        if kept is not None and kept.holding is not None:
+            kept.holding.release()
 
-    def _give_up_latched(self) -> None:
+    def _give_up(self, source: str, kept: _Kept) -> None:
         """Memory is short: the message is lost, which the robot's user must know."""
-        self._latched = self._latched_holding = None
-        self.robot.drop_latched(self.tag)
+        if self._latched.get(source) is kept:
+            del self._latched[source]
+        self.robot.drop_latched(self.tag, source)
         self.robot.count_dropped(self.tag)
         self.robot.report(f"{self.tag}: memory is short; the latched message was dropped")
 
-    def _send(self, payload: bytes, *, latched: bool) -> None:
+    def _send(self, payload: bytes, source: str) -> None:
         if self._queue.busy or self.form_out.is_heavy(payload):
             if self.robot.connected and not self._queue.put(
-                len(payload), partial(self._show, payload, latched=latched)
+                len(payload), partial(self._show, payload, source)
             ):
                 self.robot.count_dropped(self.tag)
-        elif latched:
-            self.robot.send_latched(self.tag, Delivery(self, payload, NO_ID), shared=True)
+        elif source in self._latched:
+            self.robot.send_latched(self.tag, source, Delivery(self, payload, NO_ID), shared=True)
         else:
             self.robot.send_data(self.tag, Delivery(self, payload, NO_ID), Overflow.DROP_OLDEST)
 
-    async def _show(self, payload: bytes, *, latched: bool) -> tuple[Outgoing | None, str, bool]:
+    async def _show(self, payload: bytes, source: str) -> tuple[Outgoing | None, str, str]:
         try:
-            return await self.offload.show(payload, NO_ID), "", latched
+            return await self.offload.show(payload, NO_ID), "", source
         except UnreadableError as error:
-            return None, str(error), latched
+            return None, str(error), source
 
-    def _send_shown(self, converted: tuple[Outgoing | None, str, bool]) -> None:
-        outgoing, problem, latched = converted
+    def _send_shown(self, converted: tuple[Outgoing | None, str, str]) -> None:
+        outgoing, problem, source = converted
         if outgoing is None:
             self.not_rendered(NO_ID, problem)
-        elif latched:
-            self.robot.send_latched(self.tag, outgoing, shared=False)
+        elif source in self._latched:
+            self.robot.send_latched(self.tag, source, outgoing, shared=False)
         else:
             self.robot.send_data(self.tag, outgoing, Overflow.DROP_OLDEST)
 
     def _dropped(self) -> None:
         self.robot.count_dropped(self.tag)
+
+
+class _Kept:
+    """The latched message of a source."""
+
+    __slots__ = ("holding", "payload")
+
+    def __init__(self, payload: bytes) -> None:
+        self.payload = payload
+        self.holding: Holding | None = None

@@ -8,6 +8,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Protocol
 
 from rce.link.exceptions import LinkLost, ProtocolError
+from rce.link.frames import FEATURES
 
 if TYPE_CHECKING:
     from rce.link.frames import Frame
@@ -36,7 +37,13 @@ class CarrierHandler(Protocol):
 
 
 class Carrier(ABC):
-    """A live connection between the two ends of a link."""
+    """A live connection between the two ends of a link.
+
+    Attributes:
+        features: What the peer knows beyond the first version of links.
+    """
+
+    features: frozenset[str] = frozenset()
 
     @property
     @abstractmethod
@@ -103,6 +110,7 @@ class LocalCarrier(Carrier):
     """
 
     kind = "local"
+    features = frozenset(FEATURES)
 
     def __init__(self) -> None:
         self._loop = asyncio.get_running_loop()
@@ -150,7 +158,7 @@ class LocalCarrier(Carrier):
 
     def send(self, queue: OutgoingQueue, frame: Frame) -> None:
         """Send a message; nothing ever waits here."""
-        queue.counters.count_out(len(frame.payload))
+        queue.counters.count_frame(frame)
         if type(frame.payload) is not bytes:
             frame = frame._replace(payload=bytes(frame.payload))
         self.control(frame)

@@ -16,10 +16,20 @@ from rce.link.exceptions import (
     PeerLost,
     ProtocolError,
 )
-from rce.link.frames import LATCHED, OVERLOADED, Frame, FrameType
+from rce.link.frames import (
+    LATCH,
+    LATCHED,
+    OVERLOADED,
+    Frame,
+    FrameType,
+    encode_sources,
+    parse_sources,
+)
 from rce.link.queues import OutgoingQueue, OverflowPolicy
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from rce.control.model import ConnectionSpec
     from rce.link.interface import Buffer
     from rce.link.link import Link
@@ -118,12 +128,23 @@ class Channel:
 
     # Sending
 
-    def send(self, payload: bytes | memoryview, *, latched: bool) -> None:
-        """Send a message of a topic; the caller has looked at its size."""
+    def send(self, payload: bytes | memoryview, *, source: int = 0) -> None:
+        """Send a message of a topic; the caller has looked at its size.
+
+        Args:
+            payload: The message.
+            source: Number of the source of a latched message; 0 if it is not latched.
+        """
         carrier = self.link.carrier
         if self.established and carrier is not None:
-            flags = LATCHED if latched else 0
-            carrier.send(self._queue, Frame(FrameType.DATA, self.number, 0, flags, payload))
+            flags = LATCHED if source else 0
+            carrier.send(self._queue, Frame(FrameType.DATA, self.number, source, flags, payload))
+
+    def send_sources(self, sources: Collection[int]) -> None:
+        """Tell the peer which sources' latched messages are in force, after all that was sent before."""
+        carrier = self.link.carrier
+        if self.established and carrier is not None and LATCH in carrier.features:
+            carrier.send(self._queue, encode_sources(self.number, sources))
 
     async def call(self, payload: bytes | memoryview, deadline: float) -> bytes:
         """Send a request and wait ``deadline`` seconds for its answer. Raises as :meth:`Port.call`."""
@@ -178,7 +199,9 @@ class Channel:
         payload = bytes(frame.payload)
         match frame.type:
             case FrameType.DATA:
-                self.slot.receive(payload, latched=bool(frame.flags & LATCHED))
+                self.slot.receive(self, payload, frame.id if frame.flags & LATCHED else None)
+            case FrameType.SOURCES:
+                self.slot.keep_sources(self, parse_sources(payload))
             case FrameType.CALL:
                 self._request_received(frame.id, payload)
             case FrameType.REPLY:

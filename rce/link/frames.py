@@ -6,7 +6,7 @@ Every frame starts with 24 bytes in network order::
          0     1  type     FrameType
          1     1  flags    LATCHED, OVERLOADED
          2     2  zero
-         4     4  id       of a service call; 0 elsewhere
+         4     4  id       of a service call, or of a latched message's source; 0 elsewhere
          8     8  channel  0 for frames of the link itself
         16     4  length   bytes of payload in this frame
         20     4  total    bytes of payload in the whole message
@@ -32,6 +32,8 @@ from rce.link.exceptions import LinkRefused, ProtocolError
 from rce.link.settings import KIB
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from rce.link.settings import LinkLimits
 
 VERSION = 1
@@ -81,6 +83,8 @@ class FrameType(IntEnum):
     """A text in place of a REPLY."""
     CANCEL = 20
     """The caller no longer waits for the answer to the CALL with this id."""
+    SOURCES = 21
+    """Ids of the sources whose latched messages are in force, 4 bytes each; only to peers with ``latch``."""
     FRAGMENT = 24
     ABORT = 25
 
@@ -101,9 +105,23 @@ class Hello(msgspec.Struct, frozen=True, kw_only=True):
     version: int
     link: str
     token: str
+    features: tuple[str, ...] = ()
+    """What the dialing end knows beyond the first version; unknown words mean nothing."""
 
+
+class Welcome(msgspec.Struct, frozen=True, kw_only=True):
+    """Payload of WELCOME; empty from a peer that knows the first version only."""
+
+    features: tuple[str, ...] = ()
+
+
+LATCH = "latch"
+"""Feature: latched messages name their source, and SOURCES takes back those of sources that ended."""
+FEATURES = (LATCH,)
+"""What is known here beyond the first version of links."""
 
 _hello_decoder = msgspec.json.Decoder(Hello)
+_welcome_decoder = msgspec.json.Decoder(Welcome)
 _TYPES = {int(t): t for t in FrameType}
 _CARRIERS = frozenset({FrameType.DATA, FrameType.CALL, FrameType.REPLY})
 
@@ -126,9 +144,29 @@ def encode(frame: Frame) -> bytes:
 
 def encode_hello(link: str, token: str) -> bytes:
     """Write the first frame of a link's dialing end."""
-    return encode(
-        Frame(FrameType.HELLO, payload=msgspec.json.encode(Hello(version=VERSION, link=link, token=token)))
-    )
+    hello = Hello(version=VERSION, link=link, token=token, features=FEATURES)
+    return encode(Frame(FrameType.HELLO, payload=msgspec.json.encode(hello)))
+
+
+def encode_welcome() -> bytes:
+    """Write the accepting end's answer to HELLO."""
+    return encode(Frame(FrameType.WELCOME, payload=msgspec.json.encode(Welcome(features=FEATURES))))
+
+
+def encode_sources(channel: int, sources: Collection[int]) -> Frame:
+    """Make the frame that tells which sources' latched messages are in force."""
+    return Frame(FrameType.SOURCES, channel, payload=struct.pack(f"!{len(sources)}I", *sources))
+
+
+def parse_sources(payload: bytes) -> frozenset[int]:
+    """Read :func:`encode_sources`.
+
+    Raises:
+        ProtocolError: It is none.
+    """
+    if len(payload) % 4:
+        raise ProtocolError(f"SOURCES of {len(payload)} bytes")
+    return frozenset(struct.unpack(f"!{len(payload) // 4}I", payload))
 
 
 def parse_hello(frame: Frame) -> Hello:
@@ -170,8 +208,11 @@ def parse_opening(frame: Frame) -> tuple[str, bool]:
         raise ProtocolError(f"bad SECURE: {error}") from error
 
 
-def check_answer(frame: Frame) -> None:
+def check_answer(frame: Frame) -> frozenset[str]:
     """Read the accepting end's answer to HELLO.
+
+    Returns:
+        The features that it knows.
 
     Raises:
         LinkRefused: It does not want the link.
@@ -181,6 +222,12 @@ def check_answer(frame: Frame) -> None:
         raise LinkRefused(bytes(frame.payload).decode(errors="replace"))
     if frame.type is not FrameType.WELCOME:
         raise ProtocolError(f"HELLO was answered by {frame.type.name}")
+    if not frame.payload:
+        return frozenset()
+    try:
+        return frozenset(_welcome_decoder.decode(frame.payload).features)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise ProtocolError(f"bad WELCOME: {error}") from error
 
 
 class _Message:

@@ -14,7 +14,7 @@ from rce.dialing import open_socket
 from rce.guard.lobby import Lobby, address_of
 from rce.link.carrier import Carrier, LocalCarrier
 from rce.link.exceptions import LinkError, LinkLost, LinkRefused
-from rce.link.frames import Frame, FrameType, check_answer, encode, encode_hello, parse_hello
+from rce.link.frames import Frame, FrameType, check_answer, encode, encode_hello, encode_welcome, parse_hello
 from rce.link.handover import Doorman
 from rce.link.opening import secured_link
 from rce.link.secure import Adopter, accept_secure, dial_secure
@@ -272,7 +272,7 @@ class LinkHub:
         try:
             carrier.greet(encode_hello(spec.id, spec.token))
             async with asyncio.timeout(self.timeouts.handshake):
-                check_answer(await carrier.handshake_frame())
+                carrier.features = check_answer(await carrier.handshake_frame())
         except BaseException as error:
             carrier.abort(LinkLost(f"no handshake: {error}"))
             raise
@@ -324,7 +324,8 @@ class LinkHub:
             carrier.abort(LinkLost("the hub is closed"))
             raise
         else:
-            carrier.greet(encode(Frame(FrameType.WELCOME)))
+            carrier.features = frozenset(hello.features)
+            carrier.greet(encode_welcome() if hello.features else encode(Frame(FrameType.WELCOME)))
             link.attach(carrier)
         finally:
             guest.leave()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 if TYPE_CHECKING:
@@ -21,15 +21,25 @@ class Port(Protocol):
         """What the interface was made for."""
         ...
 
-    def send(self, payload: Buffer, *, latched: bool = False) -> None:
+    def send(self, payload: Buffer, *, latched: bool = False, source: str = "") -> None:
         """Send a message to every peer. For subscriber interfaces.
 
         Never blocks and never fails: where a peer's queue is full its oldest messages are dropped and
-        counted. The newest latched message is kept and sent to each peer that comes later.
+        counted. The newest latched message of each source is kept and sent to each peer that comes later,
+        until :meth:`keep_latched` takes it back.
+
+        Args:
+            payload: The message.
+            latched: Keep it.
+            source: Names the publisher that a latched message is of.
 
         Raises:
             TypeError: The interface is not a subscriber.
         """
+        ...
+
+    def keep_latched(self, sources: Collection[str]) -> None:
+        """Take back the latched messages of all sources but these: their publishers ended."""
         ...
 
     async def call(self, payload: Buffer, *, timeout: float | None = None) -> bytes:
@@ -78,6 +88,14 @@ class Interface(ABC):
     def receive(self, payload: bytes, *, latched: bool) -> None:
         """Take a peer's message. For publisher interfaces; must not block."""
         raise NotImplementedError(f"{type(self).__name__} takes no messages")
+
+    def receive_latched(self, payload: bytes, source: str) -> None:
+        """Take a peer's latched message, the newest of its source. For publisher interfaces."""
+        del source
+        self.receive(payload, latched=True)
+
+    def unlatch(self, sources: Collection[str]) -> None:  # noqa: B027 - not every interface keeps messages
+        """Forget the latched messages of sources: their publishers ended. For publisher interfaces."""
 
     async def serve(self, payload: bytes) -> Buffer:
         """Answer a peer's request. For service client interfaces; cancelled when the peer waits no more.

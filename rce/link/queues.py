@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from rce.control.model import InterfaceUsage
 from rce.link.exceptions import Overloaded
-from rce.link.frames import FRAGMENT_SIZE
+from rce.link.frames import FRAGMENT_SIZE, LATCHED, FrameType
 from rce.link.settings import KIB
 
 if TYPE_CHECKING:
@@ -49,10 +49,11 @@ class Counters:
         self.messages_in += 1
         self.bytes_in += size
 
-    def count_out(self, size: int) -> None:
+    def count_frame(self, frame: Frame) -> None:
         """Count a message that was handed to the transport as a whole."""
-        self.messages_out += 1
-        self.bytes_out += size
+        if frame.type is not FrameType.SOURCES:
+            self.messages_out += 1
+            self.bytes_out += len(frame.payload)
 
     def usage(self) -> InterfaceUsage:
         """Return the counters as the task set reports them."""
@@ -118,6 +119,8 @@ class OutgoingQueue:
         self._max_messages = max_messages
         self._max_bytes = max_bytes
         self._frames: deque[Frame] = deque()
+        self._kept: dict[int, Frame] = {}
+        """The newest latched message of each source, and SOURCES (0), which a full queue does not drop."""
         self._bytes = 0
         self._backlog = backlog or Backlog()
 
@@ -149,8 +152,11 @@ class OutgoingQueue:
         while self._is_full(size):
             if self._policy is OverflowPolicy.REFUSE:
                 raise Overloaded(f"{len(self._frames)} messages wait to be sent")
-            self._drop_oldest()
+            if not self._drop_oldest():
+                break
         self._frames.append(frame)
+        if _is_kept(frame):
+            self._kept[frame.id] = frame
         self._count(size)
         self._backlog.on_growth()
 
@@ -170,7 +176,7 @@ class OutgoingQueue:
         self.sent = end
         if end == size:
             self._remove_head()
-            self.counters.count_out(size)
+            self.counters.count_frame(frame)
         return frame, start, end
 
     def withdraw(self, call_id: int) -> bool:
@@ -190,7 +196,8 @@ class OutgoingQueue:
             and len(self._frames) > (1 if self.sent else 0)
             and self._bytes > goal
         ):
-            self._drop_oldest()
+            if not self._drop_oldest():
+                self._kept.clear()
 
     def clear(self) -> int:
         """Throw everything away.
@@ -199,8 +206,9 @@ class OutgoingQueue:
             Size of the message that had begun and must be aborted; 0 if none had.
         """
         begun = len(self._frames[0].payload) if self.sent else 0
-        self.counters.dropped += len(self._frames)
+        self.counters.dropped += sum(frame.type is not FrameType.SOURCES for frame in self._frames)
         self._frames.clear()
+        self._kept.clear()
         self._count(-self._bytes)
         self.sent = 0
         return begun
@@ -212,16 +220,29 @@ class OutgoingQueue:
             return False
         return waiting >= self._max_messages or self._bytes - begun + size > self._max_bytes
 
-    def _drop_oldest(self) -> None:
-        index = 1 if self.sent else 0
-        self._count(-len(self._frames[index].payload))
-        del self._frames[index]
-        self.counters.dropped += 1
+    def _drop_oldest(self) -> bool:
+        """Drop the oldest message that may be dropped; false if there is none."""
+        for index in range(1 if self.sent else 0, len(self._frames)):
+            frame = self._frames[index]
+            if self._kept.get(frame.id) is not frame:
+                self._count(-len(frame.payload))
+                del self._frames[index]
+                self.counters.dropped += 1
+                return True
+        return False
 
     def _remove_head(self) -> None:
-        self._count(-len(self._frames.popleft().payload))
+        frame = self._frames.popleft()
+        if self._kept.get(frame.id) is frame:
+            del self._kept[frame.id]
+        self._count(-len(frame.payload))
         self.sent = 0
 
     def _count(self, change: int) -> None:
         self._bytes += change
         self._backlog.bytes += change
+
+
+def _is_kept(frame: Frame) -> bool:
+    """Tell whether a message stays in a full queue until a newer one of its source comes."""
+    return frame.type is FrameType.SOURCES or (frame.type is FrameType.DATA and bool(frame.flags & LATCHED))

@@ -9,14 +9,14 @@ from rce.guard.holdings import Holdings
 from rce.link.calls import CallServer
 from rce.link.channel import as_payload
 from rce.link.exceptions import MessageTooLarge, NotConnected
+from rce.link.latch import HeardSources, LatchedMessages
 from rce.link.queues import Counters
 from rce.protocol.names import InterfaceType, Role
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Collection
 
     from rce.control.model import InterfaceSpec
-    from rce.guard.holdings import Holding
     from rce.link.channel import Channel
     from rce.link.interface import Buffer, Interface, InterfaceFactory
     from rce.link.settings import LinkLimits, LinkTimeouts
@@ -57,9 +57,9 @@ class InterfaceSlot:
         self._on_fault = on_fault
         self._interface: Interface | None = None
         self._channels: dict[int, Channel] = {}
-        self._latched: bytes | memoryview | None = None
         self._holdings = Holdings() if holdings is None else holdings
-        self._latched_holding: Holding | None = None
+        self._latched = LatchedMessages(self._holdings, self._latched_given_up)
+        self._heard = HeardSources()
         self._faults: set[str] = set()
 
     # Port
@@ -69,7 +69,7 @@ class InterfaceSlot:
         """What the interface was made for."""
         return self._spec
 
-    def send(self, payload: Buffer, *, latched: bool = False) -> None:
+    def send(self, payload: Buffer, *, latched: bool = False, source: str = "") -> None:
         """Send a message to every peer."""
         if self.role is not Role.SUBSCRIBER:
             raise TypeError(f"{self._spec.tag} is a {self._spec.type}: only a subscriber sends messages")
@@ -79,10 +79,14 @@ class InterfaceSlot:
             self.counters.dropped += 1
             self._fault_once(str(error))
             return
-        if latched:
-            self._keep(data)
+        number = self._latched.keep(source, data) if latched else 0
         for channel in self._channels.values():
-            channel.send(data, latched=latched)
+            channel.send(data, source=number)
+
+    def keep_latched(self, sources: Collection[str]) -> None:
+        """Take back the latched messages of all sources but these."""
+        if self._latched.retain(sources):
+            self._send_sources()
 
     async def call(self, payload: Buffer, *, timeout: float | None = None) -> bytes:
         """Ask the peer."""
@@ -117,7 +121,7 @@ class InterfaceSlot:
 
     async def close(self) -> None:
         """End the interface; its channels were removed before."""
-        self._forget_latched()
+        self._latched.retain(())
         if self.server is not None:
             await self.server.close()
         if self._interface is not None:
@@ -136,11 +140,14 @@ class InterfaceSlot:
     def remove(self, channel: Channel) -> None:
         """Let a connection go; it was closed before."""
         del self._channels[channel.number]
+        self._unlatch(self._heard.retain(channel.number))
 
     def channel_changed(self, channel: Channel) -> None:
         """Take note that a channel was established or lost."""
-        if channel.established and self._latched is not None:
-            channel.send(self._latched, latched=True)
+        if channel.established and self.role is Role.SUBSCRIBER:
+            for kept in self._latched:
+                channel.send(kept.payload, source=kept.number)
+            channel.send_sources(self._latched.numbers)
         if not channel.established and self.server is not None:
             self.server.cancel(channel)
         active = any(channel.established for channel in self._channels.values())
@@ -149,32 +156,39 @@ class InterfaceSlot:
             self._tell_interface(active)
         self._on_change()
 
-    def receive(self, payload: bytes, *, latched: bool) -> None:
-        """Hand a peer's message to the interface."""
+    def receive(self, channel: Channel, payload: bytes, source: int | None) -> None:
+        """Hand a peer's message to the interface; a latched one has a source."""
         self.counters.count_in(len(payload))
         assert self._interface is not None
         try:
-            self._interface.receive(payload, latched=latched)
+            if source is None:
+                self._interface.receive(payload, latched=False)
+            else:
+                self._interface.receive_latched(payload, self._heard.hear(channel.number, source))
         except Exception as error:
             log.debug("interface %s refused a message", self._spec.tag, exc_info=True)
             self._fault_once(str(error) or type(error).__name__)
 
-    def _keep(self, data: bytes | memoryview) -> None:
-        """Keep a latched message in place of the one before."""
-        self._forget_latched()
-        self._latched = data
-        self._latched_holding = self._holdings.hold(len(data), self._give_up_latched)
+    def keep_sources(self, channel: Channel, sources: Collection[int]) -> None:
+        """Have the interface forget what other sources of the peer latched."""
+        self._unlatch(self._heard.retain(channel.number, sources))
 
-    def _forget_latched(self) -> None:
-        self._latched = None
-        if self._latched_holding is not None:
-            self._latched_holding.release()
-            self._latched_holding = None
+    def _unlatch(self, sources: list[str]) -> None:
+        if sources and self._interface is not None:
+            try:
+                self._interface.unlatch(sources)
+            except Exception as error:
+                log.debug("interface %s: unlatch failed", self._spec.tag, exc_info=True)
+                self._fault_once(str(error) or type(error).__name__)
 
-    def _give_up_latched(self) -> None:
-        self._latched = self._latched_holding = None
+    def _send_sources(self) -> None:
+        for channel in self._channels.values():
+            channel.send_sources(self._latched.numbers)
+
+    def _latched_given_up(self) -> None:
         self.counters.dropped += 1
         self._fault_once("memory is short; its latched message was dropped")
+        self._send_sources()
 
     def _tell_interface(self, active: bool) -> None:
         assert self._interface is not None

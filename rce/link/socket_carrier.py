@@ -170,7 +170,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
             return
         size = len(frame.payload)
         if self._straight and size <= FRAGMENT_SIZE and not self._lanes:
-            queue.counters.count_out(size)
+            queue.counters.count_frame(frame)
             self.sent += HEADER_SIZE + size
             for buffer in frame_chunk(frame):
                 transport.write(buffer)

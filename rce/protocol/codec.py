@@ -54,13 +54,13 @@ def encode(message: ClientMessage) -> list[Frame]:
         TypeError: It holds something that JSON cannot express.
     """
     if isinstance(message, DataMessage):
-        return encode_data(message.i_tag, message.type, message.msg, message.msg_id)
+        return encode_data(message.i_tag, message.type, message.msg, message.msg_id, message.latch)
     if isinstance(message, ErrorReport):
         return encode_message("ER", message.text)
     return encode_message(type_of(message), msgspec.to_builtins(message))
 
 
-def encode_data(i_tag: str, type_: str, msg: Any, msg_id: str = NO_ID) -> list[Frame]:
+def encode_data(i_tag: str, type_: str, msg: Any, msg_id: str = NO_ID, latch: str = "") -> list[Frame]:
     """Write a data message.
 
     Args:
@@ -68,15 +68,20 @@ def encode_data(i_tag: str, type_: str, msg: Any, msg_id: str = NO_ID) -> list[F
         type_: Message or service class.
         msg: The message as a JSON object that may hold binary values, or as binary as a whole.
         msg_id: Echoed in the answer to a service request.
+        latch: The source whose latched message it is; for peers that know of such only.
 
     Raises:
         TypeError: ``msg`` holds something that JSON cannot express.
     """
     if isinstance(msg, _BINARY):
         id_ = next(_fresh_ids)
-        data = {"iTag": i_tag, "type": type_, "msgID": msg_id, "msg*": id_}
+        data = {"iTag": i_tag, "type": type_, "msgID": msg_id, **_latch(latch), "msg*": id_}
         return [_encode({"type": "DM", "data": data}).decode(), b"".join((id_.encode(), msg))]
-    return encode_message("DM", {"iTag": i_tag, "type": type_, "msgID": msg_id, "msg": msg})
+    return encode_message("DM", {"iTag": i_tag, "type": type_, "msgID": msg_id, **_latch(latch), "msg": msg})
+
+
+def _latch(source: str) -> dict[str, str]:
+    return {"latch": source} if source else {}
 
 
 def encode_message(type_: str, data: Any) -> list[Frame]:

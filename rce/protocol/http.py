@@ -143,6 +143,26 @@ def _read_header(query: str, authorization: Sequence[str]) -> Credentials:
     return Credentials(values["userID"], values["robotID"], token=text)
 
 
+FEATURES_KEY = "features"
+"""Parameter of the WebSocket handshake: what the client knows beyond the first protocol, by commas."""
+FEATURES_HEADER = "RCE-Features"
+"""Header of the answer: which of these the endpoint knows too."""
+LATCH = "latch"
+"""Feature: latched messages name their source, and ``LT`` tells which sources' are in force."""
+FEATURES = frozenset((LATCH,))
+"""What is known here."""
+
+
+def read_features(query: str) -> frozenset[str]:
+    """Return what a client asks for in its WebSocket handshake and is known here.
+
+    Args:
+        query: What comes after the ``?``, still percent-encoded; one that :func:`read_credentials` took.
+    """
+    asked = {word for name, value in _pairs(query) if name == FEATURES_KEY for word in value.split(",")}
+    return FEATURES & asked
+
+
 def _pairs(query: str) -> list[tuple[str, str]]:
     """Return the parameters of a query that is known to be readable."""
     return parse_qsl(query, keep_blank_values=True, max_num_fields=_MAX_FIELDS)

@@ -58,6 +58,9 @@ InterfacePath = Annotated[str, Meta(pattern=rf"^{_INTERFACE_PATH_PATTERN}\Z", ma
 """An interface of an endpoint, ``ENDPOINT/INTERFACE``."""
 MessageId = Annotated[str, Meta(max_length=MAX_MESSAGE_ID_LENGTH)]
 """Echoed in the answer to a service request."""
+MAX_SOURCE_LENGTH = 64
+SourceName = Annotated[str, Meta(max_length=MAX_SOURCE_LENGTH)]
+"""Names a publisher of latched messages within an interface."""
 Text = Annotated[str, Meta(max_length=65536, pattern=r"^[^\x00]*\Z")]
 """Free text without a NUL, which no argument and no file name may hold."""
 Quantity: TypeAlias = int | float | Text
@@ -267,6 +270,15 @@ class DataMessage(Struct, frozen=True, omit_defaults=False):
     msg: Any
     """A JSON object, or bytes where the message travels serialized."""
     msg_id: MessageId = field(name="msgID", default=NO_ID)
+    latch: SourceName = ""
+    """The source whose latched message it is; empty if it is not latched."""
+
+
+class LatchedSources(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
+    """``LT``: the sources whose latched messages are in force at an interface; all others ended."""
+
+    i_tag: Name
+    sources: tuple[SourceName, ...] = ()
 
 
 class InterfaceStatus(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
@@ -287,7 +299,7 @@ Request: TypeAlias = (
     CreateContainer | ResizeContainer | DestroyContainer | ConfigureComponents | ConfigureConnections
 )
 """What a client may ask of the master."""
-ClientMessage: TypeAlias = Request | DataMessage | InterfaceStatus | ErrorReport
+ClientMessage: TypeAlias = Request | DataMessage | LatchedSources | InterfaceStatus | ErrorReport
 """Any message of the protocol."""
 
 REQUEST_TYPES: dict[str, type[Request]] = {
@@ -300,13 +312,14 @@ REQUEST_TYPES: dict[str, type[Request]] = {
 TYPES: dict[str, type[ClientMessage]] = {
     **REQUEST_TYPES,
     "DM": DataMessage,
+    "LT": LatchedSources,
     "ST": InterfaceStatus,
     "ER": ErrorReport,
 }
 """The value of ``type`` to the class of the message."""
-UPWARD = frozenset(("CC", "DC", "CN", "CX", "RC", "DM"))
+UPWARD = frozenset(("CC", "DC", "CN", "CX", "RC", "DM", "LT"))
 """Types that a client sends."""
-DOWNWARD = frozenset(("DM", "ST", "ER"))
+DOWNWARD = frozenset(("DM", "LT", "ST", "ER"))
 """Types that the engine sends."""
 
 _TAGS = {cls: tag for tag, cls in TYPES.items()}

@@ -40,6 +40,7 @@ from rce.protocol.messages import (
     Request,
     ResizeContainer,
     SetParam,
+    SourceName,
 )
 from rce.protocol.names import Form
 from rce.protocol.wishes import container_faults, resize_faults
@@ -63,6 +64,7 @@ class SerializedData(Struct):
     binary: Annotated[str, Meta(pattern=r"^[0-9A-Fa-f]{32}\Z")] = field(name="msg*")
     """The id of the binary frame."""
     msg_id: MessageId = field(name="msgID", default=NO_ID)
+    latch: SourceName = ""
     msg: UnsetType = UNSET
     """Must not be there beside ``msg*``."""
 

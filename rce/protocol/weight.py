@@ -29,6 +29,7 @@ _EDGE = 4096
 _TAG = re.compile(rb'"iTag"\s*:\s*"([^"\\]{1,256})"')
 _CLASS = re.compile(rb'"type"\s*:\s*"([^"\\]{1,256}/[^"\\]{1,256})"')
 _MSG_ID = re.compile(rb'"msgID"\s*:\s*"?([^"\\,}]{1,255})')
+_LATCH = re.compile(rb'"latch"\s*:\s*"([^"\\]{1,64})"')
 _MSG = re.compile(rb'"msg\*?"\s*:')
 _STRING = re.compile(rb'"[^"\\]*+(?:\\.[^"\\]*+)*+"', re.DOTALL)
 
@@ -40,6 +41,8 @@ class Address(NamedTuple):
     type: str = ""
     """Empty if it was not found."""
     msg_id: str = NO_ID
+    latch: str = ""
+    """See :attr:`rce.protocol.messages.DataMessage.latch`; it must come before ``msg``."""
 
 
 def is_light(text: bytes) -> bool:
@@ -97,7 +100,8 @@ def find_address(text: bytes) -> Address | None:
     msg = _MSG.search(head)
     head = head[: msg.start()] if msg is not None else head
     tag, type_, msg_id = (_find(pattern, head, tail) for pattern in (_TAG, _CLASS, _MSG_ID))
-    return Address(tag, type_, msg_id or NO_ID) if tag else None
+    latch = _find(_LATCH, head, b"")
+    return Address(tag, type_, msg_id or NO_ID, latch) if tag else None
 
 
 def _find(pattern: re.Pattern[bytes], head: bytes, tail: bytes) -> str:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 from typing import TYPE_CHECKING
 
 from rce.protocol.names import Role
 from rce.ros.errors import MasterError
 from rce.ros.node import Node
-from rce_client.exceptions import ClientError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator, Callable, Sequence
 
+    from rce.ros.node import Publisher as RosPublisher
     from rce.ros.types import TypeRegistry
     from rce_client.connection import Connection
     from rce_client.ends import Publisher
@@ -72,10 +73,11 @@ async def lay(span: Span, conn: Connection, node: Node) -> None:
     match span.role:
         case Role.SUBSCRIBER:
             uplink = Uplink(conn, await conn.publisher(span.tag, span.cls, raw=True))
-            await node.subscribe_serialized(span.addr, span.cls, uplink.send, hears_own=False)
+            await node.listen(span.addr, span.cls, uplink)
         case Role.PUBLISHER:
             publisher = await node.advertise(span.addr, span.cls)
-            await conn.subscriber(span.tag, span.cls, publisher.publish_serialized, raw=True)
+            downlink = Downlink(publisher)
+            await conn.subscriber(span.tag, span.cls, downlink.received, raw=True, latches=downlink)
         case Role.SERVICE_PROVIDER:
             client = await conn.service_client(span.tag, span.cls, raw=True)
 
@@ -95,8 +97,10 @@ async def lay(span: Span, conn: Connection, node: Node) -> None:
 class Uplink:
     """A topic of the robot on its way to the cloud, where nothing is sent before somebody hears it.
 
-    The engine makes an interface some time after it was asked to, and would complain of messages before. A
-    latched message waits for its time; any other would be out of date by then.
+    The engine makes an interface some time after it was asked to, and would complain of messages before. What
+    is latched waits for its time; any other message would be out of date by then.
+
+    Implements :class:`rce.ros.node.subscriber.TopicListener`.
 
     Args:
         conn: What it goes over.
@@ -106,23 +110,52 @@ class Uplink:
     def __init__(self, conn: Connection, publisher: Publisher[bytes]) -> None:
         self._conn = conn
         self._publisher = publisher
-        self._latched: bytes | None = None
+        self._names: dict[str, str] = {}
+        """By publisher of the robot's graph: what the engine is told of who it is."""
+        self._numbers = itertools.count(1)
 
-    def send(self, payload: bytes, latched: bool) -> None:
-        """Take a message of the robot's graph."""
+    def received(self, payload: bytes) -> None:
+        """Send a message of the robot's graph."""
         if self._conn.active.get(self._publisher.tag, False):
             self._publisher.publish(payload)
-        elif latched:
-            if self._latched is None:
-                self._conn.spawn(self._send_latched())
-            self._latched = bytes(payload)
 
-    async def _send_latched(self) -> None:
-        with contextlib.suppress(ClientError):  # closed for good: nobody will hear it
-            await self._publisher.wait_active()
-            if self._latched is not None:
-                self._publisher.publish(self._latched)
-        self._latched = None
+    def received_latched(self, payload: bytes, source: str) -> None:
+        """Send a latched message of the robot's graph, now and whenever the interface is joined again."""
+        name = self._names.get(source)
+        if name is None:
+            name = self._names[source] = str(next(self._numbers))
+        self._publisher.publish(bytes(payload), latch=name)
+
+    def source_ended(self, source: str) -> None:
+        """Take back what a publisher of the robot's graph latched."""
+        self._names.pop(source, None)
+        self._publisher.keep_latched(tuple(self._names.values()))
+
+
+class Downlink:
+    """A topic of the cloud on its way to the robot's graph, where what is latched there is latched too.
+
+    Implements :class:`rce_client.ends.LatchListener`.
+
+    Args:
+        publisher: Its topic in the robot's graph.
+    """
+
+    def __init__(self, publisher: RosPublisher) -> None:
+        self._publisher = publisher
+
+    def received(self, payload: bytes) -> None:
+        """Publish a message."""
+        self._publisher.publish_serialized(payload)
+
+    def received_latched(self, message: bytes, source: str) -> None:
+        """Publish a message, and keep it for nodes that subscribe later."""
+        self._publisher.publish_serialized(message, latch=True, source=source)
+
+    def keep_latched(self, sources: Sequence[str]) -> None:
+        """Forget what all other sources latched."""
+        for source in self._publisher.latched.keys() - set(sources):
+            self._publisher.unlatch(source)
 
 
 async def wait_ready(plan: Plan, conn: Connection, say: Callable[[str], None]) -> None:

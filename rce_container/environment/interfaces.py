@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from abc import abstractmethod
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Collection
 from typing import TYPE_CHECKING
 
 from rce.link import Buffer, CallError, Interface, InterfaceError, Port
@@ -84,6 +84,17 @@ class PublisherInterface(RosInterface):
         if self.publisher is not None:
             self.publisher.publish_serialized(payload, latch=latched)
 
+    def receive_latched(self, payload: bytes, source: str) -> None:
+        """Publish one message, and give it to nodes that subscribe later."""
+        if self.publisher is not None:
+            self.publisher.publish_serialized(payload, latch=True, source=source)
+
+    def unlatch(self, sources: Collection[str]) -> None:
+        """Give later nodes nothing of these sources any more."""
+        if self.publisher is not None:
+            for source in sources:
+                self.publisher.unlatch(source)
+
     async def close(self) -> None:
         """Take the topic back."""
         if self.publisher is not None:
@@ -95,14 +106,28 @@ class SubscriberInterface(RosInterface):
 
     subscriber: Subscriber | None = None
 
+    def __init__(self, port: Port, node: Node, readiness: Readiness) -> None:
+        super().__init__(port, node, readiness)
+        self._sources: dict[str, None] = {}
+        """Publishers whose last message is latched, oldest first."""
+
     async def open(self) -> None:
         """Subscribe to the topic."""
-        self.subscriber = await self.node.subscribe_serialized(
-            self.addr, self.cls, self._forward, hears_own=False
-        )
+        self.subscriber = await self.node.listen(self.addr, self.cls, self)
 
-    def _forward(self, payload: bytes, latched: bool) -> None:
-        self.port.send(payload, latched=latched)
+    def received(self, payload: bytes) -> None:
+        """Send a node's message."""
+        self.port.send(payload)
+
+    def received_latched(self, payload: bytes, source: str) -> None:
+        """Send a node's message, also to peers that come later."""
+        self._sources[source] = None
+        self.port.send(payload, latched=True, source=source)
+
+    def source_ended(self, source: str) -> None:
+        """Give later peers nothing of a node that ended."""
+        self._sources.pop(source, None)
+        self.port.keep_latched(self._sources)
 
     async def close(self) -> None:
         """Unsubscribe."""

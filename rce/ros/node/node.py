@@ -17,6 +17,7 @@ from rce.ros.node.service import Handler, SerializedHandler, Service, coding
 from rce.ros.node.service_client import ServiceClient, answers
 from rce.ros.node.settings import NodeSettings
 from rce.ros.node.subscriber import (
+    ListenerSink,
     MessageCallback,
     QueueSink,
     SerializedCallback,
@@ -28,6 +29,7 @@ from rce.ros.node.timing import Rate, Timer, TimerCallback
 from rce.ros.tcpros.header import ANY
 
 if TYPE_CHECKING:
+    from rce.ros.node.subscriber import Sink, TopicListener
     from rce.ros.types import MessageType, ServiceType, Time, TypeRegistry
 
 SERVICE_POLL = 0.1
@@ -172,7 +174,6 @@ class Node(GraphMember):
         callback: SerializedCallback,
         *,
         queue_size: int = DEFAULT_QUEUE,
-        hears_own: bool = True,
     ) -> Subscriber:
         """Take the messages of a topic as they are on the wire.
 
@@ -182,20 +183,37 @@ class Node(GraphMember):
             callback: Called with ``(payload, latched)``; ``latched`` is what the publisher says of itself.
                 Plain function or coroutine function, as for :meth:`subscribe`.
             queue_size: As for :meth:`subscribe`.
-            hears_own: Whether it takes what this node itself publishes; a bridge does not.
 
         Raises:
             TypeMismatch: This node subscribes to the topic with another type.
             UnknownType: There is no such type.
             MasterError: The master cannot be told.
         """
-        runtime = self._running
         name = self.resolve(topic)
-        sink = sink_for(callback, queue_size, name, runtime.tasks)
+        sink = sink_for(callback, queue_size, name, self._running.tasks)
+        return await self._subscribe_raw(name, kind, sink)
+
+    async def _subscribe_raw(
+        self, name: str, kind: str | MessageType | TypeName, sink: Sink, *, hears_own: bool = True
+    ) -> Subscriber:
+        runtime = self._running
         known: MessageType | TypeName | None = None
         if kind != ANY:
             known = kind if isinstance(kind, TypeName) else runtime.types.message(kind)
         return await self._topics.subscribe(runtime, name, known, sink, decodes=False, hears_own=hears_own)
+
+    async def listen(
+        self, topic: str, kind: str | MessageType | TypeName, listener: TopicListener
+    ) -> Subscriber:
+        """Take the messages of a topic as a bridge needs them: as on the wire, and those of others only.
+
+        Args:
+            topic: The topic.
+            kind: As for :meth:`subscribe_serialized`, and so is what is raised.
+            listener: Takes the messages, at once and in order; must not block.
+        """
+        name = self.resolve(topic)
+        return await self._subscribe_raw(name, kind, ListenerSink(listener, name), hears_own=False)
 
     # ------------------------------------------------------------------ services
 

@@ -173,10 +173,10 @@ class TopicOutput:
     @property
     def is_latching(self) -> bool:
         """Whether a new subscriber may get an old message."""
-        return any(publisher.latch or publisher.latched is not None for publisher in self.publishers)
+        return any(publisher.latch or publisher.latched for publisher in self.publishers)
 
     def _latched(self) -> list[Chunks]:
-        return [chunks for publisher in self.publishers if (chunks := publisher.latched) is not None]
+        return [chunks for publisher in self.publishers for chunks in publisher.latched.values()]
 
     def _joined(self) -> None:
         self.changed.set()
@@ -192,7 +192,7 @@ class Publisher:
 
     Attributes:
         latch: Whether the last message is given to later subscribers.
-        latched: The frame that later subscribers get.
+        latched: The frames that later subscribers get, by the source that they are of.
         on_subscriber: Called whenever another subscriber is connected; to be set by the program.
     """
 
@@ -200,7 +200,7 @@ class Publisher:
         self, output: TopicOutput, *, latch: bool, release: Callable[[Publisher], Awaitable[None]]
     ) -> None:
         self.latch = latch
-        self.latched: Chunks | None = None
+        self.latched: dict[str, Chunks] = {}
         self.on_subscriber: Callable[[], None] | None = None
         self._output = output
         self._release = release
@@ -248,28 +248,33 @@ class Publisher:
             return
         self.publish_serialized(kind.serialize(message))
 
-    def publish_serialized(self, payload: Payload, latch: bool = False) -> None:
+    def publish_serialized(self, payload: Payload, latch: bool = False, source: str = "") -> None:
         """Publish a serialized message, untouched.
 
         Args:
             payload: The message's bytes.
             latch: Remember this message for later subscribers, whatever :attr:`latch` says.
+            source: Whose message it is, if this publishes for others: one message of each is remembered.
 
         Raises:
             NodeClosed: The publisher was closed.
         """
         output = self._output
-        self._send(payload, latch)
+        self._send(payload, latch, source)
         if output.local_links:
             output.send_locally(Parcel(output.known_kind, payload=bytes(payload)))
 
-    def _send(self, payload: Payload, latch: bool) -> None:
+    def unlatch(self, source: str = "") -> None:
+        """Forget the message that is remembered of a source; no later subscriber gets it."""
+        self.latched.pop(source, None)
+
+    def _send(self, payload: Payload, latch: bool, source: str = "") -> None:
         """Send to the subscribers of other processes."""
         if self._closed:
             raise NodeClosed(f"the publisher of {self.topic} is closed")
         chunks = frame(payload)
         if latch or self.latch:
-            self.latched = chunks
+            self.latched[source] = chunks
         size = len(payload)
         for link in self._output.links:
             link.send(chunks, size)

@@ -37,8 +37,11 @@ class Sink(Protocol):
     def dropped(self) -> int:
         """How many messages were dropped, the oldest first, because they were not taken in time."""
 
-    def deliver(self, payload: Item, latched: bool) -> None:
-        """Take a message; must neither wait nor raise."""
+    def deliver(self, payload: Item, latched: bool, source: str) -> None:
+        """Take a message of the publisher with this slave API; must neither wait nor raise."""
+
+    def lose(self, source: str) -> None:
+        """Learn that the connection to a publisher ended."""
 
     def end(self) -> None:
         """Learn that no more will come."""
@@ -56,12 +59,64 @@ class CallbackSink:
         """Nothing ever is."""
         return 0
 
-    def deliver(self, payload: Item, latched: bool) -> None:
+    def deliver(self, payload: Item, latched: bool, source: str) -> None:
         """Call."""
+        del source
         try:
             self._callback(payload, latched)
         except Exception:  # noqa: BLE001 - the program's own fault, which must not stop the next message
             _log.exception("the callback of %s failed", self._topic)
+
+    def lose(self, source: str) -> None:
+        """Nothing is kept."""
+
+    def end(self) -> None:
+        """Nothing is kept."""
+
+
+class TopicListener(Protocol):
+    """Takes a topic's messages as a bridge needs them: with the publishers of those that are latched."""
+
+    def received(self, payload: bytes) -> None:
+        """Take a message."""
+
+    def received_latched(self, payload: bytes, source: str) -> None:
+        """Take a latched message; it replaces the one that the same publisher latched before."""
+
+    def source_ended(self, source: str) -> None:
+        """Learn that a publisher ended: nothing of it is latched any more."""
+
+
+class ListenerSink:
+    """Hands messages to a listener, at once."""
+
+    def __init__(self, listener: TopicListener, topic: str) -> None:
+        self._listener = listener
+        self._topic = topic
+        self._sources: set[str] = set()
+
+    @property
+    def dropped(self) -> int:
+        """Nothing ever is."""
+        return 0
+
+    def deliver(self, payload: Item, latched: bool, source: str) -> None:
+        """Hand over."""
+        data = payload.payload() if isinstance(payload, Parcel) else payload
+        try:
+            if latched:
+                self._sources.add(source)
+                self._listener.received_latched(data, source)
+            else:
+                self._listener.received(data)
+        except Exception:  # noqa: BLE001 - the program's own fault, which must not stop the next message
+            _log.exception("the listener of %s failed", self._topic)
+
+    def lose(self, source: str) -> None:
+        """Tell of the end of a publisher that had latched something."""
+        if source in self._sources:
+            self._sources.remove(source)
+            self._listener.source_ended(source)
 
     def end(self) -> None:
         """Nothing is kept."""
@@ -80,10 +135,14 @@ class QueueSink:
         """How many messages were dropped."""
         return self._queue.dropped
 
-    def deliver(self, payload: Item, latched: bool) -> None:
+    def deliver(self, payload: Item, latched: bool, source: str) -> None:
         """Keep."""
+        del source
         self._queue.put((payload, latched), len(payload))
         self._arrived.set()
+
+    def lose(self, source: str) -> None:
+        """What was kept stays: it may still be wanted."""
 
     def end(self) -> None:
         """Let those who wait go."""

@@ -67,14 +67,19 @@ class TopicInput:
         own = uri == self._own_uri
         for subscriber in self.subscribers:
             if subscriber.hears_own or not own:
-                subscriber.sink.deliver(payload, latched)
+                subscriber.sink.deliver(payload, latched, uri)
 
     def deliver_parcel(self, parcel: Parcel, latched: bool, uri: str) -> None:
         """Give a message of a publisher of this process to all subscribers."""
         own = uri == self._own_uri
         for subscriber in self.subscribers:
             if subscriber.hears_own or not own:
-                subscriber.sink.deliver(parcel if subscriber.decodes else parcel.payload(), latched)
+                subscriber.sink.deliver(parcel if subscriber.decodes else parcel.payload(), latched, uri)
+
+    def lose(self, uri: str) -> None:
+        """Tell all subscribers that the connection to a publisher ended."""
+        for subscriber in self.subscribers:
+            subscriber.sink.lose(uri)
 
     def catch_up(self, subscriber: Subscriber) -> None:
         """Give a subscriber that came later the latched messages; they come only once over a connection."""
@@ -83,9 +88,9 @@ class TopicInput:
             if link.uri == self._own_uri and not subscriber.hears_own:
                 continue
             if isinstance(link.kept, Parcel) and not subscriber.decodes:
-                subscriber.sink.deliver(link.kept.payload(), True)
+                subscriber.sink.deliver(link.kept.payload(), True, link.uri)
             elif link.kept is not None:
-                subscriber.sink.deliver(link.kept, True)
+                subscriber.sink.deliver(link.kept, True, link.uri)
 
     def set_publishers(self, uris: Iterable[str], *, of_new_master: bool = False) -> None:
         """Follow these publishers, given by their slave APIs, and no others.
@@ -154,6 +159,7 @@ class TopicInput:
             await link.ended
         finally:
             self.links.remove(link)
+            self.lose(link.uri)
             output.drop(link)
 
     async def _receive(self, link: InputLink) -> None:
@@ -169,6 +175,7 @@ class TopicInput:
             await link.ended
         finally:
             self.links.remove(link)
+            self.lose(link.uri)
             connection.abort()
             await connection.gone.wait()
 

@@ -180,12 +180,13 @@ async def test_a_bad_file_is_refused_with_every_fault_and_nothing_is_sent(
     engine: Engine, tmp_path: Path
 ) -> None:
     data = config(engine.door.url)
-    data["interfaces"][1] |= {"iCls": "no_such/Type", "addr": "/say"}
+    for number in (1, 2):
+        data["interfaces"][number] |= {"iCls": f"no_such/Type{number}"}
     async with program(write(tmp_path, data)) as bridge:
         assert await bridge.end() == 2
     text = "\n".join(bridge.lines)
+    assert "interfaces[2].iCls" in text
     assert "interfaces[1].iCls" in text
-    assert "interfaces[1].addr" in text
     data["interfaces"][2]["iType"] = "Nonsense"
     del data["userID"]
     async with program(write(tmp_path, data)) as bridge:

@@ -11,7 +11,16 @@ from msgspec.structs import replace
 
 from rce.control.model import ConnectionSpec, LinkAddress, LinkSpec
 from rce.link import CallTimeout, LinkLimits, LinkLost, LinkRefused, MessageTooLarge, Overloaded, PeerLost
-from rce.link.frames import HEADER, Frame, FrameReader, FrameType, check_answer, encode, encode_hello
+from rce.link.frames import (
+    HEADER,
+    Frame,
+    FrameReader,
+    FrameType,
+    check_answer,
+    encode,
+    encode_hello,
+    encode_welcome,
+)
 
 if TYPE_CHECKING:
     from .conftest import Party, Rig
@@ -336,7 +345,7 @@ class Stalled:
         sock.setblocking(False)
         await loop.sock_connect(sock, address.unix)
         await loop.sock_sendall(sock, encode_hello(link, "secret"))
-        await loop.sock_recv(sock, HEADER.size)
+        await loop.sock_recv(sock, len(encode_welcome()))
         await loop.sock_sendall(sock, b"".join(encode(Frame(FrameType.OPEN, n)) for n in channels))
         return cls(sock)
 

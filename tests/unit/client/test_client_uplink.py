@@ -2,77 +2,120 @@
 
 from __future__ import annotations
 
-import asyncio
-from typing import Any
+import json
+from typing import TYPE_CHECKING, Any
 
-from rce_client.exceptions import NotConnectedError
-from rce_client.ros_bridge.bridge import Uplink
+from rce_client.ends import Publisher
+from rce_client.ros_bridge.bridge import Downlink, Uplink
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rce.protocol.codec import Frame
+
+TAG, STRING = "pose", "std_msgs/String"
 
 
-class PlayedPublisher:
-    """A connection with one interface, which becomes active when the test says so."""
+class PlayedWay:
+    """A connection with one interface, which is active when the test says so."""
 
-    tag = "poseSender"
+    knows_sources = True
 
     def __init__(self) -> None:
         self.active: dict[str, bool] = {}
-        self.sent: list[bytes] = []
-        self.tasks: list[asyncio.Task[None]] = []
-        self.closed = False
-        self._changed = asyncio.Event()
+        self.sent: list[tuple[str, str]] = []
 
-    def spawn(self, work: Any) -> asyncio.Task[None]:
-        self.tasks.append(asyncio.create_task(work))
-        return self.tasks[-1]
+    def is_active(self, tag: str) -> bool:
+        return self.active.get(tag, False)
 
-    def publish(self, payload: bytes) -> bool:
-        self.sent.append(payload)
+    def post_data(self, tag: str, frames: Sequence[Frame], key: str | None = None) -> bool:
+        message = json.loads(frames[0])
+        data = message["data"]
+        if message["type"] == "LT":
+            self.sent.append(("LT", ",".join(data.get("sources", ()))))
+        else:
+            self.sent.append((data.get("latch", ""), bytes(frames[1])[32:].decode()))  # type: ignore[arg-type]
         return True
 
-    async def wait_active(self) -> None:
-        await self._changed.wait()
-        if self.closed:
-            raise NotConnectedError("closed")
-
-    async def change(self, *, active: bool = True, closed: bool = False) -> None:
-        self.active[self.tag], self.closed = active, closed
-        self._changed.set()
-        await asyncio.gather(*self.tasks)
-        self._changed.clear()
+    def join(self, publisher: Publisher[bytes], *, active: bool = True) -> None:
+        self.active[TAG] = active
+        if active:
+            publisher.on_active()
 
 
-def uplink(played: Any) -> Uplink:
-    return Uplink(played, played)
+def uplink() -> tuple[PlayedWay, Publisher[bytes], Uplink]:
+    way: Any = PlayedWay()
+    publisher = Publisher[bytes](way, TAG, STRING, raw=True)
+    return way, publisher, Uplink(way, publisher)
 
 
-async def test_what_comes_too_early_is_not_sent_unless_it_is_latched() -> None:
-    played = PlayedPublisher()
-    link = uplink(played)
-    link.send(b"pose 1", False)
-    link.send(b"map 1", True)
-    link.send(b"map 2", True)
-    assert played.sent == []
-    await played.change()
-    assert played.sent == [b"map 2"]
-    link.send(b"pose 2", False)
-    link.send(b"map 3", True)
-    assert played.sent == [b"map 2", b"pose 2", b"map 3"]
-    assert len(played.tasks) == 1
+def test_what_comes_too_early_is_not_sent_unless_it_is_latched() -> None:
+    way, publisher, link = uplink()
+    link.received(b"pose 1")
+    link.received_latched(b"map 1", "http://a")
+    link.received_latched(b"map 2", "http://a")
+    link.received_latched(b"sign", "http://b")
+    assert way.sent == []
+    way.join(publisher)
+    assert way.sent == [("1", "map 2"), ("2", "sign"), ("LT", "1,2")]
+    link.received(b"pose 2")
+    link.received_latched(b"map 3", "http://a")
+    assert way.sent[3:] == [("", "pose 2"), ("1", "map 3")]
 
 
-async def test_a_latched_message_waits_again_when_the_peer_is_away() -> None:
-    played = PlayedPublisher()
-    link = uplink(played)
-    await played.change()
-    await played.change(active=False)
-    link.send(b"map", True)
-    assert played.sent == []
-    await played.change()
-    assert played.sent == [b"map"]
+def test_what_is_latched_is_said_again_when_the_peer_is_back() -> None:
+    way, publisher, link = uplink()
+    way.join(publisher)
+    link.received_latched(b"map", "http://a")
+    way.join(publisher, active=False)
+    link.received(b"pose")
+    way.sent.clear()
+    way.join(publisher)
+    assert way.sent == [("1", "map"), ("LT", "1")]
 
 
-async def test_nothing_is_sent_over_a_connection_that_was_closed() -> None:
-    played = PlayedPublisher()
-    uplink(played).send(b"map", True)
-    await played.change(active=False, closed=True)
-    assert played.sent == []
+def test_a_publisher_that_ends_takes_its_message_back() -> None:
+    way, publisher, link = uplink()
+    way.join(publisher)
+    for name in ("a", "b"):
+        link.received_latched(name.encode(), f"http://{name}")
+    link.source_ended("http://a")
+    assert way.sent[-1] == ("LT", "2")
+    link.received_latched(b"a is back", "http://a")
+    assert way.sent[-1] == ("3", "a is back")
+
+
+def test_an_engine_that_knows_no_sources_is_told_of_none() -> None:
+    way, publisher, link = uplink()
+    way.knows_sources = False
+    link.received_latched(b"map", "http://a")
+    way.join(publisher)
+    link.source_ended("http://a")
+    assert way.sent == [("", "map")]
+
+
+class PlayedTopic:
+    """A topic of the robot's graph."""
+
+    def __init__(self) -> None:
+        self.latched: dict[str, bytes] = {}
+        self.published: list[bytes] = []
+
+    def publish_serialized(self, payload: bytes, latch: bool = False, source: str = "") -> None:
+        self.published.append(payload)
+        if latch:
+            self.latched[source] = payload
+
+    def unlatch(self, source: str = "") -> None:
+        del self.latched[source]
+
+
+def test_what_the_cloud_latches_is_latched_at_the_robot() -> None:
+    topic: Any = PlayedTopic()
+    link = Downlink(topic)
+    link.received(b"pose")
+    for source in ("5.1", "5.2"):
+        link.received_latched(source.encode(), source)
+    assert topic.published == [b"pose", b"5.1", b"5.2"]
+    link.keep_latched(("5.2", "5.3"))
+    assert topic.latched == {"5.2": b"5.2"}

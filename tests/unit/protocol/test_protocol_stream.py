@@ -105,7 +105,7 @@ def test_sides_take_only_their_types() -> None:
     assert isinstance(ProtocolStream.for_client().feed(status, 0.0)[0], InterfaceStatus)
     assert isinstance(ProtocolStream.for_engine().feed(create, 0.0)[0], CreateContainer)
     assert ProtocolStream.for_engine().feed(status, 0.0) == [
-        Fault("type: unknown message type 'ST'; use one of CC, CN, CX, DC, DM, RC")
+        Fault("type: unknown message type 'ST'; use one of CC, CN, CX, DC, DM, LT, RC")
     ]
     assert isinstance(ProtocolStream.for_client().feed(create, 0.0)[0], Fault)
 

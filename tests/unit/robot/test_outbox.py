@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce_robot.outbox import Outbox, OutboxLimits, Outgoing, Overflow, Queued
+from rce_robot.outbox import LatchedDelivery, Outbox, OutboxLimits, Outgoing, Overflow, Queued
 
 
 def message(text: str, extra: int = 0) -> Outgoing:
@@ -162,7 +164,7 @@ def test_latched_messages_are_neither_dropped_nor_in_the_way() -> None:
     """More than all queues hold comes at once: all of it waits, and ordinary messages have their room."""
     outbox = Outbox(OutboxLimits(queue_bytes=100, total_bytes=200))
     for number in range(10):
-        outbox.put_latched(f"map{number}", Outgoing(b"m" * 90), shared=False)
+        outbox.put_latched(f"map{number}", "1", Outgoing(b"m" * 90), shared=False)
         outbox.put_data(f"map{number}", Outgoing(b"d" * 20))
     assert outbox.bytes == 10 * 90 + 10 * 20
     outbox.put_data("other", Outgoing(b"o" * 50))
@@ -174,9 +176,9 @@ def test_latched_messages_are_neither_dropped_nor_in_the_way() -> None:
 
 def test_a_latched_message_takes_the_place_of_the_one_before() -> None:
     outbox = Outbox()
-    outbox.put_latched("map", Outgoing(b"old"), shared=False)
+    outbox.put_latched("map", "1", Outgoing(b"old"), shared=False)
     outbox.put_data("map", Outgoing(b"between"))
-    outbox.put_latched("map", Outgoing(b"newer"), shared=False)
+    outbox.put_latched("map", "1", Outgoing(b"newer"), shared=False)
     assert [message.text for message in iter(outbox.pop, None)] == [b"between", b"newer"]
     assert outbox.bytes == 0
     assert outbox.dropped["map"] == 1
@@ -184,18 +186,31 @@ def test_a_latched_message_takes_the_place_of_the_one_before() -> None:
 
 def test_a_latched_message_that_is_kept_elsewhere_is_not_counted_twice() -> None:
     outbox = Outbox()
-    outbox.put_latched("map", Outgoing(b"m" * 90), shared=True)
+    outbox.put_latched("map", "1", Outgoing(b"m" * 90), shared=True)
     assert outbox.bytes == 0
-    outbox.drop_latched("map")
+    outbox.drop_latched("map", "1")
     assert not outbox
 
 
 def test_latched_messages_go_last_when_memory_is_short() -> None:
     outbox = Outbox()
-    outbox.put_latched("map", Outgoing(b"m" * 90), shared=False)
+    outbox.put_latched("map", "1", Outgoing(b"m" * 90), shared=False)
     outbox.put_data("map", Outgoing(b"d" * 20))
     outbox.shed(10)
     assert outbox.bytes == 90
     outbox.shed(10)
     assert outbox.bytes == 0
     assert not outbox
+
+
+def test_each_source_has_a_latched_message_and_names_it() -> None:
+    """One that ends before its message was sent takes back its own only."""
+    outbox = Outbox()
+    for source, text in (("1", b"old"), ("2", b"of 2"), ("3", b"of 3"), ("1", b"of 1")):
+        message = Outgoing(b'{"type":"DM","data":{"iTag":"map","msg":"' + text + b'"}}')
+        outbox.put_latched("map", source, LatchedDelivery(message, source), shared=False)
+    outbox.drop_latched("map", "3")
+    sent = [json.loads(bytes(message.render().text))["data"] for message in iter(outbox.pop, None)]
+    assert [(data["latch"], data["msg"]) for data in sent] == [("2", "of 2"), ("1", "of 1")]
+    assert outbox.bytes == 0
+    assert outbox.dropped["map"] == 2

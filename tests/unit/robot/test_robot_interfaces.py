@@ -38,10 +38,16 @@ class FakePort:
     def __init__(self, type_: str, cls: str) -> None:
         self.spec = InterfaceSpec(tag="tag", type=type_, cls=cls)
         self.sent: list[bytes] = []
+        self.latched: dict[str, bytes] = {}
         self.answer: bytes | Exception | asyncio.Future[bytes] = b""
 
-    def send(self, payload: Any, *, latched: bool = False) -> None:
+    def send(self, payload: Any, *, latched: bool = False, source: str = "") -> None:
         self.sent.append(bytes(payload))
+        if latched:
+            self.latched[source] = bytes(payload)
+
+    def keep_latched(self, sources: Sequence[str]) -> None:
+        self.latched = {source: self.latched[source] for source in sources if source in self.latched}
 
     async def call(self, payload: Any, *, timeout: float | None = None) -> bytes:
         self.sent.append(bytes(payload))
@@ -63,6 +69,8 @@ class FakeRobot:
         self.gone: list[RobotInterface] = []
         self.holdings = Holdings()
         self.latched_dropped = 0
+        self.knows_sources = True
+        self.sources: list[tuple[str, ...]] = []
         self.awaited: list[tuple[LargeData, list[str]]] = []
 
     def send_data(self, tag: str, message: Queued, overflow: Overflow) -> bool:
@@ -83,10 +91,13 @@ class FakeRobot:
     def show_active(self, tag: str, active: bool) -> None:
         self.states.append(active)
 
-    def send_latched(self, tag: str, message: Queued, *, shared: bool) -> None:
+    def send_latched(self, tag: str, source: str, message: Queued, *, shared: bool) -> None:
         self.send_data(tag, message, Overflow.DROP_OLDEST)
 
-    def drop_latched(self, tag: str) -> None:
+    def send_sources(self, tag: str, sources: Sequence[str]) -> None:
+        self.sources.append(tuple(sources))
+
+    def drop_latched(self, tag: str, source: str) -> None:
         self.latched_dropped += 1
 
     def hold(self, size: int, give_up: Callable[[], object] | None = None) -> Holding:
@@ -231,6 +242,47 @@ def test_the_last_latched_message_waits_for_a_robot_that_comes_back() -> None:
     setup.interface.robot_joined()
     assert [shown(message)["msg"]["data"] for message, _ in setup.robot.data] == ["map"]
     assert setup.robot.states == [True, True]
+
+
+def test_each_source_of_peers_has_its_latched_message() -> None:
+    """A robot that comes back gets all that are in force, and is told which these are."""
+    setup = Setup("PublisherConverter")
+    for source, text in (("1", "old"), ("2", "of 2"), ("3", "of 3"), ("1", "of 1")):
+        setup.interface.receive_latched(ros_string(text), source)
+    setup.interface.unlatch(["3"])
+    assert setup.robot.sources == [("2", "1")]
+    setup.robot.data.clear()
+    setup.interface.robot_joined()
+    assert [shown(message)["msg"]["data"] for message, _ in setup.robot.data] == ["of 2", "of 1"]
+    assert setup.robot.sources[-1] == ("2", "1")
+    assert setup.robot.holdings.bytes == len(ros_string("of 2")) + len(ros_string("of 1"))
+
+
+def test_what_a_robot_latches_lasts_as_long_as_it_says() -> None:
+    """Also while it is away; but not when a client comes that does not name its sources."""
+    setup = Setup("SubscriberConverter")
+    for source in ("1", "2"):
+        message = DataMessage("tag", STRING, {"data": source}, latch=source)
+        setup.interface.take(message)
+    setup.take({"data": "not latched"})
+    setup.interface.robot_left()
+    assert setup.port.latched == {source: ros_string(source) for source in ("1", "2")}
+    setup.interface.robot_joined()
+    setup.interface.keep_latched(("2",))
+    assert list(setup.port.latched) == ["2"]
+    setup.robot.knows_sources = False
+    setup.interface.robot_joined()
+    assert not setup.port.latched
+
+
+async def test_sources_end_after_what_waits_to_be_converted() -> None:
+    setup = Setup("SubscriberConverter", "sensor_msgs/Image")
+    picture = {"height": 1, "width": 1, "encoding": "mono8", "step": 1, "data": b"x"}
+    setup.interface.take(DataMessage("tag", "sensor_msgs/Image", picture, latch="1"))
+    setup.interface.keep_latched(())
+    await asyncio.gather(*setup.robot.work)
+    assert len(setup.port.sent) == 1
+    assert not setup.port.latched
 
 
 async def test_pictures_are_converted_elsewhere_and_in_order() -> None:

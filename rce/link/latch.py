@@ -1,0 +1,112 @@
+"""What an interface keeps of latched topics: the last message of each source, at both ends of a connection.
+
+The sending end keeps the payloads, and sends them to each peer that comes later. The receiving end keeps
+nothing but which sources it has heard of on which channel, so that it can tell its interface when one ended.
+
+Sources survive the loss of a connection: what they said stays in force until the peer is back and says what
+is in force now (SOURCES), or until the connection is removed.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterator
+
+    from rce.guard.holdings import Holding, Holdings
+
+MAX_SOURCES = 1024
+"""Publishers of one topic whose latched messages are kept."""
+
+
+@dataclass(eq=False, slots=True)
+class Kept:
+    """The last message of a source."""
+
+    number: int
+    """Names the source on channels."""
+    payload: bytes | memoryview
+    holding: Holding | None = None
+
+
+class LatchedMessages:
+    """The last message of each source, oldest source first.
+
+    Args:
+        holdings: Where the bytes are entered.
+        on_given_up: Called when memory is short, after a source's message was thrown away.
+    """
+
+    def __init__(self, holdings: Holdings, on_given_up: Callable[[], None]) -> None:
+        self._holdings = holdings
+        self._on_given_up = on_given_up
+        self._kept: dict[str, Kept] = {}
+        self._numbers = itertools.count(1)
+
+    def __iter__(self) -> Iterator[Kept]:
+        return iter(list(self._kept.values()))
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """The sources, by number."""
+        return tuple(kept.number for kept in self._kept.values())
+
+    def keep(self, source: str, payload: bytes | memoryview) -> int:
+        """Keep a message in place of the last one of its source; return the source's number."""
+        kept = self._kept.get(source)
+        if kept is None:
+            if len(self._kept) >= MAX_SOURCES:
+                self._forget(next(iter(self._kept)))
+            kept = self._kept[source] = Kept(next(self._numbers), payload)
+        elif kept.holding is not None:
+            kept.holding.release()
+        kept.payload = payload
+        holding = self._holdings.hold(len(payload), lambda: self._give_up(source, kept))
+        if self._kept.get(source) is kept:  # else it was given up at once
+            kept.holding = holding
+        return kept.number
+
+    def retain(self, sources: Collection[str]) -> bool:
+        """Forget all but these sources; tell whether there were others."""
+        ended = [source for source in self._kept if source not in sources]
+        for source in ended:
+            self._forget(source)
+        return bool(ended)
+
+    def _give_up(self, source: str, kept: Kept) -> None:
+        if self._kept.get(source) is kept:
+            del self._kept[source]
+            self._on_given_up()
+
+    def _forget(self, source: str) -> None:
+        kept = self._kept.pop(source)
+        if kept.holding is not None:
+            kept.holding.release()
+
+
+class HeardSources:
+    """Which sources' latched messages came on which channel."""
+
+    def __init__(self) -> None:
+        self._heard: dict[int, set[int]] = {}
+
+    def hear(self, channel: int, source: int) -> str:
+        """Note a latched message; return the name of its source, which no other channel's source has."""
+        self._heard.setdefault(channel, set()).add(source)
+        return _name(channel, source)
+
+    def retain(self, channel: int, sources: Collection[int] = ()) -> list[str]:
+        """Forget all sources of a channel but these; return the names of those that were there."""
+        heard = self._heard.get(channel, set())
+        ended = heard.difference(sources)
+        heard -= ended
+        if not heard:
+            self._heard.pop(channel, None)
+        return [_name(channel, source) for source in sorted(ended)]
+
+
+def _name(channel: int, source: int) -> str:
+    return f"{channel}.{source}"
