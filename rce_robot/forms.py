@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from rce_robot.converters import Converter
     from rce_robot.outbox import Buffer
 
-_json = msgspec.json.Encoder().encode
+_encoder = msgspec.json.Encoder()
+_json, _json_into = _encoder.encode, _encoder.encode_into
 _BINARY = (bytes, bytearray, memoryview)
 _prefix = os.urandom(8).hex()
 _numbers = itertools.count(1)
@@ -132,9 +133,11 @@ class ConverterForm:
     def pack(self, tag: str, cls: str, msg_id: str, msg: Any) -> Outgoing:
         """Write the object as JSON."""
         if self._is_plain:  # no search for binary values, and no way through a str
-            head = b'{"type":"DM","data":{"iTag":"%b","type":"%b","msgID":%b,"msg":'
             names = (tag.encode(), cls.encode(), _json(msg_id))
-            return Outgoing(b"".join((head % names, _json(msg), b"}}")))
+            packed = bytearray(b'{"type":"DM","data":{"iTag":"%b","type":"%b","msgID":%b,"msg":' % names)
+            _json_into(msg, packed, -1)  # in place: a large message is not copied once more
+            packed += b"}}"
+            return Outgoing(packed)
         text, *binaries = encode_data(tag, cls, msg, msg_id)
         assert isinstance(text, str)
         return Outgoing(text.encode(), tuple((b"", frame) for frame in binaries if isinstance(frame, bytes)))

@@ -68,7 +68,7 @@ def test_counters_can_be_told_on() -> None:
     assert found.traffic == (2**53, 7)
 
 
-@pytest.mark.parametrize("line", [b'{"t":"Report","x":' + b"[" * 100_000, b"\xff", b"", b'{"t":"Boo"}'])
+@pytest.mark.parametrize("line", [b'{"t":"Report","x":' + b"[" * 100_000, b"\xff", b"", b'{"x":"Boo"}'])
 def test_what_is_no_message_is_one_kind_of_error(line: bytes) -> None:
     with pytest.raises(msgspec.DecodeError):
         intake.read(line)
