@@ -80,7 +80,7 @@ class Meter:
 
     def read(self) -> dict[str, float]:
         """Seconds since each kind's processes began."""
-        return {kind: sum(map(_cpu_seconds, found)) for kind, found in self._processes.items()}
+        return {kind: sum(map(cpu_seconds, found)) for kind, found in self._processes.items()}
 
     def per_message(self, before: dict[str, float], messages: int) -> dict[str, float]:
         """Milliseconds per message since ``before`` was read."""
@@ -88,7 +88,7 @@ class Meter:
         return {f"{kind} cpu_ms": 1e3 * (now[kind] - before[kind]) / messages for kind in now}
 
 
-def _cpu_seconds(process: psutil.Process) -> float:
+def cpu_seconds(process: psutil.Process) -> float:
     """CPU time of a process's main thread, from the scheduler's nanoseconds."""
     with contextlib.suppress(OSError):
         return int(Path(f"/proc/{process.pid}/schedstat").read_text().split()[0]) / 1e9

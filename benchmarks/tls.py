@@ -11,10 +11,12 @@ from collections.abc import AsyncIterator
 from time import perf_counter
 from typing import Any
 
-from benchmarks.engine import BIN, RunningEngine, free_ports
+import psutil
+
+from benchmarks.engine import BIN, RunningEngine, cpu_seconds, free_ports
 from benchmarks.figures import percentile
-from benchmarks.roundtrip import converter_trip, forwarder_trip
-from benchmarks.wire import Robot, locate, robot_at, wire_echo
+from benchmarks.roundtrip import Trip, converter_trip, forwarder_trip
+from benchmarks.wire import locate, robot_at, wire_echo
 from rce.supervision.process import Child
 from rce.tls.folder import CertificateFolder
 
@@ -23,15 +25,19 @@ PAIRS = 600
 WARM_UP = 50
 TARGET = {20: 1.15}
 """Most that the median may grow, by bytes."""
+Figures = dict[tuple[str, int, str], list[float]]
+"""Form, bytes and ``plain`` or ``tls`` to seconds."""
 _TRIPS = {"Converter": converter_trip, "Forwarder": forwarder_trip}
 
 
 @contextlib.asynccontextmanager
-async def tls_endpoint(running: RunningEngine) -> AsyncIterator[tuple[str, ssl.SSLContext]]:
+async def tls_endpoint(
+    running: RunningEngine,
+) -> AsyncIterator[tuple[str, ssl.SSLContext, psutil.Process]]:
     """Run another robot endpoint of the engine, whose robots connect in TLS.
 
     Yields:
-        Its URL, and what trusts it.
+        Its URL, what trusts it, and its process.
     """
     certificates = CertificateFolder(running.folder / "bench-certificates")
     certificates.make_authority()
@@ -49,7 +55,8 @@ async def tls_endpoint(running: RunningEngine) -> AsyncIterator[tuple[str, ssl.S
             if "ready:" in line:
                 break
         drain = asyncio.create_task(_drain(child))
-        yield f"wss://127.0.0.1:{port}/", ssl.create_default_context(cafile=certificates.authority)
+        trusting = ssl.create_default_context(cafile=certificates.authority)
+        yield f"wss://127.0.0.1:{port}/", trusting, psutil.Process(child.pid)
         drain.cancel()
     finally:
         await child.stop()
@@ -62,27 +69,30 @@ async def _drain(child: Child) -> None:
 
 async def run(running: RunningEngine, *, passes: int) -> list[dict[str, Any]]:
     """Measure both, trip by trip in turn, with new containers in each pass."""
-    times: dict[tuple[str, int, str], list[float]] = {}
+    times: Figures = {}
+    costs: Figures = {}
     plain_url = await locate(running.url)  # while there is one endpoint only
-    async with tls_endpoint(running) as (url, trusting):
+    (endpoint,) = running.named("rce_robot")
+    async with tls_endpoint(running) as (url, trusting, secured_endpoint):
+        endpoints = {"plain": endpoint, "tls": secured_endpoint}
         for number in range(passes):
-            for form in _TRIPS:
+            for form, make_trip in _TRIPS.items():
                 async with (
                     robot_at(plain_url, f"plain{form}{number}") as plain,
                     robot_at(url, f"tls{form}{number}", trusting) as secured,
                 ):
                     for client in (plain, secured):
                         await wire_echo(client, form, f"c{client.name}")
-                    await _measure(form, plain, secured, times)
+                    trips = {"plain": make_trip(plain), "tls": make_trip(secured)}
+                    await _measure(form, trips, times)
+                    await _weigh(form, trips, endpoints, costs)
                     for client in (plain, secured):
                         await client.send("DC", {"containerTag": f"c{client.name}"})
-    return [_row(form, size, times) for form in _TRIPS for size in SIZES]
+    return [_row(form, size, times, costs) for form in _TRIPS for size in SIZES]
 
 
-async def _measure(
-    form: str, plain: Robot, secured: Robot, times: dict[tuple[str, int, str], list[float]]
-) -> None:
-    trips = {"plain": _TRIPS[form](plain), "tls": _TRIPS[form](secured)}
+async def _measure(form: str, trips: dict[str, Trip], times: Figures) -> None:
+    """Take the time of each trip."""
     for size in SIZES:
         gc.collect()
         for number in range(WARM_UP + PAIRS):
@@ -93,7 +103,20 @@ async def _measure(
                     times.setdefault((form, size, name), []).append(perf_counter() - start)
 
 
-def _row(form: str, size: int, times: dict[tuple[str, int, str], list[float]]) -> dict[str, Any]:
+async def _weigh(
+    form: str, trips: dict[str, Trip], endpoints: dict[str, psutil.Process], costs: Figures
+) -> None:
+    """Take the processor time of the robot endpoint, which says more than the clock on a busy machine."""
+    for size in SIZES:
+        for name, trip in trips.items():
+            before = cpu_seconds(endpoints[name])
+            for _ in range(PAIRS):
+                await trip(size)
+            cost = (cpu_seconds(endpoints[name]) - before) / PAIRS
+            costs.setdefault((form, size, name), []).append(cost)
+
+
+def _row(form: str, size: int, times: Figures, costs: Figures) -> dict[str, Any]:
     plain, secured = times[form, size, "plain"], times[form, size, "tls"]
     ratio = percentile(secured, 0.5) / percentile(plain, 0.5)
     target = TARGET.get(size)
@@ -104,5 +127,6 @@ def _row(form: str, size: int, times: dict[tuple[str, int, str], list[float]]) -
         "tls p50_ms": round(1e3 * percentile(secured, 0.5), 4),
         "x plain (p50)": round(ratio, 3),
         "x plain (p10)": round(percentile(secured, 0.1) / percentile(plain, 0.1), 3),
+        **{f"{name} cpu_ms": round(1e3 * min(costs[form, size, name]), 4) for name in ("plain", "tls")},
         "target": "" if target is None else f"{target:.2f} {'met' if ratio <= target else 'missed'}",
     }
