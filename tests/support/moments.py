@@ -129,7 +129,9 @@ def _kill(traces: Traces, name: str) -> None:
 
 async def main(seed: int, count: int) -> int:
     """Go through moments; returns how many left something."""
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # what nohup ignores, its programs ignore, too
+    # What a shell's background jobs and nohup ignore, their programs would ignore, too.
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     dice = random.Random(seed)
     bad = 0
     for number in range(count):

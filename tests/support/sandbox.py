@@ -125,6 +125,7 @@ async def look(folder: Path, runtime: str, home_bytes: int) -> dict[str, Any]:
                 node = NodeSpec(tag="node", pkg="own", exe=exe, args=arguments)
                 await machine.put(BOX, nodes=(node,))
                 said = await machine.log_holds(BOX, "node", "}\n")
+                await until(lambda: machine.node(BOX, "node").pid, what="the node's process is told")
                 seen = json.loads(next(line for line in said.splitlines() if line.startswith("{")))
                 found[exe.partition(".")[0]] = {**seen, "outside": outside(machine)}
                 await machine.drop(BOX)

@@ -39,7 +39,7 @@ def can(path):
 run = subprocess.run(["/bin/cat", "/etc/rootfs-release"], capture_output=True, text=True)
 status = dict(line.split(":", 1) for line in open("/proc/self/status"))
 print(json.dumps({
-    "root": sorted(os.listdir("/")), "release": run.stdout, "machine": os.path.exists("/usr/bin"),
+    "root": sorted(os.listdir("/")), "release": run.stdout, "machine": os.path.exists("/usr/sbin"),
     "uid": os.getuid(), "host": os.uname().nodename, "env": sorted(os.environ),
     "written": [path for path in ("/x", "/etc/x", "x", "/tmp/x", "/dev/shm/x") if can(path)],
     "caps": status["CapBnd"].strip(), "filter": status["Seccomp"].strip(), "python": sys.executable,
