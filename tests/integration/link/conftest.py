@@ -25,7 +25,7 @@ from rce.link.handover import Doorman, HandoverReceiver, HandoverSender
 from rce.protocol.names import EndpointId
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+    from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterator
 
     from rce.link import Buffer, Port
 
@@ -39,6 +39,8 @@ class FakeInterface(Interface):
     def __init__(self, port: Port) -> None:
         super().__init__(port)
         self.received: asyncio.Queue[tuple[bytes, bool]] = asyncio.Queue()
+        self.latched: dict[str, bytes] = {}
+        self.unlatched = asyncio.Event()
         self.active: list[bool] = []
         self.may_start = asyncio.Event()
         self.may_start.set()
@@ -66,6 +68,28 @@ class FakeInterface(Interface):
         if payload == b"refuse me":
             raise ValueError("refused")
         self.received.put_nowait((payload, latched))
+
+    def receive_latched(self, payload: bytes, source: str) -> None:
+        self.latched[source] = payload
+        super().receive_latched(payload, source)
+
+    def unlatch(self, sources: Collection[str]) -> None:
+        for source in sources:
+            del self.latched[source]
+        self.unlatched.set()
+
+    async def until_latched(self, *payloads: bytes) -> None:
+        """Wait until exactly these messages are in force."""
+        async with asyncio.timeout(10):
+            while sorted(self.latched.values()) != sorted(payloads):
+                self.unlatched.clear()
+                waits = [
+                    asyncio.ensure_future(self.unlatched.wait()),
+                    asyncio.ensure_future(self.received.get()),
+                ]
+                await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+                for wait in waits:
+                    wait.cancel()
 
     async def upper(self, payload: bytes) -> bytes:
         if payload == b"fail":

@@ -10,7 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rce.link.exceptions import Overloaded, ProtocolError
-from rce.link.frames import FRAGMENT_SIZE, Frame, FrameReader, FrameType
+from rce.link.frames import (
+    FRAGMENT_SIZE,
+    LATCHED,
+    Frame,
+    FrameReader,
+    FrameType,
+    encode_sources,
+    parse_sources,
+)
 from rce.link.lanes import MAX_CONTROL_FRAMES, URGENT_BURST, Lanes
 from rce.link.queues import SMALL_MESSAGE, Backlog, Counters, OutgoingQueue, OverflowPolicy
 from rce.link.settings import LinkLimits
@@ -45,6 +53,34 @@ def drain(lanes: Lanes) -> list[tuple[FrameType, int, int]]:
 
 
 # Queues
+
+
+def test_a_full_queue_keeps_the_last_latched_message_of_each_source() -> None:
+    """The newest of every source, and the newest list of sources, leave in order; the rest makes room."""
+    queue = topic(max_messages=4)
+    for source, text in ((1, b"old"), (2, b"of 2"), (0, b"a"), (1, b"of 1"), (0, b"b"), (3, b"of 3")):
+        queue.push(Frame(FrameType.DATA, 1, source, LATCHED if source else 0, text))
+    for ids in ((1, 2), (2, 3)):
+        queue.push(encode_sources(1, ids))
+    for number in range(3):
+        queue.push(Frame(FrameType.DATA, 1, 0, 0, b"%d" % number))
+    left = [queue.take()[0] for _ in range(len(queue))]
+    texts = [bytes(frame.payload) for frame in left if frame.type is FrameType.DATA and frame.flags]
+    assert texts == [b"of 2", b"of 1", b"of 3"]
+    assert [parse_sources(bytes(f.payload)) for f in left if f.type is FrameType.SOURCES] == [{2, 3}]
+    assert queue.waiting_bytes == 0
+
+
+def test_latched_messages_go_too_when_memory_is_short() -> None:
+    queue = topic()
+    for source in (1, 2):
+        queue.push(Frame(FrameType.DATA, 1, source, LATCHED, bytes(10)))
+    queue.push(Frame(FrameType.DATA, 1, 0, 0, bytes(10)))
+    queue.shed(5)
+    assert [frame.id for frame in (queue.take()[0], queue.take()[0])] == [1, 2]
+    queue.push(Frame(FrameType.DATA, 1, 1, LATCHED, bytes(10)))
+    queue.shed(5)
+    assert len(queue) == 0
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5000)), max_size=60))
