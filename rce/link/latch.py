@@ -88,24 +88,36 @@ class LatchedMessages:
 
 
 class HeardSources:
-    """Which sources' latched messages came on which channel."""
+    """Which sources' latched messages came on which channel: at most :data:`MAX_SOURCES`, oldest first."""
 
     def __init__(self) -> None:
-        self._heard: dict[int, set[int]] = {}
+        self._heard: dict[int, dict[int, None]] = {}
 
-    def hear(self, channel: int, source: int) -> str:
-        """Note a latched message; return the name of its source, which no other channel's source has."""
-        self._heard.setdefault(channel, set()).add(source)
-        return _name(channel, source)
+    def hear(self, channel: int, source: int) -> tuple[str, list[str]]:
+        """Note a latched message.
+
+        Returns:
+            The name of its source, which no other channel's source has; and that of a source that had to make
+            room, because the peer names more than it may.
+        """
+        heard = self._heard.setdefault(channel, {})
+        ended = []
+        if source not in heard and len(heard) >= MAX_SOURCES:
+            oldest = next(iter(heard))
+            del heard[oldest]
+            ended.append(_name(channel, oldest))
+        heard[source] = None
+        return _name(channel, source), ended
 
     def retain(self, channel: int, sources: Collection[int] = ()) -> list[str]:
         """Forget all sources of a channel but these; return the names of those that were there."""
-        heard = self._heard.get(channel, set())
-        ended = heard.difference(sources)
-        heard -= ended
+        heard = self._heard.get(channel, {})
+        ended = [source for source in heard if source not in sources]
+        for source in ended:
+            del heard[source]
         if not heard:
             self._heard.pop(channel, None)
-        return [_name(channel, source) for source in sorted(ended)]
+        return [_name(channel, source) for source in ended]
 
 
 def _name(channel: int, source: int) -> str:

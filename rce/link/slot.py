@@ -164,7 +164,9 @@ class InterfaceSlot:
             if source is None:
                 self._interface.receive(payload, latched=False)
             else:
-                self._interface.receive_latched(payload, self._heard.hear(channel.number, source))
+                name, ended = self._heard.hear(channel.number, source)
+                self._unlatch(ended)
+                self._interface.receive_latched(payload, name)
         except Exception as error:
             log.debug("interface %s refused a message", self._spec.tag, exc_info=True)
             self._fault_once(str(error) or type(error).__name__)

@@ -10,6 +10,7 @@ import pytest
 
 from rce.control.model import ConnectionSpec, LinkSpec
 from rce.link.frames import LATCHED, VERSION, Frame, FrameReader, FrameType, encode
+from rce.link.latch import MAX_SOURCES
 from rce.link.settings import LinkLimits
 
 if TYPE_CHECKING:
@@ -90,3 +91,30 @@ async def test_a_peer_of_the_first_version_is_told_of_no_sources(rig: Rig) -> No
     assert FrameType.SOURCES not in {frame.type for frame in frames}
     data = [(bytes(f.payload), f.flags) for f in frames if f.type is FrameType.DATA]
     assert data == [(b"x", LATCHED), (b"y", LATCHED), (b"last", 0)]
+
+
+async def test_a_peer_with_too_many_sources_loses_its_oldest(rig: Rig) -> None:
+    """A peer may say what it likes: what is kept of it is bounded, also if its messages are empty."""
+    hub = await rig.hub()
+    b = rig.party("b", hub)
+    await rig.listen(b, "unix")
+    await b.apply(
+        {"i1": "PublisherInterface"},
+        [LinkSpec(id="L", peer="user/a", token="secret", dial=False)],
+        [ConnectionSpec(id=1, link="L", interface="i1", peer_interface="x")],
+    )
+    await b.until(lambda: "i1" in b.fakes)
+    _, writer = await asyncio.open_unix_connection(b.address.unix)
+    hello = msgspec.json.encode({"version": VERSION, "link": "L", "token": "secret"})
+    writer.write(encode(Frame(FrameType.HELLO, payload=hello)) + encode(Frame(FrameType.OPEN, 1)))
+    await b.connected(1)
+    for number in range(MAX_SOURCES + 10):
+        writer.write(encode(Frame(FrameType.DATA, 1, number, LATCHED)))
+    writer.write(encode(Frame(FrameType.DATA, 1, 0, 0, b"last")))
+    heard = b.fakes["i1"]
+    async with asyncio.timeout(20):
+        while await heard.received.get() != (b"last", False):
+            pass
+    assert list(heard.latched) == [f"1.{number}" for number in range(10, MAX_SOURCES + 10)]
+    writer.close()
+    await b.connected()
