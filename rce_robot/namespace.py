@@ -169,6 +169,8 @@ class Namespace:
             self._endpoint.shed(self.held - goal)
         if self.held > goal:
             self._holdings.shed(self.held - goal)
+        if self.held > goal:
+            self._endpoint.drop_unfinished(self.held - goal)
         self._given_up += before - self.held
         if self._given_up > COLLECT_AFTER:
             # An error and its traceback are a cycle that may hold a message; the collector counts no bytes.

@@ -108,20 +108,23 @@ class Endpoint:
         return self._backlog.bytes + self._holdings.bytes + unfinished
 
     def shed(self, size: int) -> None:
-        """Throw away what is held until ``size`` bytes are free.
+        """Throw away what is held until ``size`` bytes are free, as far as there is anything to throw away.
 
-        First the oldest messages of topics, where most waits; then links with much that is incomplete, which
-        are dialed anew; then requests and latched messages, the oldest first.
+        First the oldest messages of topics, where most waits; then the oldest requests and latched messages.
         """
         goal = self.waiting_bytes - size
         for channel in sorted(self._channels.values(), key=lambda channel: -channel.waiting_bytes):
             if self.waiting_bytes <= goal:
                 return
             channel.shed(self.waiting_bytes - goal)
+        self._holdings.shed(self.waiting_bytes - goal)
+
+    def drop_unfinished(self, size: int) -> None:
+        """End links on which most is incomplete, until ``size`` bytes are free; they are dialed anew."""
+        goal = self.waiting_bytes - size
         for link in sorted(self._links.values(), key=lambda link: -link.unfinished_bytes):
             if self.waiting_bytes > goal and link.unfinished_bytes:
                 link.abort(LinkLost("memory is short"))
-        self._holdings.shed(self.waiting_bytes - goal)
 
     async def apply(self, spec: EndpointSpec) -> None:
         """Make up the difference between ``spec`` and what is there.
