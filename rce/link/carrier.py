@@ -8,7 +8,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Protocol
 
 from rce.link.exceptions import LinkLost, ProtocolError
-from rce.link.frames import FEATURES
+from rce.link.handshake import FEATURES
 
 if TYPE_CHECKING:
     from rce.link.frames import Frame

@@ -16,15 +16,8 @@ from rce.link.exceptions import (
     PeerLost,
     ProtocolError,
 )
-from rce.link.frames import (
-    LATCH,
-    LATCHED,
-    OVERLOADED,
-    Frame,
-    FrameType,
-    encode_sources,
-    parse_sources,
-)
+from rce.link.frames import LATCHED, OVERLOADED, Frame, FrameType, encode_sources, parse_sources
+from rce.link.handshake import LATCH
 from rce.link.queues import OutgoingQueue, OverflowPolicy
 
 if TYPE_CHECKING:

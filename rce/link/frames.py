@@ -25,10 +25,8 @@ import struct
 from enum import IntEnum
 from typing import TYPE_CHECKING, NamedTuple
 
-import msgspec
-
 from rce.buffers import unfilled
-from rce.link.exceptions import LinkRefused, ProtocolError
+from rce.link.exceptions import ProtocolError
 from rce.link.settings import KIB
 
 if TYPE_CHECKING:
@@ -99,29 +97,6 @@ class Frame(NamedTuple):
     payload: bytes | memoryview = b""
 
 
-class Hello(msgspec.Struct, frozen=True, kw_only=True):
-    """Payload of HELLO."""
-
-    version: int
-    link: str
-    token: str
-    features: tuple[str, ...] = ()
-    """What the dialing end knows beyond the first version; unknown words mean nothing."""
-
-
-class Welcome(msgspec.Struct, frozen=True, kw_only=True):
-    """Payload of WELCOME; empty from a peer that knows the first version only."""
-
-    features: tuple[str, ...] = ()
-
-
-LATCH = "latch"
-"""Feature: latched messages name their source, and SOURCES takes back those of sources that ended."""
-FEATURES = (LATCH,)
-"""What is known here beyond the first version of links."""
-
-_hello_decoder = msgspec.json.Decoder(Hello)
-_welcome_decoder = msgspec.json.Decoder(Welcome)
 _TYPES = {int(t): t for t in FrameType}
 _CARRIERS = frozenset({FrameType.DATA, FrameType.CALL, FrameType.REPLY})
 
@@ -142,17 +117,6 @@ def encode(frame: Frame) -> bytes:
     return pack_header(frame, size, size) + frame.payload
 
 
-def encode_hello(link: str, token: str) -> bytes:
-    """Write the first frame of a link's dialing end."""
-    hello = Hello(version=VERSION, link=link, token=token, features=FEATURES)
-    return encode(Frame(FrameType.HELLO, payload=msgspec.json.encode(hello)))
-
-
-def encode_welcome() -> bytes:
-    """Write the accepting end's answer to HELLO."""
-    return encode(Frame(FrameType.WELCOME, payload=msgspec.json.encode(Welcome(features=FEATURES))))
-
-
 def encode_sources(channel: int, sources: Collection[int]) -> Frame:
     """Make the frame that tells which sources' latched messages are in force."""
     return Frame(FrameType.SOURCES, channel, payload=struct.pack(f"!{len(sources)}I", *sources))
@@ -167,67 +131,6 @@ def parse_sources(payload: bytes) -> frozenset[int]:
     if len(payload) % 4:
         raise ProtocolError(f"SOURCES of {len(payload)} bytes")
     return frozenset(struct.unpack(f"!{len(payload) // 4}I", payload))
-
-
-def parse_hello(frame: Frame) -> Hello:
-    """Read the first frame of a link's dialing end.
-
-    Raises:
-        ProtocolError: It is no HELLO, or one of a version that is not spoken here.
-    """
-    if frame.type is not FrameType.HELLO:
-        raise ProtocolError(f"first frame is {frame.type.name}, not HELLO")
-    try:
-        hello = _hello_decoder.decode(frame.payload)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise ProtocolError(f"bad HELLO: {error}") from error
-    if hello.version != VERSION:
-        raise ProtocolError(f"link version {hello.version} is not spoken here, {VERSION} is")
-    return hello
-
-
-def encode_secure(link: str) -> bytes:
-    """Write the frame that announces TLS for a link."""
-    return encode(Frame(FrameType.SECURE, payload=link.encode()))
-
-
-def parse_opening(frame: Frame) -> tuple[str, bool]:
-    """Read the first frame of a link's dialing end.
-
-    Returns:
-        The link, and whether TLS follows.
-
-    Raises:
-        ProtocolError: It begins no link.
-    """
-    if frame.type is not FrameType.SECURE:
-        return parse_hello(frame).link, False
-    try:
-        return bytes(frame.payload).decode(), True
-    except UnicodeDecodeError as error:
-        raise ProtocolError(f"bad SECURE: {error}") from error
-
-
-def check_answer(frame: Frame) -> frozenset[str]:
-    """Read the accepting end's answer to HELLO.
-
-    Returns:
-        The features that it knows.
-
-    Raises:
-        LinkRefused: It does not want the link.
-        ProtocolError: It is no answer.
-    """
-    if frame.type is FrameType.REFUSE:
-        raise LinkRefused(bytes(frame.payload).decode(errors="replace"))
-    if frame.type is not FrameType.WELCOME:
-        raise ProtocolError(f"HELLO was answered by {frame.type.name}")
-    if not frame.payload:
-        return frozenset()
-    try:
-        return frozenset(_welcome_decoder.decode(frame.payload).features)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise ProtocolError(f"bad WELCOME: {error}") from error
 
 
 class _Message:

@@ -14,8 +14,9 @@ from rce.dialing import open_socket
 from rce.guard.lobby import Lobby, address_of
 from rce.link.carrier import Carrier, LocalCarrier
 from rce.link.exceptions import LinkError, LinkLost, LinkRefused
-from rce.link.frames import Frame, FrameType, check_answer, encode, encode_hello, encode_welcome, parse_hello
+from rce.link.frames import Frame, FrameType, encode
 from rce.link.handover import Doorman
+from rce.link.handshake import check_answer, encode_hello, encode_welcome, parse_hello
 from rce.link.opening import secured_link
 from rce.link.secure import Adopter, accept_secure, dial_secure
 from rce.link.settings import LinkLimits, LinkTimeouts
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
     from rce.control.model import LinkAddress, LinkSpec
     from rce.guard.lobby import Guest
-    from rce.link.frames import Hello
+    from rce.link.handshake import Hello
     from rce.link.link import Link
 
 log = logging.getLogger(__name__)

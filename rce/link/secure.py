@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from rce.link.encryption import accepting_context, dialing_context
 from rce.link.exceptions import LinkRefused
-from rce.link.frames import encode_secure
+from rce.link.handshake import encode_secure
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable

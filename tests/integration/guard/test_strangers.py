@@ -16,8 +16,9 @@ from websockets.asyncio.client import connect
 from rce.control.server import ControlServer
 from rce.guard.lobby import Lobby
 from rce.link.exceptions import LinkRefused
-from rce.link.frames import FrameReader, check_answer, encode_hello
+from rce.link.frames import FrameReader
 from rce.link.handover import Doorman, HandoverReceiver, HandoverSender
+from rce.link.handshake import check_answer, encode_hello
 from rce.link.hub import LinkHub
 from rce.link.settings import LinkLimits, LinkTimeouts
 from rce.tls.folder import CertificateFolder

@@ -11,16 +11,8 @@ from msgspec.structs import replace
 
 from rce.control.model import ConnectionSpec, LinkAddress, LinkSpec
 from rce.link import CallTimeout, LinkLimits, LinkLost, LinkRefused, MessageTooLarge, Overloaded, PeerLost
-from rce.link.frames import (
-    HEADER,
-    Frame,
-    FrameReader,
-    FrameType,
-    check_answer,
-    encode,
-    encode_hello,
-    encode_welcome,
-)
+from rce.link.frames import HEADER, Frame, FrameReader, FrameType, encode
+from rce.link.handshake import check_answer, encode_hello, encode_welcome
 
 if TYPE_CHECKING:
     from .conftest import Party, Rig

@@ -13,8 +13,9 @@ import uvloop
 
 from rce.control.model import LinkAddress
 from rce.link import LinkHub, LinkTimeouts
-from rce.link.frames import Frame, FrameType, encode, encode_hello
+from rce.link.frames import Frame, FrameType, encode
 from rce.link.handover import Doorman, HandoverReceiver, HandoverSender
+from rce.link.handshake import encode_hello
 
 if TYPE_CHECKING:
     from pathlib import Path

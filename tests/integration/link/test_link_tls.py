@@ -14,7 +14,7 @@ from rce.control.model import LinkAddress, LinkSpec
 from rce.link import LinkHub
 from rce.link.encryption import _derive, accepting_context, dialing_context
 from rce.link.exceptions import LinkLost, LinkRefused
-from rce.link.frames import encode_hello, encode_secure
+from rce.link.handshake import encode_hello, encode_secure
 
 from .conftest import TIMEOUTS
 

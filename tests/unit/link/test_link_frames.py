@@ -16,13 +16,11 @@ from rce.link.frames import (
     Frame,
     FrameReader,
     FrameType,
-    check_answer,
     encode,
-    encode_hello,
     pack_fragment,
     pack_header,
-    parse_hello,
 )
+from rce.link.handshake import check_answer, encode_hello, parse_hello
 from rce.link.settings import LinkLimits
 
 LIMITS = LinkLimits(max_message=2_000_000, unfinished_bytes=3_000_000)
