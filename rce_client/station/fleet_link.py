@@ -32,8 +32,8 @@ BLOCK_CELL = PlannerService("/fleet/block_cell", "fleet/BlockCell")
 
 
 def pose_topic(robot: str) -> str:
-    """The topic of a robot's poses in the planner's ROS graph."""
-    return f"/{robot}/amcl_pose"
+    """The topic on which the planner tells a robot's pose."""
+    return f"/fleet/poses/{robot}"
 
 
 class FleetError(Exception):

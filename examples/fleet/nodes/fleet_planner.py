@@ -53,6 +53,7 @@ TICK = 0.1
 """Seconds between two looks at the clock; the state is published at most as often."""
 LOOK_AROUND = 0.5
 """Seconds between two looks for new robots."""
+POSE = "geometry_msgs/PoseWithCovarianceStamped"
 ROBOT_TOPIC = re.compile(r"/([A-Za-z][A-Za-z0-9_]*)/amcl_pose")
 MAP_FRAME = "map"
 
@@ -127,11 +128,14 @@ class PlannerNode:
             )
         else:
             await self._hear_apart(robot)
-        await node.subscribe(
-            f"/{robot}/amcl_pose",
-            "geometry_msgs/PoseWithCovarianceStamped",
-            lambda message: self._take(_pose(robot, message)),
-        )
+        # Who watches the planner cannot hear what other interfaces of its container publish.
+        seen = await node.advertise(f"/fleet/poses/{robot}", POSE, latch=True)
+
+        def take(message: Message) -> None:
+            self._take(_pose(robot, message))
+            seen.publish(message)
+
+        await node.subscribe(f"/{robot}/amcl_pose", POSE, take)
         node.log.info("%s is here", robot)
 
     async def _hear_apart(self, robot: str) -> None:
