@@ -104,7 +104,7 @@ async def _run(moment: Moment, runtime: str, folder: Path) -> list[str]:
                 up.process.send_signal(number)
         async with asyncio.timeout(GONE_AFTER_S):
             await up.process.wait()
-    if signal.SIGKILL in moment.signals:
+    if signal.SIGKILL in moment.signals or all(map(_is_dying, _left(traces, folder))):
         with contextlib.suppress(AssertionError):
             await until(lambda: not _left(traces, folder), timeout=GONE_AFTER_S, what="nothing is left")
     return _left(traces, folder) and [*_left(traces, folder), up.output()]
@@ -113,6 +113,11 @@ async def _run(moment: Moment, runtime: str, folder: Path) -> list[str]:
 def _left(traces: Traces, folder: Path) -> list[str]:
     sockets = [f"socket {path}" for path in (folder / "rce").rglob("*") if path.is_socket()]
     return [*traces.left(), *sockets]
+
+
+def _is_dying(line: str) -> bool:
+    """Whether this is a process that was killed and has no program any more, only its exit to go through."""
+    return line.startswith("process ") and len(line.split()) == len(("process", "pid"))
 
 
 def _containers(folder: Path) -> list[Path]:
