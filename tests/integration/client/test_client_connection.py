@@ -206,7 +206,7 @@ async def test_errors_reach_the_program(engine: Engine) -> None:
 async def test_the_password_itself_is_not_sent(engine: Engine) -> None:
     async with engine.connection():
         pass
-    assert engine.door.targets == ["/?userID=testUser&version=20130902"]
+    assert engine.door.targets == ["/?userID=testUser&version=20130902&auth=bearer"]
 
 
 @pytest.mark.parametrize("status", [400, 401, 410, 501])
