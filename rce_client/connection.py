@@ -17,7 +17,7 @@ from enum import Enum
 from typing import TYPE_CHECKING, Any, NoReturn, Self, TypeVar
 
 from rce.protocol.codec import encode
-from rce.protocol.http import LATCH
+from rce.protocol.http import LATCH, SINGLE_FRAME
 from rce.protocol.messages import NO_ID, DataMessage, ErrorReport, InterfaceStatus, LatchedSources
 from rce.protocol.stream import Fault
 from rce_client.courier import Courier, Target, Timing
@@ -236,6 +236,11 @@ class Connection(Requests, OwnInterfaces):
     def knows_sources(self) -> bool:
         """Whether the engine takes the names of latched messages' sources."""
         return LATCH in self._courier.features
+
+    @property
+    def takes_single_frames(self) -> bool:
+        """Whether the engine takes serialized messages in one frame."""
+        return SINGLE_FRAME in self._courier.features
 
     def post_control(self, frames: Sequence[Frame]) -> bool:
         """Send a service message; False if that is not possible now."""

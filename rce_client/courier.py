@@ -14,7 +14,7 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
 
 from rce.dialing import open_url_socket
-from rce.protocol.http import FEATURES, FEATURES_HEADER, FEATURES_KEY
+from rce.protocol.http import FEATURES, FEATURES_HEADER, FEATURES_KEY, SINGLE_FRAME
 from rce.protocol.limits import Limits
 from rce.protocol.stream import ProtocolStream
 from rce_client.backoff import Backoff, judge
@@ -248,7 +248,8 @@ class Courier:
 
     async def _read(self, socket: EngineSocket) -> LostError:
         limit = self._timing.max_message
-        stream = ProtocolStream.for_client(Limits(max_text=limit, max_binary=limit))
+        limits = Limits(max_text=limit, max_binary=limit)
+        stream = ProtocolStream.for_client(limits, single=SINGLE_FRAME in self.features)
         now = asyncio.get_running_loop().time
         try:
             while True:

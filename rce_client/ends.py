@@ -16,7 +16,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from rce.protocol.codec import encode, encode_data
-from rce.protocol.messages import LatchedSources
+from rce.protocol.messages import NO_ID, LatchedSources
 from rce.protocol.names import Form, InterfaceType, Role
 from rce_client.exceptions import CallError, CallTimeoutError, InterfaceError, NotConnectedError
 
@@ -50,6 +50,10 @@ class Way(Protocol):
     @property
     def knows_sources(self) -> bool:
         """Whether the engine takes the names of latched messages' sources."""
+
+    @property
+    def takes_single_frames(self) -> bool:
+        """Whether the engine takes serialized messages in one frame."""
 
     def post_control(self, frames: Sequence[Frame]) -> bool:
         """Send a service message; False if that is not possible now."""
@@ -91,6 +95,10 @@ class End(ABC):
     def type(self) -> str:
         """The interface type that the engine makes for it."""
         return str(InterfaceType(self.role, Form.FORWARDER if self.raw else Form.CONVERTER))
+
+    def _frames(self, message: object, msg_id: str = NO_ID, latch: str = "") -> list[Frame]:
+        single = self._way.takes_single_frames
+        return encode_data(self.tag, self.cls, message, msg_id, latch, single=single)
 
     async def wait_active(self, timeout: float | None = None) -> None:
         """Wait until a peer is connected; raises :class:`TimeoutError` after ``timeout`` seconds."""
@@ -155,7 +163,7 @@ class Publisher(End, Generic[M]):
             :attr:`rce_client.connection.Connection.dropped` counts.
         """
         if not latch:
-            return self._way.post_data(self.tag, encode_data(self.tag, self.cls, message))
+            return self._way.post_data(self.tag, self._frames(message))
         self._latched[latch] = message
         return self._way.is_active(self.tag) and self._post(message, latch)
 
@@ -175,7 +183,7 @@ class Publisher(End, Generic[M]):
 
     def _post(self, message: M, latch: str) -> bool:
         source = latch if self._way.knows_sources else ""
-        return self._way.post_data(self.tag, encode_data(self.tag, self.cls, message, latch=source), latch)
+        return self._way.post_data(self.tag, self._frames(message, latch=source), latch)
 
     def deliver(self, message: DataMessage) -> None:
         """Ignore it; the engine sends nothing here."""
@@ -297,7 +305,7 @@ class ServiceClient(End, Generic[M]):
         answer: asyncio.Future[M] = asyncio.get_running_loop().create_future()
         self._calls[msg_id] = answer
         try:
-            if not self._way.post_control(encode_data(self.tag, self.cls, request, msg_id)):
+            if not self._way.post_control(self._frames(request, msg_id)):
                 raise NotConnectedError(f"{self.tag}: not connected, or too much waits to be sent")
             async with asyncio.timeout(timeout):
                 return await answer
@@ -384,10 +392,10 @@ class ServiceProvider(End, Generic[M]):
 
     def _answer(self, msg_id: str, answer: object) -> None:
         try:
-            frames = encode_data(self.tag, self.cls, answer, msg_id)
+            frames = self._frames(answer, msg_id)
         except TypeError as error:
             _log.exception("answer of service %s", self.tag)
-            frames = encode_data(self.tag, self.cls, f"the answer cannot be sent: {error}", msg_id)
+            frames = self._frames(f"the answer cannot be sent: {error}", msg_id)
         if not self._way.post_control(frames):
             _log.warning("%s: no connection to send an answer on", self.tag)
 

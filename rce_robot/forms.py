@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import os
 from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
@@ -11,25 +9,18 @@ import msgspec
 from rce.protocol.codec import encode_data
 from rce.ros.types.message import element_min_size
 from rce_robot.exceptions import UnreadableError
-from rce_robot.outbox import Outgoing
+from rce_robot.outgoing import Outgoing, Serialized
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rce.ros.types import MessageType
     from rce_robot.converters import Converter
-    from rce_robot.outbox import Buffer
+    from rce_robot.outgoing import Buffer, Rendered
 
 _encoder = msgspec.json.Encoder()
 _json, _json_into = _encoder.encode, _encoder.encode_into
 _BINARY = (bytes, bytearray, memoryview)
-_prefix = os.urandom(8).hex()
-_numbers = itertools.count(1)
-
-
-def fresh_id() -> str:
-    """Return 32 hex characters that were not used before: a binary value's or a service call's id."""
-    return f"{_prefix}{next(_numbers):016x}"
 
 
 class Form(Protocol):
@@ -61,7 +52,7 @@ class Form(Protocol):
             UnreadableError: The payload is no such message.
         """
 
-    def pack(self, tag: str, cls: str, msg_id: str, msg: Any) -> Outgoing:
+    def pack(self, tag: str, cls: str, msg_id: str, msg: Any) -> Rendered:
         """Return the data message that carries what :meth:`show` returned."""
 
 
@@ -85,16 +76,10 @@ class ForwarderForm:
         """Return the payload."""
         return payload
 
-    def pack(self, tag: str, cls: str, msg_id: str, msg: Buffer) -> Outgoing:
-        """Put the payload behind its id, uncopied."""
-        id_ = fresh_id().encode()
-        text = b'{"type":"DM","data":{"iTag":"%b","type":"%b","msgID":%b,"msg*":"%b"}}' % (
-            tag.encode(),
-            cls.encode(),
-            _json(msg_id),
-            id_,
-        )
-        return Outgoing(text, ((id_, msg),))
+    def pack(self, tag: str, cls: str, msg_id: str, msg: Buffer) -> Serialized:
+        """Put names beside the payload, which is not copied."""
+        names = b'"iTag":"%b","type":"%b","msgID":%b' % (tag.encode(), cls.encode(), _json(msg_id))
+        return Serialized(names, msg)
 
 
 class ConverterForm:

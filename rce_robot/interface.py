@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from rce_robot.conversion import Result
     from rce_robot.conversion.jobs import Job
     from rce_robot.forms import Form
-    from rce_robot.outbox import Buffer, Outgoing, Queued
+    from rce_robot.outbox import Queued
+    from rce_robot.outgoing import Buffer, Rendered
 
 URGENT_BELOW = 64 << 10
 """Service messages smaller than so many bytes go in the control lane."""
@@ -99,7 +100,7 @@ class Delivery:
         self._msg_id = msg_id
         self.size = len(payload)
 
-    def render(self) -> Outgoing | None:
+    def render(self) -> Rendered | None:
         """Convert the message; a failure is reported to the robot and to whoever waits for an answer."""
         interface = self._interface
         try:
@@ -171,7 +172,7 @@ class RobotInterface(Interface):
         """Deal with a message to the robot that could not be converted."""
         self.robot.report(f"{self._name(msg_id)}: {problem}")
 
-    def pack(self, msg: Any, msg_id: str) -> Outgoing:
+    def pack(self, msg: Any, msg_id: str) -> Rendered:
         """Return the data message that carries ``msg`` to the robot."""
         return self.form_out.pack(self.tag, self.cls, msg_id, msg)
 

@@ -36,7 +36,8 @@ if TYPE_CHECKING:
     from rce_robot.conversion.jobs import Job
     from rce_robot.forms import Form
     from rce_robot.interface import RobotInterface
-    from rce_robot.outbox import Buffer, Overflow, Queued
+    from rce_robot.outbox import Overflow, Queued
+    from rce_robot.outgoing import Buffer
     from rce_robot.session import Session
 
 

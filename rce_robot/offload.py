@@ -8,7 +8,7 @@ import msgspec
 
 from rce_robot.conversion import ConversionFailed, ReadText, ReadValue, Show
 from rce_robot.exceptions import UnreadableError
-from rce_robot.outbox import Outgoing
+from rce_robot.outgoing import Outgoing
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rce.protocol.stream import LargeData
     from rce_robot.conversion import Result
     from rce_robot.interface import RobotSide
-    from rce_robot.outbox import Buffer
+    from rce_robot.outgoing import Buffer
 
 
 class Read(NamedTuple):

@@ -14,9 +14,10 @@ from __future__ import annotations
 from collections import Counter, deque
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-Buffer = bytes | bytearray | memoryview
+if TYPE_CHECKING:
+    from rce_robot.outgoing import Rendered
 
 
 class Overflow(Enum):
@@ -35,56 +36,11 @@ class Queued(Protocol):
     def size(self) -> int:
         """Bytes that it counts in the queue's limits."""
 
-    def render(self) -> Outgoing | None:
+    def render(self) -> Rendered | None:
         """Make it ready to be sent; None if that turns out to be impossible.
 
         Called when its turn has come: a message that is dropped in the queue costs no conversion.
         """
-
-
-@dataclass(frozen=True, slots=True)
-class Outgoing:
-    """One message as it goes over the WebSocket: a JSON text and the binary frames it names."""
-
-    text: Buffer
-    """UTF-8."""
-    binaries: tuple[tuple[bytes, Buffer], ...] = ()
-    """Payloads of binary frames, each in two parts, so that an id can go before bytes that nobody copies."""
-
-    @property
-    def size(self) -> int:
-        """Payload bytes of all its frames."""
-        return len(self.text) + sum(len(head) + len(body) for head, body in self.binaries)
-
-    def render(self) -> Outgoing:
-        """Return itself; it is ready."""
-        return self
-
-
-class LatchedDelivery:
-    """A latched message on its way to a client that knows of sources."""
-
-    __slots__ = ("_message", "_source", "size")
-
-    def __init__(self, message: Queued, source: str) -> None:
-        self._message = message
-        self._source = source
-        self.size = message.size
-
-    def render(self) -> Outgoing | None:
-        """Add the name of the source to the message."""
-        outgoing = self._message.render()
-        if outgoing is None:
-            return None
-        text = bytes(outgoing.text)
-        if not text.startswith(_DATA_HEAD):
-            raise ValueError(f"a data message does not begin with {_DATA_HEAD.decode()}")
-        latch = b'"latch":"%b",' % self._source.encode()
-        return Outgoing(b"".join((_DATA_HEAD, latch, text[len(_DATA_HEAD) :])), outgoing.binaries)
-
-
-_DATA_HEAD = b'{"type":"DM","data":{'
-"""How every data message begins that is made here."""
 
 
 @dataclass(frozen=True, slots=True)

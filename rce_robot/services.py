@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from rce.link import CallError, CallTimeout, Overloaded, PeerFault, PeerLost
 from rce_robot.exceptions import BusyError, MisdirectedError, UnreadableError
-from rce_robot.forms import fresh_id
 from rce_robot.interface import RobotInterface
 from rce_robot.offload import Read, pack_value
+from rce_robot.outgoing import fresh_id
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Iterator
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rce.protocol.stream import LargeData
     from rce_robot.forms import Form
     from rce_robot.interface import RobotSide
-    from rce_robot.outbox import Buffer
+    from rce_robot.outgoing import Buffer
 
 
 _log = logging.getLogger(__name__)

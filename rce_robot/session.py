@@ -17,7 +17,7 @@ from websockets.frames import CloseCode
 
 from rce.protocol.calls import call_at
 from rce.protocol.codec import encode
-from rce.protocol.http import LATCH
+from rce.protocol.http import LATCH, SINGLE_FRAME
 from rce.protocol.limits import Limits
 from rce.protocol.messages import (
     ConfigureComponents,
@@ -30,7 +30,8 @@ from rce.protocol.messages import (
 )
 from rce.protocol.stream import Fault, LargeData, ProtocolStream
 from rce_robot.exceptions import RobotError
-from rce_robot.outbox import LatchedDelivery, Outbox, Outgoing, Overflow
+from rce_robot.outbox import Outbox, Overflow
+from rce_robot.outgoing import LatchedDelivery, Outgoing, Serialized
 from rce_robot.websocket import LARGE_PART
 
 if TYPE_CHECKING:
@@ -103,7 +104,8 @@ class Session:
         self._settings = settings
         self._drain_timeout = settings.drain_timeout
         limits = Limits(max_text=settings.max_text, max_binary=settings.max_message)
-        self._stream = ProtocolStream.for_engine(limits)
+        self._single = SINGLE_FRAME in features
+        self._stream = ProtocolStream.for_engine(limits, single=self._single)
         self._outbox = Outbox(settings.outbox, dropped)
         self._requests: asyncio.Queue[tuple[Request, int] | None] = asyncio.Queue()
         self._pending_bytes = 0
@@ -321,10 +323,16 @@ class Session:
 
     def _write(self, message: Queued) -> None:
         rendered = message.render()
-        if rendered is not None:
+        if rendered is None:
+            return
+        if not isinstance(rendered, Serialized):
             self._socket.write(rendered)
-            if rendered.size > LARGE_PART:
-                self._owner.grew()
+        elif self._single and not rendered.is_long:
+            self._socket.write_binary(rendered.prefix, rendered.payload)
+        else:
+            self._socket.write(rendered.split())
+        if rendered.size > LARGE_PART:
+            self._owner.grew()
 
     def _handle(self, event: Event, size: int = 0) -> None:
         match event:

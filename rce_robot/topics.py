@@ -10,7 +10,8 @@ from rce_robot.conversion import ConversionQueue
 from rce_robot.exceptions import BusyError, MisdirectedError, UnreadableError
 from rce_robot.interface import Delivery, RobotInterface
 from rce_robot.offload import Read, pack_value
-from rce_robot.outbox import Outgoing, Overflow
+from rce_robot.outbox import Overflow
+from rce_robot.outgoing import Outgoing
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Coroutine, Sequence
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from rce.protocol.stream import LargeData
     from rce_robot.forms import Form
     from rce_robot.interface import RobotSide
-    from rce_robot.outbox import Buffer
+    from rce_robot.outgoing import Buffer
 
 
 class _Converted(NamedTuple):

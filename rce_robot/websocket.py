@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from websockets.streams import StreamReader
 
     from rce.guard.loop_share import LoopShare
-    from rce_robot.outbox import Buffer, Outgoing
+    from rce_robot.outgoing import Buffer, Outgoing
 
 LARGE_PART = 64 << 10
 """Bytes of an incomplete message from which on the receiver is told of every part."""
@@ -102,6 +102,15 @@ class RobotSocket(GuardedConnection):
         _add_frame(buffers, _FIN_TEXT, b"", message.text)
         for head, body in message.binaries:
             _add_frame(buffers, _FIN_BINARY, head, body)
+        self._write(buffers)
+
+    def write_binary(self, head: bytes, body: Buffer) -> None:
+        """Write a message that is one binary frame. Only to be called while :attr:`writable`."""
+        buffers: list[Buffer] = []
+        _add_frame(buffers, _FIN_BINARY, head, body)
+        self._write(buffers)
+
+    def _write(self, buffers: list[Buffer]) -> None:
         if len(buffers) > 1 and sum(map(len, buffers)) < _JOIN_BELOW:
             self.transport.write(b"".join(buffers))  # one system call, and in TLS one record
             return

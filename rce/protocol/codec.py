@@ -22,6 +22,7 @@ from rce.protocol.messages import (
     ErrorReport,
     type_of,
 )
+from rce.protocol.single import MAX_PAYLOAD, encode_single
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -60,7 +61,9 @@ def encode(message: ClientMessage) -> list[Frame]:
     return encode_message(type_of(message), msgspec.to_builtins(message))
 
 
-def encode_data(i_tag: str, type_: str, msg: Any, msg_id: str = NO_ID, latch: str = "") -> list[Frame]:
+def encode_data(
+    i_tag: str, type_: str, msg: Any, msg_id: str = NO_ID, latch: str = "", *, single: bool = False
+) -> list[Frame]:
     """Write a data message.
 
     Args:
@@ -69,11 +72,14 @@ def encode_data(i_tag: str, type_: str, msg: Any, msg_id: str = NO_ID, latch: st
         msg: The message as a JSON object that may hold binary values, or as binary as a whole.
         msg_id: Echoed in the answer to a service request.
         latch: The source whose latched message it is; for peers that know of such only.
+        single: Write a message that is binary as a whole as one frame; for peers that agreed on it only.
 
     Raises:
         TypeError: ``msg`` holds something that JSON cannot express.
     """
     if isinstance(msg, _BINARY):
+        if single and len(msg) <= MAX_PAYLOAD:
+            return [encode_single(i_tag, type_, msg, msg_id, latch)]
         id_ = next(_fresh_ids)
         data = {"iTag": i_tag, "type": type_, "msgID": msg_id, **_latch(latch), "msg*": id_}
         return [_encode({"type": "DM", "data": data}).decode(), b"".join((id_.encode(), msg))]

@@ -149,7 +149,9 @@ FEATURES_HEADER = "RCE-Features"
 """Header of the answer: which of these the endpoint knows too."""
 LATCH = "latch"
 """Feature: latched messages name their source, and ``LT`` tells which sources' are in force."""
-FEATURES = frozenset((LATCH,))
+SINGLE_FRAME = "single-frame"
+"""Feature: a message that is binary as a whole travels in one frame, see :mod:`rce.protocol.single`."""
+FEATURES = frozenset((LATCH, SINGLE_FRAME))
 """What is known here."""
 
 

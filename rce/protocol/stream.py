@@ -31,6 +31,7 @@ from rce.protocol.reading import (
     message_from_json,
     parse_json,
 )
+from rce.protocol.single import MARK, SingleReader
 from rce.protocol.weight import Address, find_address, is_light
 
 if TYPE_CHECKING:
@@ -129,22 +130,33 @@ class ProtocolStream:
     """
 
     def __init__(
-        self, accept: Collection[str], limits: Limits = DEFAULT_LIMITS, *, defer_large: bool = False
+        self,
+        accept: Collection[str],
+        limits: Limits = DEFAULT_LIMITS,
+        *,
+        defer_large: bool = False,
+        single: bool = False,
     ) -> None:
         self._accept = accept
         self._limits = limits
         self._defer_large = defer_large
+        self._single = SingleReader() if single else None
         self._assembler = Assembler(limits)
 
     @classmethod
-    def for_engine(cls, limits: Limits = DEFAULT_LIMITS) -> Self:
-        """Make the engine's side, which reads what clients send, and leaves large messages to others."""
-        return cls(UPWARD, limits, defer_large=True)
+    def for_engine(cls, limits: Limits = DEFAULT_LIMITS, *, single: bool = False) -> Self:
+        """Make the engine's side, which reads what clients send, and leaves large messages to others.
+
+        Args:
+            limits: How much is taken.
+            single: Whether the client may send messages in one frame; see :mod:`rce.protocol.single`.
+        """
+        return cls(UPWARD, limits, defer_large=True, single=single)
 
     @classmethod
-    def for_client(cls, limits: Limits = DEFAULT_LIMITS) -> Self:
-        """Make the client's side, which reads what the engine sends."""
-        return cls(DOWNWARD, limits)
+    def for_client(cls, limits: Limits = DEFAULT_LIMITS, *, single: bool = False) -> Self:
+        """Make the client's side, which reads what the engine sends; the arguments are the same."""
+        return cls(DOWNWARD, limits, single=single)
 
     @property
     def pending(self) -> int:
@@ -233,11 +245,24 @@ class ProtocolStream:
         if len(frame) > self._limits.max_binary:
             limit = self._limits.max_binary
             return [Fault(f"a binary frame of {len(frame)} bytes is longer than the limit of {limit}")]
+        if self._single is not None and frame and frame[0] == MARK:
+            return [self._read_single(self._single, frame)]
         try:
             value, dropped = self._assembler.add_binary(frame, now)
         except ProtocolError as error:
             return [Fault(str(error))]
         return self._events(value, dropped)
+
+    def _read_single(self, reader: SingleReader, frame: Binary) -> Event:
+        value: Any = None
+        try:
+            message = reader.read(frame)
+            if type(message) is DataMessage:
+                return message
+            value = {"type": "DM", "data": message}
+            return message_from_json(value, self._accept)
+        except ProtocolError as error:
+            return Fault.of(str(error), call_of(value))
 
     def expire(self, now: float) -> list[Event]:
         """Drop what has been incomplete for too long."""

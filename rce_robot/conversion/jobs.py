@@ -14,7 +14,7 @@ import msgspec
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rce_robot.outbox import Buffer
+    from rce_robot.outgoing import Buffer
 
 HEAD = struct.Struct("!I")
 """How many parts follow."""

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rce_robot.conversion.jobs import Job, Result
-    from rce_robot.outbox import Buffer
+    from rce_robot.outgoing import Buffer
 
 _log = logging.getLogger(__name__)
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rce_robot.conversion.jobs import Job, Result
-    from rce_robot.outbox import Buffer
+    from rce_robot.outgoing import Buffer
 
 _START_TIMEOUT_S = 60.0
 _MAX_PACKET = 1 << 30

@@ -30,11 +30,12 @@ from rce.ros.types import TypeRegistry
 from rce_robot.conversion.jobs import HEAD, ReadText, ReadValue, Result, Show, decode_job, pack
 from rce_robot.exceptions import UnreadableError
 from rce_robot.factory import FormFactory
+from rce_robot.outgoing import Outgoing
 
 if TYPE_CHECKING:
     from rce_robot.conversion.jobs import Job
     from rce_robot.forms import Form
-    from rce_robot.outbox import Buffer
+    from rce_robot.outgoing import Buffer
 
 MAX_TEXT = 64 << 20
 """Longest text that is sent to a robot, in bytes; clients take no longer ones."""
@@ -92,6 +93,7 @@ class Worker:
     def _show(self, job: Show, payload: bytes) -> tuple[Result, list[Buffer]]:
         form = self._forms(job)[1]
         outgoing = form.pack(job.i_tag, job.cls, job.msg_id, form.show(payload))
+        assert isinstance(outgoing, Outgoing)  # a Forwarder's payload is never heavy
         if len(outgoing.text) > MAX_TEXT:
             size = len(outgoing.text) >> 20
             raise UnreadableError(

@@ -20,6 +20,7 @@ class PlayedWay:
     """A connection with one interface, which is active when the test says so."""
 
     knows_sources = True
+    takes_single_frames = False
 
     def __init__(self) -> None:
         self.active: dict[str, bool] = {}

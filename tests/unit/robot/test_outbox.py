@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce_robot.outbox import LatchedDelivery, Outbox, OutboxLimits, Outgoing, Overflow, Queued
+from rce_robot.outbox import Outbox, OutboxLimits, Overflow, Queued
+from rce_robot.outgoing import LatchedDelivery, Outgoing
 
 
 def message(text: str, extra: int = 0) -> Outgoing:

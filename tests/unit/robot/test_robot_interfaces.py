@@ -24,7 +24,8 @@ from rce_robot.exceptions import BusyError, MisdirectedError, UnreadableError
 from rce_robot.factory import FormFactory
 from rce_robot.interface import RobotInterface
 from rce_robot.interfaces import make_interface
-from rce_robot.outbox import Outgoing, Overflow, Queued
+from rce_robot.outbox import Overflow, Queued
+from rce_robot.outgoing import Outgoing, Serialized
 from rce_robot.services import AnsweredByRobot
 
 STRING = "std_msgs/String"
@@ -227,9 +228,14 @@ def test_a_forwarded_payload_is_not_copied() -> None:
     payload = bytes(100_000)
     setup.interface.receive(payload, latched=False)
     ((message, _),) = setup.robot.data
-    ((id_, body),) = message.binaries
+    assert isinstance(message, Serialized)
+    assert message.payload is payload  # in one frame
+    header = json.loads(message.prefix[3:])
+    assert header == {"iTag": "tag", "type": STRING, "msgID": "nil"}
+    split = message.latched("5.1").split()
+    ((id_, body),) = split.binaries
     assert body is payload
-    assert shown(message)["msg*"].encode() == id_
+    assert shown(split) == {"latch": "5.1", **header, "msg*": id_.decode()}
     assert len(id_) == 32
 
 
