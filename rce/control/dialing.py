@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 from typing import TYPE_CHECKING
 
 from websockets.asyncio.client import connect
 
 from rce.control.execution import MAX_DATA, path_of
 from rce.control.timeouts import DEFAULT_TIMEOUTS, ControlTimeouts
+from rce.dialing import open_url_socket
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from websockets.asyncio.client import ClientConnection
+
     from rce.config.secret import Secret
     from rce.tls.identity import Context
 
@@ -37,16 +44,21 @@ class RunDialer:
         self._secret = secret
         self._timeouts = timeouts
 
-    def dial(self, run: str) -> connect:
-        """Connect for a run; use what is returned with ``async with``.
+    @contextlib.asynccontextmanager
+    async def dial(self, run: str) -> AsyncIterator[ClientConnection]:
+        """Connect for a run.
 
         Raises:
-            OSError: The master cannot be reached.
+            OSError: The master cannot be reached; ``TimeoutError`` if it does not answer.
             WebSocketException: It does not take the connection.
         """
-        return connect(
+        async with asyncio.timeout(self._timeouts.open):
+            sock = await open_url_socket(self._url)
+        async with connect(
             self._url + path_of(run),
+            sock=sock,
             additional_headers={"Authorization": f"Bearer {self._secret.reveal()}"},
+            ssl=None if self._tls is None else self._tls(),
             compression=None,
             proxy=None,
             open_timeout=self._timeouts.open,
@@ -55,5 +67,5 @@ class RunDialer:
             close_timeout=self._timeouts.close,
             max_size=MAX_DATA + 2,
             max_queue=4,
-            ssl=None if self._tls is None else self._tls(),
-        )
+        ) as master:
+            yield master

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
+from rce.dialing import open_socket
 from rce.ros.errors import RosError, TcprosError
 from rce.ros.tcpros.header import ANY, MAX_HEADER, decode_header, encode_header, raise_error_field
 from rce.ros.tools.exceptions import ToolError
@@ -128,7 +129,7 @@ async def _definition(topic: str, node: str, master: MasterClient, rpc: RpcClien
 async def _exchange_headers(host: str, port: int, fields: dict[str, str]) -> dict[str, str]:
     """Connect, send a connection header, and return the one that is answered."""
     async with asyncio.timeout(CONNECT_S):
-        reader, writer = await asyncio.open_connection(host, port)
+        reader, writer = await asyncio.open_connection(sock=await open_socket(host, port))
         try:
             writer.write(encode_header(fields))
             (size,) = struct.unpack("<I", await reader.readexactly(4))
