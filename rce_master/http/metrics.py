@@ -77,7 +77,7 @@ class EngineCollector(Collector):
         yield CounterMetricFamily(
             "rce_revisions",
             "Changes of desired state since the start.",
-            value=counted.get("revision", 0) - counted.get("revisions_before", 0),
+            value=counted.get("revision", 0) - tables.first_revision,
         )
 
     def _connections(self) -> Iterator[Metric]:

@@ -189,6 +189,8 @@ class Tables:
         self.moves = Table[Move](
             "moves", type_=Any, key=lambda m: m.id, persistent=False, to=lambda m: [m.to]
         )
+        self.first_revision = 0
+        """Revisions that this life of the master gives are above this."""
 
     @property
     def all(self) -> tuple[Table[Any], ...]:

@@ -236,7 +236,7 @@ def restart(tx: Transaction, revision: int) -> None:
     would be in force as long as the store is.
     """
     tx.raise_counter("revision", revision)
-    tx.raise_counter("revisions_before", tx.newest("revision"))
+    tx.tables.first_revision = tx.newest("revision")
     for task_set in tx.tables.task_sets:
         tx.put(Presence(process=task_set.process, connected=False, since=tx.now))
     for endpoint in tx.tables.endpoints:
