@@ -20,7 +20,7 @@ from benchmarks.targets import TARGETS, Target
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "performance.md"
 
 _BLOCK = re.compile(r"(<!-- figures: (?P<name>[\w.]+) -->\n).*?(<!-- end -->)", re.DOTALL)
-_PATHS = ("bare websockets echo", "forwarder", "converter", "service")
+_PATHS = ("bare websockets echo", "forwarder", "forwarder, one frame", "converter", "service")
 
 
 def made(page: str, summary: dict[str, Any]) -> str:

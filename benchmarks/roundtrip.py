@@ -20,6 +20,8 @@ SIZES = (
 BYTES_PER_PASS = 60_000_000
 MAX_ROUNDS = 300
 MIN_ROUNDS = 5
+TURNS = 5
+"""In how many parts the trips of a size are measured in each pass."""
 
 Trip = Callable[[int], Awaitable[None]]
 
@@ -29,12 +31,10 @@ def rounds_for(size: int) -> int:
     return max(MIN_ROUNDS, min(MAX_ROUNDS, BYTES_PER_PASS // size))
 
 
-async def measure(trip: Trip, size: int) -> list[float]:
+async def measure(trip: Trip, size: int, rounds: int) -> list[float]:
     """Times of round trips of one size, seconds."""
-    await trip(size)
-    gc.collect()
     times = []
-    for _ in range(rounds_for(size)):
+    for _ in range(rounds):
         start = perf_counter()
         await trip(size)
         times.append(perf_counter() - start)
@@ -49,6 +49,18 @@ def forwarder_trip(client: Robot) -> Trip:
         await client.send_forwarded("request", payloads[size])
         frame = await client.receive_binary()
         assert len(frame) == size + 36
+
+    return trip
+
+
+def single_trip(client: Robot) -> Trip:
+    """The same with a message in one frame."""
+    payloads = {size: serialized_string(size) for size in (20, *SIZES)}
+
+    async def trip(size: int) -> None:
+        await client.send_single("request", payloads[size])
+        frame = await client.receive_binary()
+        assert frame.endswith(payloads[size])
 
     return trip
 
@@ -80,16 +92,18 @@ def service_trip(client: Robot) -> Trip:
 
 
 async def run(running: RunningEngine, *, passes: int, sizes: tuple[int, ...] = SIZES) -> list[dict[str, Any]]:
-    """Measure all paths, pass by pass in turn, so that a drift of the machine meets all of them."""
+    """Measure all paths in turn, a few trips each, so that a drift of the machine meets all of them."""
     times: dict[tuple[str, int], list[float]] = {}
     costs: dict[tuple[str, int], list[float]] = {}
     async with (
         bare_echo() as url,
         connect(url, compression=None, max_size=None) as bare,
         robot(running.url, "forwarding") as forwarding,
+        robot(running.url, "single", features="single-frame") as single,
         robot(running.url, "converting") as converting,
     ):
         await wire_echo(forwarding, "Forwarder", "benchForwarder")
+        await wire_echo(single, "Forwarder", "benchSingle")
         await wire_echo(converting, "Converter", "benchConverter")
 
         async def bare_trip(size: int) -> None:
@@ -99,20 +113,29 @@ async def run(running: RunningEngine, *, passes: int, sizes: tuple[int, ...] = S
         trips = {
             "bare websockets echo": bare_trip,
             "forwarder": forwarder_trip(forwarding),
+            "forwarder, one frame": single_trip(single),
             "converter": converter_trip(converting),
             "service": service_trip(converting),
         }
         meter = Meter(running)
         for _ in range(passes):
             for size in sizes:
-                for name, trip in trips.items():
+                for trip in trips.values():
+                    await trip(size)
+                gc.collect()
+                rounds = max(1, rounds_for(size) // TURNS)
+                for name, trip in [*trips.items()] * TURNS:
                     before = meter.read()
-                    measured = await measure(trip, size)
+                    measured = await measure(trip, size, rounds)
                     times.setdefault((name, size), []).extend(measured)
                     costs.setdefault((name, size), []).append(
-                        sum(meter.per_message(before, len(measured) + 1).values())
+                        sum(meter.per_message(before, len(measured)).values())
                     )
-        for client, container in ((forwarding, "benchForwarder"), (converting, "benchConverter")):
+        for client, container in (
+            (forwarding, "benchForwarder"),
+            (single, "benchSingle"),
+            (converting, "benchConverter"),
+        ):
             await client.send("DC", {"containerTag": container})
     return [_row(key, times, costs) for key in sorted(times, key=lambda key: key[1])]
 

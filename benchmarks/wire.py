@@ -21,6 +21,7 @@ from websockets.asyncio.client import ClientConnection, connect
 STRING = "std_msgs/String"
 ECHO = "Test/StringEcho"
 _ID = b"0" * 32
+_SINGLE = struct.Struct("!BH")
 _write = msgspec.json.Encoder().encode
 _read = msgspec.json.Decoder().decode
 
@@ -92,6 +93,11 @@ class Robot:
         await self.socket.send(_write({"type": "DM", "data": data}), text=True)
         await self.socket.send(_ID + payload)
 
+    async def send_single(self, tag: str, payload: bytes, *, number: str = "nil", cls: str = STRING) -> None:
+        """Send a serialized message in one frame; for robots that asked for it."""
+        header = _write({"iTag": tag, "type": cls, "msgID": number})
+        await self.socket.send(_SINGLE.pack(1, len(header)) + header + payload)
+
 
 async def locate(master: str) -> str:
     """Ask a master for the URL of a robot endpoint."""
@@ -101,18 +107,22 @@ async def locate(master: str) -> str:
 
 
 @contextlib.asynccontextmanager
-async def robot(master: str, name: str) -> AsyncIterator[Robot]:
-    """Connect a robot of testUser."""
-    async with robot_at(await locate(master), name) as found:
+async def robot(master: str, name: str, *, features: str = "") -> AsyncIterator[Robot]:
+    """Connect a robot of testUser, which asks for features of the protocol."""
+    async with robot_at(await locate(master), name, features=features) as found:
         yield found
 
 
 @contextlib.asynccontextmanager
-async def robot_at(url: str, name: str, tls: ssl.SSLContext | None = None) -> AsyncIterator[Robot]:
+async def robot_at(
+    url: str, name: str, tls: ssl.SSLContext | None = None, *, features: str = ""
+) -> AsyncIterator[Robot]:
     """Connect a robot of testUser to a certain endpoint."""
     password = hashlib.sha256(b"testUser").hexdigest()
-    target = f"{url}?userID=testUser&robotID={name}&password={password}"
+    target = f"{url}?userID=testUser&robotID={name}&password={password}&features={features}"
     async with connect(target, ssl=tls, max_size=None, compression=None, ping_interval=None) as socket:
+        assert socket.response is not None
+        assert socket.response.headers.get("RCE-Features", "") == features
         yield Robot(socket, name)
 
 
