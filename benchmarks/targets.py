@@ -13,6 +13,7 @@ RATIOS = {
     "forwarder": {20: 2.5, 784: 2.5, 6951: 2.5, 61584: 3.0, 545559: 2.5, 4832930: 2.5, 10000000: 2.0},
 }
 """Round trip in times of a bare echo's in the same run, by bytes: half of rosbridge's time or less."""
+RATIOS["forwarder, one frame"] = RATIOS["forwarder"]
 
 
 @dataclass(frozen=True)
