@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
+import struct
+
 import pytest
 from support.engine import running_engine
-from support.stranger import check_echo, stranger, wire_echo
+from support.stranger import PATIENCE_S, check_echo, stranger, wire_echo
+
+from rce_client.connection import Connection
 
 pytestmark = pytest.mark.e2e
+
+STRING = "std_msgs/String"
 
 
 @pytest.mark.parametrize("runtime", ["process", pytest.param("namespace", marks=pytest.mark.needs("bwrap"))])
@@ -49,3 +56,40 @@ async def test_faults_are_told_and_nothing_else_is_lost() -> None:
         await client.wait_error("noSuchFile")
         assert len(client.errors) >= before + 5
         await check_echo(client, "still here")
+
+
+async def test_serialized_echo_in_one_frame_beside_a_client_that_knows_two() -> None:
+    """Both are connected to one container's topics; a client that did not ask sees nothing new."""
+    text = struct.pack("<I", 5) + b"hello"
+    topics = (("say", "Publisher", "/stringEchoReq"), ("hear", "Subscriber", "/stringEchoResp"))
+    async with (
+        running_engine() as engine,
+        Connection(engine.url, "testUser", "testUser", "asking") as asking,
+        stranger(engine.url, robot="plain") as plain,
+    ):
+        assert asking.takes_single_frames
+        await asking.create_container("box")
+        await asking.add_node("box", "echo", "Test", "stringEcho.py")
+        got: asyncio.Queue[bytes] = asyncio.Queue()
+        publisher = await asking.publisher("say", STRING, raw=True)
+        await asking.subscriber("hear", STRING, lambda message: got.put_nowait(bytes(message)), raw=True)
+        for tag, role, topic in topics:
+            await asking.add_interface("box", tag, f"{role}Interface", STRING, addr=topic)
+            await asking.connect(f"asking/{tag}", f"box/{tag}")
+        for tag in ("say", "hear"):
+            await asking.wait_active(tag, PATIENCE_S)
+        for tag, kind in (("say", "SubscriberForwarder"), ("hear", "PublisherForwarder")):
+            own = {"endpointTag": "plain", "interfaceTag": tag, "interfaceType": kind, "className": STRING}
+            await plain.send("CN", {"addInterfaces": [own]})
+            await plain.send("CX", {"connect": [{"tagA": f"plain/{tag}", "tagB": f"box/{tag}"}]})
+        await plain.wait_status({"say": True, "hear": True})
+        publisher.publish(text)
+        assert await got.get() == text
+        assert await plain.receive("hear") == text
+        id_ = "0" * 32
+        await plain.send("DM", {"iTag": "say", "type": STRING, "msgID": "nil", "msg*": id_})
+        await plain.socket.send_bytes(id_.encode() + text)
+        assert await plain.receive("hear") == text
+        assert await got.get() == text
+        assert plain.errors == []
+        await asking.remove_all()
