@@ -87,7 +87,7 @@ class Graph:
     def register_subscriber(self, topic: str, topic_type: str, node: str, uri: str) -> Outcome:
         """Note that a node subscribes; it learns the publishers from the answer, not by a call."""
         outcome = self._displace(node, uri)
-        if topic_type != ANY_TYPE and self._types.get(topic, ANY_TYPE) == ANY_TYPE:
+        if topic_type != ANY_TYPE and topic not in self._types:
             self._types[topic] = topic_type
         self._add(Kind.SUBSCRIBER, topic, node, uri, None, outcome)
         return outcome
