@@ -1,116 +1,23 @@
-"""``rce-master``: the Master Task Set as a program."""
+"""Starts ``rce-master``: with settings handed over without what reads command lines, which takes 5 MB."""
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
-from typing import TYPE_CHECKING
+import sys
 
-import typer
-import uvloop
-
-from rce.cli.options import Verbose, start_logging
-from rce.cli.settings import COMMON, SettingsOptions
-from rce.config.exceptions import RunDirError, SecretError
-from rce.config.secret import load_secret
-from rce.config.settings import EngineSettings
-from rce.guard.files import raise_file_limit
-from rce.supervision.signals import end_signals
-from rce.tls.choice import TlsChoice
-from rce.tls.exceptions import CertificateError
-from rce_master.exceptions import MasterError
-from rce_master.master import Master, RunningMaster
-from rce_master.quotas import QuotaSettings
-from rce_master.settings import MasterSettings
-from rce_master.state.settings import StateSettings
-from rce_master.store import SqliteStore
-
-if TYPE_CHECKING:
-    from rce.config.secret import Secret
-
-OPTIONS = SettingsOptions("master", "tls", *COMMON)
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-
-
-@app.command()
-@OPTIONS.given("rce-master")
-def command(engine: EngineSettings, *, verbose: Verbose = False) -> None:
-    """Run the Master Task Set: HTTP for clients on 9000, control of task sets on 8080."""
-    start_logging(engine, "rce-master", verbose=verbose)
-    raise_file_limit()
-    faults: tuple[BaseException, ...] = ()
-    try:
-        secret = load_secret(engine.secret_file, dev=engine.dev)
-        with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
-            runner.run(_run(_settings(engine), secret))
-    except* (MasterError, SecretError, RunDirError, CertificateError) as group:
-        faults = group.exceptions
-    for fault in faults:
-        typer.echo(f"rce-master: {fault}", err=True)
-    if faults:
-        raise typer.Exit(1)
-
-
-def _settings(engine: EngineSettings) -> MasterSettings:
-    """Make the master's own settings of the engine's."""
-    own = engine.master
-    return MasterSettings(
-        bind=own.bind,
-        http_port=own.http_port,
-        control_port=own.control_port,
-        state_dir=engine.master_state,
-        dev=engine.dev,
-        tls=TlsChoice.of(engine),
-        allowed_origins=own.origins,
-        public_names=own.public_names,
-        trusted_proxies=own.trusted_proxies,
-        token_lifetime=own.token_lifetime,
-        quotas=QuotaSettings(
-            requests=own.requests_per_second,
-            request_burst=own.request_burst,
-            streams=own.max_streams,
-            log_reads=own.max_log_reads,
-        ),
-        state=StateSettings(
-            robot_grace=own.robot_grace,
-            container_grace=own.container_grace,
-            user_share=own.user_share,
-            max_containers=own.max_containers,
-            max_packages=own.max_packages,
-            max_package_size=own.max_disk,
-            max_slots=own.max_slots,
-            max_cpu=own.max_cpu,
-            max_memory=own.max_memory,
-        ),
-    )
-
-
-async def _run(settings: MasterSettings, secret: Secret) -> None:
-    """Run until SIGINT or SIGTERM."""
-    task = asyncio.current_task()
-    assert task is not None
-
-    def stop() -> None:
-        if not task.cancelling():  # a second time would cut short how it ends
-            task.cancel()
-
-    for number in end_signals():
-        asyncio.get_running_loop().add_signal_handler(number, stop)
-    store = await SqliteStore.open(settings.state_dir)
-    try:
-        with contextlib.suppress(asyncio.CancelledError):
-            await Master(settings, secret, store).run(_announce)
-    finally:
-        await store.close()
-
-
-def _announce(master: RunningMaster) -> None:
-    typer.echo(f"rce-master ready: {master.url}")
+from rce.config.handover import handed_over
 
 
 def main() -> None:
     """Run the program."""
-    app(prog_name="rce-master")
+    settings = handed_over(sys.argv[1:])
+    if settings is None:
+        from rce_master.command import app
+
+        app(prog_name="rce-master")
+    else:
+        from rce_master.program import run
+
+        sys.exit(run(settings))
 
 
 if __name__ == "__main__":

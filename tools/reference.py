@@ -21,9 +21,9 @@ from rce.cli.main import GROUP, build_app
 from rce.config.fields import Field, Section, fields_of, sections_of
 from rce.config.settings import EngineSettings
 from rce_client.ros_bridge.__main__ import app as rce_ros
-from rce_container.__main__ import app as rce_container
-from rce_master.__main__ import app as rce_master
-from rce_robot.__main__ import app as rce_robot
+from rce_container.command import app as rce_container
+from rce_master.command import app as rce_master
+from rce_robot.command import app as rce_robot
 
 ROOT = Path(__file__).resolve().parent.parent
 WIDTH = 110

@@ -1,15 +1,18 @@
-"""Keys and signatures: Ed25519, written in hex."""
+"""Keys and signatures: Ed25519, written in hex.
+
+``cryptography`` takes 4 MB: it is loaded by what first makes, reads or checks a key.
+"""
 
 from __future__ import annotations
 
 import hashlib
 from binascii import unhexlify
-
-from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
-from cryptography.hazmat.primitives import serialization
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+from typing import TYPE_CHECKING
 
 from rce.bundles.exceptions import BadKey, BadSignature
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 KEY_BYTES = 32
 SIGNATURE_BYTES = 64
@@ -25,6 +28,8 @@ class SigningKey:
     @classmethod
     def generate(cls) -> SigningKey:
         """Make a new one."""
+        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
         return cls(Ed25519PrivateKey.generate())
 
     @classmethod
@@ -34,6 +39,10 @@ class SigningKey:
         Raises:
             BadKey: It holds no Ed25519 key, or one that is locked by a password.
         """
+        from cryptography.exceptions import UnsupportedAlgorithm
+        from cryptography.hazmat.primitives import serialization
+        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
         try:
             key = serialization.load_pem_private_key(text, password=None)
         except (ValueError, TypeError, UnsupportedAlgorithm) as error:
@@ -44,6 +53,8 @@ class SigningKey:
 
     def to_pem(self) -> bytes:
         """Write it as a key file holds it."""
+        from cryptography.hazmat.primitives import serialization
+
         return self._key.private_bytes(
             serialization.Encoding.PEM,
             serialization.PrivateFormat.PKCS8,
@@ -80,6 +91,9 @@ def verify(key: str, signature: str, signed: bytes) -> None:
         BadKey: It is no public key.
         BadSignature: The key's owner did not sign this.
     """
+    from cryptography.exceptions import InvalidSignature
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
     public = Ed25519PublicKey.from_public_bytes(_key_bytes(key))
     try:
         public.verify(unhexlify(signature), signed)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import dataclasses
 import json
 import sys
@@ -11,18 +9,15 @@ from collections.abc import Iterable
 from typing import Annotated, Any
 
 import typer
-import uvloop
 from msgspec.structs import replace
 
 from rce.cli.settings import SettingsOptions
 from rce.config.fields import SettingError, fields_of
 from rce.config.loading import as_document
 from rce.config.settings import LOOPBACK, EngineSettings, MasterSettings
-from rce.supervision.signals import end_signals
-from rce.supervision.supervisor import Program, StartError, Supervisor
+from rce.supervision.plan import Plan
+from rce.supervision.supervisor import Program
 from rce.tls.choice import WARNED_VARIABLE, plain_warning
-from rce.tls.exceptions import CertificateError
-from rce.tls.keeping import keep_certificates
 
 OPTIONS = SettingsOptions(
     "dev", "state_dir", "secret_file", "log_level", "log_dir", "master", "robot", "container", "tls", up=True
@@ -38,7 +33,11 @@ def up(
     ] = None,
 ) -> None:
     """Run master, robot and container task sets; restart one that dies; stop all on Ctrl-C."""
-    raise typer.Exit(uvloop.run(run(settings if bind is None else bound_to(bind, settings))))
+    try:
+        plan(settings if bind is None else bound_to(bind, settings)).hand_over()
+    except OSError as error:
+        typer.echo(f"rce up: {error}", err=True)
+        raise typer.Exit(1) from error
 
 
 def bound_to(bind: str, settings: EngineSettings) -> EngineSettings:
@@ -59,38 +58,20 @@ def bound_to(bind: str, settings: EngineSettings) -> EngineSettings:
     )
 
 
-async def run(settings: EngineSettings) -> int:
-    """Run an engine until SIGINT, SIGTERM or SIGHUP; returns the exit code.
-
-    A second signal ends containers without waiting for their nodes. Whatever ends this, nothing is left.
-    """
-    task = asyncio.current_task()
-    assert task is not None
-    supervisor = Supervisor(list(programs(settings)), typer.echo)
-
-    def stop() -> None:
-        supervisor.hurry() if task.cancelling() else task.cancel()
-
-    for number in end_signals():
-        asyncio.get_running_loop().add_signal_handler(number, stop)
-
-    def announce() -> None:
-        typer.echo(f"RCE ready: {settings.http_url}")
-        if settings.tls.enabled:
-            typer.echo(f"RCE authority, which clients need: {settings.certificates.absolute()}/authority.pem")
-
-    if text := warning(settings):
-        typer.echo(f"[up] {text}", err=True)
-    faults: tuple[BaseException, ...] = ()
-    with contextlib.suppress(asyncio.CancelledError):
-        try:
-            async with keep_certificates(settings, lambda text: typer.echo(f"[up] {text}")):
-                await supervisor.run(announce)
-        except* (StartError, OSError, CertificateError) as group:
-            faults = group.exceptions
-    for fault in faults:
-        typer.echo(f"rce up: {fault}", err=True)
-    return 1 if faults else 0
+def plan(settings: EngineSettings) -> Plan:
+    """Return what to run, and what to say of it."""
+    ready = [f"RCE ready: {settings.http_url}"]
+    certified = {}
+    if settings.tls.enabled:
+        ready.append(f"RCE authority, which clients need: {settings.certificates.absolute()}/authority.pem")
+        certified = _document(settings)
+    text = warning(settings)
+    return Plan(
+        programs=tuple(programs(settings)),
+        ready=tuple(ready),
+        warnings=(f"[up] {text}",) if text else (),
+        certified=certified,
+    )
 
 
 def warning(settings: EngineSettings) -> str | None:
@@ -104,10 +85,7 @@ def warning(settings: EngineSettings) -> str | None:
 
 def programs(settings: EngineSettings) -> Iterable[Program]:
     """The programs of an engine, in the order in which they start. Each gets all settings as one document."""
-    document = as_document(settings) | {
-        "state_dir": str(settings.state_dir.absolute()),
-        "master_host": settings.master_host or LOOPBACK,
-    }
+    document = _document(settings)
     yield _program("master", "rce_master", document)
     robot = settings.robot
     link_port = ROBOT_LINK_PORT if robot.link_port is None else robot.link_port
@@ -121,6 +99,13 @@ def programs(settings: EngineSettings) -> Iterable[Program]:
         document["container"] = document.get("container", {}) | {"link_port": CONTAINER_LINK_PORT}
     final = _program("container", "rce_container", document, "--end").argv
     yield dataclasses.replace(_program("container", "rce_container", document), final=final)
+
+
+def _document(settings: EngineSettings) -> dict[str, Any]:
+    return as_document(settings) | {
+        "state_dir": str(settings.state_dir.absolute()),
+        "master_host": settings.master_host or LOOPBACK,
+    }
 
 
 def _next(port: int, offset: int) -> int:

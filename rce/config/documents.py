@@ -5,16 +5,13 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
-import yaml
-
 from rce.config.exceptions import ConfigError, Fault
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
 
 _MAX_SIZE = 4 * 2**20
-_MAX_ALIASES = 100
 
 
 def read_file(path: Path) -> str:
@@ -49,7 +46,9 @@ def parse(text: str, source: str) -> Any:
         text.lstrip().startswith(("{", "[")) and not source.endswith((".yaml", ".yml"))
     ):
         return _parse_json(text, source)
-    return _parse_yaml(text, source)
+    from rce.config.yaml_documents import parse_yaml  # programs that are handed their settings need none
+
+    return parse_yaml(text, source)
 
 
 class _Object(dict[str, Any]):
@@ -96,50 +95,3 @@ def join(place: str, step: str | int) -> str:
     if isinstance(step, int):
         return f"{place}[{step}]"
     return f"{place}.{step}" if place else step
-
-
-class _Loader(yaml.SafeLoader):
-    """Refuses keys that come twice, and files that blow up by aliases."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__(text)
-        self._aliases = 0
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        if self.check_event(yaml.events.AliasEvent):
-            self._aliases += 1
-            if self._aliases > _MAX_ALIASES:
-                mark = self.get_mark()
-                raise yaml.MarkedYAMLError(problem="too many aliases", problem_mark=mark)
-        return super().compose_node(parent, index)
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        seen = set()
-        for key_node, _ in node.value:
-            if key_node.tag == "tag:yaml.org,2002:merge":
-                continue
-            key = self.construct_object(key_node, deep=True)
-            if isinstance(key, list | dict) or key in seen:
-                problem = (
-                    f"key {key!r} is given more than once"
-                    if not isinstance(key, list | dict)
-                    else "no valid key"
-                )
-                raise yaml.MarkedYAMLError(problem=problem, problem_mark=key_node.start_mark)
-            seen.add(key)
-        return super().construct_mapping(node, deep)
-
-
-def _parse_yaml(text: str, source: str) -> Any:
-    try:
-        loader = _Loader(text)
-        try:
-            return loader.get_single_data()
-        finally:
-            loader.dispose()
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        place = f"line {mark.line + 1}, column {mark.column + 1}" if mark else ""
-        raise ConfigError(source, [Fault(place, f"no valid YAML: {error.problem}")]) from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ConfigError(source, [Fault("", f"no valid YAML: {error}")]) from error

@@ -44,5 +44,9 @@ class RunDirError(Exception):
     """The folder for sockets cannot be used, for instance because it belongs to somebody else."""
 
 
+class LogFileError(Exception):
+    """The file of a program's log cannot be written."""
+
+
 class ShippedFileError(Exception):
     """A folder that is part of the project was not found."""

@@ -5,7 +5,14 @@ from __future__ import annotations
 import logging
 import re
 from logging.handlers import RotatingFileHandler
-from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rce.config.exceptions import LogFileError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from rce.config.settings import EngineSettings
 
 FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
@@ -48,6 +55,28 @@ def start_logging(level: int | str, *, line: str = FORMAT, handler: logging.Hand
     logging.basicConfig(level=level, handlers=[handler])
     for name in _TALKATIVE:
         logging.getLogger(name).setLevel(logging.WARNING)
+
+
+def log_as(program: str, settings: EngineSettings, *, verbose: bool = False) -> None:
+    """Log as all programs of the engine do: to the standard error stream, or to a file that is rotated.
+
+    Args:
+        program: Name of the program, and of its file.
+        settings: They say what is logged, and where.
+        verbose: Log all.
+
+    Raises:
+        LogFileError: The file cannot be written.
+    """
+    level = logging.DEBUG if verbose else settings.log_level.value.upper()
+    handler = None
+    if settings.log_dir is not None:
+        path = settings.log_dir / f"{program}.log"
+        try:
+            handler = rotating_file(path, size=settings.log_size, count=settings.log_count)
+        except OSError as error:
+            raise LogFileError(f"cannot write the log {path}: {error.strerror}") from error
+    start_logging(level, handler=handler)
 
 
 def rotating_file(path: Path, *, size: int, count: int) -> logging.Handler:

@@ -9,7 +9,6 @@ from http import HTTPStatus
 from typing import Any
 
 from pydantic import BaseModel
-from pydantic.json_schema import models_json_schema
 
 from rce import __version__
 
@@ -75,6 +74,8 @@ def build_document(
         description: What it is for.
         error: Model of every answer that is not a success.
     """
+    from pydantic.json_schema import models_json_schema  # takes memory that only asked servers spend
+
     operations = list(operations)
     models = {model for known in operations for model in (known.body, known.reply) if model} | {error}
     ordered = sorted(models, key=lambda model: model.__name__)

@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING, NamedTuple
 
-from prometheus_client import CollectorRegistry, GCCollector, PlatformCollector, ProcessCollector
+from aiohttp import web
+from prometheus_client import (
+    CONTENT_TYPE_LATEST,
+    CollectorRegistry,
+    GCCollector,
+    PlatformCollector,
+    ProcessCollector,
+    generate_latest,
+)
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.registry import Collector
 
@@ -16,7 +24,7 @@ from rce_master.state.lifecycle import ContainerPhase, RobotSession
 from rce_master.state.records import Container
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from prometheus_client.metrics_core import Metric
 
@@ -30,6 +38,13 @@ _NO_USAGE = EndpointUsage()
 
 MAX_SERIES = 50_000
 """Series of containers, nodes and interfaces in one answer; what is beyond it is counted, not listed."""
+
+
+def make_answer(tables: Tables, book: UsageBook) -> Callable[[], web.Response]:
+    """Return what makes an answer to a scrape."""
+    registry = make_registry(tables, book)
+    headers = {"Content-Type": CONTENT_TYPE_LATEST}
+    return lambda: web.Response(body=generate_latest(registry), headers=headers)
 
 
 def make_registry(tables: Tables, book: UsageBook) -> CollectorRegistry:

@@ -7,10 +7,10 @@ import json
 import logging
 import math
 from dataclasses import replace
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from aiohttp import hdrs, web
-from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
 from rce.web.bodies import read_whole
 from rce.web.openapi import PREFIX, build_document
@@ -42,7 +42,6 @@ from rce_master.http.access import admit, bearer, check_metrics
 from rce_master.http.auditing import note_done, note_refused
 from rce_master.http.entry import Entry
 from rce_master.http.health import Health
-from rce_master.http.metrics import make_registry
 from rce_master.http.models import Error
 from rce_master.http.routes import Call, Route, Services, read_body
 
@@ -123,26 +122,32 @@ def _adapt(route: Route, services: Services) -> Handler:
 
 
 def _metrics(services: Services) -> Handler:
-    registry = make_registry(services.realm.tables, services.reconciler.book)
+    @cache
+    def scraped() -> Callable[[], web.Response]:
+        from rce_master.http.metrics import make_answer  # takes memory that only scraped masters spend
+
+        return make_answer(services.realm.tables, services.reconciler.book)
 
     async def handle(request: web.Request) -> web.Response:
         check_metrics(request, services)
-        return web.Response(body=generate_latest(registry), headers={"Content-Type": CONTENT_TYPE_LATEST})
+        return scraped()()
 
     return handle
 
 
 def _document() -> Handler:
-    document = build_document(
-        [route.operation for route in ROUTES],
-        title="RCE master",
-        description="Control of a robotics cloud.",
-        error=Error,
-    )
-    text = json.dumps(document)
+    @cache
+    def text() -> str:
+        document = build_document(
+            [route.operation for route in ROUTES],
+            title="RCE master",
+            description="Control of a robotics cloud.",
+            error=Error,
+        )
+        return json.dumps(document)
 
     async def handle(_: web.Request) -> web.Response:
-        return web.Response(text=text, content_type="application/json")
+        return web.Response(text=text(), content_type="application/json")
 
     return handle
 

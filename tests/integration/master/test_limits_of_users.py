@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from rce.config.settings import EngineSettings
 from rce.control.messages import MachineInfo
-from rce_master.__main__ import _settings
+from rce_master.program import _settings
 from rce_master.cli import limits
 from rce_master.cli.credentials import FILE_VARIABLE, Credentials, save
 

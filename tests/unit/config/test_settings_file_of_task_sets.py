@@ -11,12 +11,12 @@ from typer.testing import CliRunner
 from rce.cli.up import OPTIONS as UP
 from rce.config.resources import configs_dir
 from rce.config.settings import Runtime
-from rce_container.__main__ import OPTIONS as CONTAINER
-from rce_container.__main__ import app as container
-from rce_master.__main__ import OPTIONS as MASTER
-from rce_master.__main__ import app as master
-from rce_robot.__main__ import OPTIONS as ROBOT
-from rce_robot.__main__ import app as robot
+from rce_container.command import OPTIONS as CONTAINER
+from rce_container.command import app as container
+from rce_master.command import OPTIONS as MASTER
+from rce_master.command import app as master
+from rce_robot.command import OPTIONS as ROBOT
+from rce_robot.command import app as robot
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -1,0 +1,69 @@
+"""``python -m rce.supervision FD ...``: the process of ``rce up``, once its settings are read."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import sys
+from typing import TYPE_CHECKING
+
+import uvloop
+
+from rce.supervision.plan import Plan
+from rce.supervision.signals import end_signals
+from rce.supervision.supervisor import StartError, Supervisor
+from rce.tls.exceptions import CertificateError
+
+if TYPE_CHECKING:
+    from contextlib import AbstractAsyncContextManager
+
+
+async def run(plan: Plan) -> int:
+    """Run an engine until SIGINT, SIGTERM or SIGHUP; returns the exit code.
+
+    A second signal ends containers without waiting for their nodes. Whatever ends this, nothing is left.
+    """
+    task = asyncio.current_task()
+    assert task is not None
+    supervisor = Supervisor(plan.programs, _say)
+
+    def stop() -> None:
+        supervisor.hurry() if task.cancelling() else task.cancel()
+
+    for number in end_signals():
+        asyncio.get_running_loop().add_signal_handler(number, stop)
+    for line in plan.warnings:
+        _complain(line)
+    faults: tuple[BaseException, ...] = ()
+    with contextlib.suppress(asyncio.CancelledError):
+        try:
+            async with _certificates(plan):
+                await supervisor.run(lambda: _say("\n".join(plan.ready)))
+        except* (StartError, OSError, CertificateError) as group:
+            faults = group.exceptions
+    for fault in faults:
+        _complain(f"rce up: {fault}")
+    return 1 if faults else 0
+
+
+def _certificates(plan: Plan) -> AbstractAsyncContextManager[None]:
+    if not plan.certified:
+        return contextlib.nullcontext()
+    # Takes 10 MB, which only engines with TLS spend.
+    from rce.config.loading import load_settings, read_document
+    from rce.tls.keeping import keep_certificates
+
+    settings = load_settings(None, read_document(plan.certified, "the plan"))
+    return keep_certificates(settings, lambda text: _say(f"[up] {text}"))
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)  # noqa: T201 - what the programs print
+
+
+def _complain(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)  # noqa: T201 - for whoever started it
+
+
+if __name__ == "__main__":
+    sys.exit(uvloop.run(run(Plan.take_over(int(sys.argv[1])))))

@@ -1,0 +1,60 @@
+"""What a supervisor is to run, handed from the program that read the command line to a small one.
+
+What reads command lines and settings takes 10 MB, which the supervisor would hold for as long as it runs.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+from dataclasses import asdict, dataclass, field
+from typing import Any, NoReturn
+
+from rce.supervision.supervisor import Program
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """The programs of an engine, and what to say of them."""
+
+    programs: tuple[Program, ...]
+    ready: tuple[str, ...]
+    """Lines to show once all are up."""
+    warnings: tuple[str, ...] = ()
+    """Lines to show at once, as errors are."""
+    certified: dict[str, Any] = field(default_factory=dict)
+    """The engine's settings as a document, if its certificates are to be kept; empty without TLS."""
+
+    def hand_over(self) -> NoReturn:
+        """Go on as the supervisor of this plan, in this process; what was loaded is given back.
+
+        Raises:
+            OSError: The interpreter cannot be started, or the plan not be written.
+        """
+        with tempfile.TemporaryFile() as file:
+            file.write(json.dumps(asdict(self)).encode())
+            file.seek(0)
+            os.set_inheritable(file.fileno(), True)
+            # The command line is there for those who look for the process.
+            os.execv(  # noqa: S606 - this interpreter
+                sys.executable,
+                [sys.executable, "-m", "rce.supervision", str(file.fileno()), *sys.argv],
+            )
+
+    @classmethod
+    def take_over(cls, fd: int) -> Plan:
+        """Read the plan that :meth:`hand_over` left.
+
+        Args:
+            fd: The number of its file; it is closed.
+        """
+        with os.fdopen(fd, "rb") as file:
+            found = json.load(file)
+        return cls(
+            programs=tuple(Program(**program) for program in found["programs"]),
+            ready=tuple(found["ready"]),
+            warnings=tuple(found["warnings"]),
+            certified=found["certified"],
+        )

@@ -1,0 +1,109 @@
+"""What ``rce-master`` does once its settings are read."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import sys
+from typing import TYPE_CHECKING
+
+import uvloop
+
+from rce.config.exceptions import LogFileError, RunDirError, SecretError
+from rce.config.logs import log_as
+from rce.config.secret import load_secret
+from rce.guard.files import raise_file_limit
+from rce.supervision.signals import end_signals
+from rce.tls.choice import TlsChoice
+from rce.tls.exceptions import CertificateError
+from rce_master.exceptions import MasterError
+from rce_master.master import Master, RunningMaster
+from rce_master.quotas import QuotaSettings
+from rce_master.settings import MasterSettings
+from rce_master.state.settings import StateSettings
+from rce_master.store import SqliteStore
+
+if TYPE_CHECKING:
+    from rce.config.secret import Secret
+    from rce.config.settings import EngineSettings
+
+
+def run(engine: EngineSettings, *, verbose: bool = False) -> int:
+    """Run a master until it is told to end.
+
+    Args:
+        engine: The settings.
+        verbose: Whether all is logged.
+
+    Returns:
+        The exit code; faults were told.
+    """
+    faults: tuple[BaseException, ...] = ()
+    try:
+        log_as("rce-master", engine, verbose=verbose)
+        raise_file_limit()
+        secret = load_secret(engine.secret_file, dev=engine.dev)
+        with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+            runner.run(_run(_settings(engine), secret))
+    except* (LogFileError, MasterError, SecretError, RunDirError, CertificateError) as group:
+        faults = group.exceptions
+    for fault in faults:
+        print(f"rce-master: {fault}", file=sys.stderr)  # noqa: T201 - for whoever started it
+    return 1 if faults else 0
+
+
+def _settings(engine: EngineSettings) -> MasterSettings:
+    """Make the master's own settings of the engine's."""
+    own = engine.master
+    return MasterSettings(
+        bind=own.bind,
+        http_port=own.http_port,
+        control_port=own.control_port,
+        state_dir=engine.master_state,
+        dev=engine.dev,
+        tls=TlsChoice.of(engine),
+        allowed_origins=own.origins,
+        public_names=own.public_names,
+        trusted_proxies=own.trusted_proxies,
+        token_lifetime=own.token_lifetime,
+        quotas=QuotaSettings(
+            requests=own.requests_per_second,
+            request_burst=own.request_burst,
+            streams=own.max_streams,
+            log_reads=own.max_log_reads,
+        ),
+        state=StateSettings(
+            robot_grace=own.robot_grace,
+            container_grace=own.container_grace,
+            user_share=own.user_share,
+            max_containers=own.max_containers,
+            max_packages=own.max_packages,
+            max_package_size=own.max_disk,
+            max_slots=own.max_slots,
+            max_cpu=own.max_cpu,
+            max_memory=own.max_memory,
+        ),
+    )
+
+
+async def _run(settings: MasterSettings, secret: Secret) -> None:
+    """Run until SIGINT or SIGTERM."""
+    task = asyncio.current_task()
+    assert task is not None
+
+    def stop() -> None:
+        if not task.cancelling():  # a second time would cut short how it ends
+            task.cancel()
+
+    for number in end_signals():
+        asyncio.get_running_loop().add_signal_handler(number, stop)
+    store = await SqliteStore.open(settings.state_dir)
+    try:
+        with contextlib.suppress(asyncio.CancelledError):
+            await Master(settings, secret, store).run(_announce)
+    finally:
+        await store.close()
+
+
+def _announce(master: RunningMaster) -> None:
+    print(f"rce-master ready: {master.url}", flush=True)  # noqa: T201 - what other programs wait for

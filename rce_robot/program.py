@@ -1,0 +1,73 @@
+"""What ``rce-robot`` does once its settings are read."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+import uvloop
+
+from rce.config.exceptions import LogFileError, RunDirError, SecretError
+from rce.config.logs import log_as
+from rce.config.secret import load_secret
+from rce.guard.files import raise_file_limit
+from rce.ros.tcpros.allocator import keep_large_blocks
+from rce.tls.choice import TlsChoice
+from rce.tls.exceptions import CertificateError
+from rce_robot.app import App
+from rce_robot.settings import RobotSettings
+
+if TYPE_CHECKING:
+    from rce.config.settings import EngineSettings
+
+
+def run(engine: EngineSettings, *, verbose: bool = False) -> int:
+    """Run a robot task set until it is told to end.
+
+    Args:
+        engine: The settings.
+        verbose: Whether all is logged.
+
+    Returns:
+        The exit code; faults were told.
+    """
+    try:
+        log_as("rce-robot", engine, verbose=verbose)
+    except LogFileError as error:
+        print(f"rce-robot: {error}", file=sys.stderr)  # noqa: T201 - for whoever started it
+        return 1
+    own = engine.robot
+    settings = RobotSettings(
+        host=own.bind,
+        ws_port=own.ws_port,
+        link_port=own.link_port,
+        public_host=own.public_host,
+        public_url=own.public_url,
+        machine=engine.machine,
+        origins=own.origins,
+        trusted_proxies=own.trusted_proxies,
+        user_memory=own.user_memory,
+        memory=own.memory,
+        strangers_per_address=own.strangers,
+    )
+    keep_large_blocks()
+    raise_file_limit()
+    try:
+        secret = load_secret(engine.secret_file, dev=engine.dev)
+        program = App(
+            master=engine.master_host,
+            control_port=engine.master.control_port,
+            secret=secret,
+            packages=engine.container.package_path,
+            settings=settings,
+            tls=TlsChoice.of(engine),
+        )
+        uvloop.run(program.run(_announce))
+    except (SecretError, RunDirError, CertificateError, OSError) as error:
+        print(f"rce-robot: {error}", file=sys.stderr)  # noqa: T201 - for whoever started it
+        return 1
+    return 0
+
+
+def _announce(url: str) -> None:
+    print(f"rce-robot ready: {url}", flush=True)  # noqa: T201 - what other programs wait for
