@@ -2,13 +2,35 @@
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import Mapping
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, time
 from typing import Any
+
+import psutil
 
 from benchmarks.engine import RunningEngine, pss, words
 from benchmarks.figures import spread
 from benchmarks.wire import STRING, Robot, robot, serialized_string
+
+ENGINE_KINDS = {
+    "rce up": "-m rce.supervision",
+    "rce-master": "-m rce_master",
+    "rce-robot": "-m rce_robot",
+    "rce-container": "-m rce_container --settings",
+    "fork server": "-m rce_container.nursery",
+}
+"""What a process is called, and what its command line holds; of two that fit the later counts."""
+CONTAINER_KINDS = {
+    "environment": "rce_container.environment",
+    "cradle": "rce_container.nursery.cradle",
+    "echo node": "stringEcho.py",
+    "bwrap": "bwrap",
+    "holder": "read -r word",
+    "shim": "rce-container-shim",
+}
+OTHERS = "others"
 
 
 async def start_times(running: RunningEngine, *, count: int) -> list[dict[str, Any]]:
@@ -45,39 +67,53 @@ async def many(running: RunningEngine, *, count: int) -> list[dict[str, Any]]:
     return [{"containers": count, "all at once": f"{elapsed:.1f} s", **weight}]
 
 
-def memory(running: RunningEngine) -> list[dict[str, Any]]:
-    """Proportional set size of each task set, in MB."""
-    rows = []
-    for needle in ("rce_master", "rce_robot", "rce_container"):
-        for process in running.named(needle):
-            if "environment" not in " ".join(process.cmdline()):
-                rows.append({"process": needle, "PSS MB": round(pss(process) / 1e6, 1)})  # noqa: PERF401
+async def memory(running: RunningEngine, *, after: float) -> list[dict[str, Any]]:
+    """Weigh every process of an engine with one robot and one container with an echo node, idle.
+
+    Args:
+        running: The engine.
+        after: Seconds between its start and the measurement.
+    """
+    async with robot(running.url, "weigher") as client:
+        await _create(client, ["weigh0"])
+        await client.wait_active("request0", "response0")
+        await client.send_forwarded("request0", serialized_string(5))
+        await client.receive_binary()
+        started = psutil.Process(running.pid).create_time()
+        await asyncio.sleep(max(0.0, started + after - time()))
+        rows = await asyncio.to_thread(_weigh, running)
+        await client.send("DC", {"containerTag": "weigh0"})
     return rows
+
+
+def _weigh(running: RunningEngine) -> list[dict[str, Any]]:
+    """Proportional set size by kind of process, in MB, and their sum."""
+    weights = dict.fromkeys((*ENGINE_KINDS, *CONTAINER_KINDS, OTHERS), 0)
+    for process in running.processes():
+        weights[_kind(process, ENGINE_KINDS | CONTAINER_KINDS) or OTHERS] += pss(process)
+    weights["sum"] = sum(weights.values())
+    return [{"process": kind, "PSS MB": round(weight / 1e6, 1)} for kind, weight in weights.items()]
 
 
 def _weight_of_each(running: RunningEngine, count: int) -> dict[str, float]:
     """What one of ``count`` containers weighs on average, by kind of process."""
-    kinds = {
-        "environment": "rce_container.environment",
-        "cradle": "rce_container.nursery.cradle",
-        "echo node": "stringEcho.py",
-        "bwrap": "bwrap",
-        "holder": "read -r word",
-        "shim": "rce-container-shim",
-    }
-    weights = dict.fromkeys(kinds, 0)
+    weights = dict.fromkeys(CONTAINER_KINDS, 0)
     for process in running.processes():
-        line = words(process)
-        first = Path(line[0]).name if line else ""
-        text = " ".join(line)
-        kind = "bwrap" if first == "bwrap" else ""
-        if first.startswith(("python", "sh")):
-            kind = next((kind for kind, needle in reversed(kinds.items()) if needle in text), "")
-        if kind:
+        if kind := _kind(process, CONTAINER_KINDS):
             weights[kind] += pss(process)
     sizes = {f"{kind} PSS MB": round(weight / count / 1e6, 2) for kind, weight in weights.items()}
     idle = sum(weight for kind, weight in weights.items() if kind != "echo node")
     return {**sizes, "idle container PSS MB": round(idle / count / 1e6, 1)}
+
+
+def _kind(process: psutil.Process, kinds: Mapping[str, str]) -> str:
+    """Tell which of these kinds a process is; empty for none."""
+    line = words(process)
+    first = Path(line[0]).name if line else ""
+    if first == "bwrap":
+        return first
+    text = " ".join(line) if first.startswith(("python", "sh")) else ""
+    return next((kind for kind, needle in reversed(kinds.items()) if needle in text), "")
 
 
 async def _create(client: Robot, containers: list[str]) -> None:

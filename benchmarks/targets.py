@@ -70,6 +70,13 @@ TARGETS = [
         "/s",
         at_least=True,
     ),
+    Target(
+        "memory with a robot and an echo container, sum of PSS",
+        "memory",
+        _column("PSS MB", process="sum"),
+        100,
+        "MB",
+    ),
     Target("fan-out to 200 at 20 Hz, p95", "fanout", _column("p95_ms", clients=200), 20, "ms"),
     Target(
         "one client stalls: what the others get",

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 from rce.config.settings import EngineSettings
 from rce.control.messages import MachineInfo
-from rce_master.program import _settings
 from rce_master.cli import limits
 from rce_master.cli.credentials import FILE_VARIABLE, Credentials, save
+from rce_master.program import _settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
