@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Protocol
 from websockets.frames import CloseCode, Frame, Opcode
 from websockets.protocol import State
 
+from rce.buffers import write_together
 from rce.guard.websocket import GuardedConnection
 
 if TYPE_CHECKING:
@@ -114,11 +115,10 @@ class RobotSocket(GuardedConnection):
         if len(buffers) > 1 and sum(map(len, buffers)) < _JOIN_BELOW:
             self.transport.write(b"".join(buffers))  # one system call, and in TLS one record
             return
-        last = buffers.pop()
-        if buffers:
-            self.transport.writelines(buffers)
-        # Python 3.12's and 3.13.0's writelines never calls pause_writing; write does, for all that waits.
-        self.transport.write(last)
+        if len(buffers) > 1:
+            write_together(self.transport, buffers)
+        else:
+            self.transport.write(buffers[0])
 
     def fail(self, code: int, reason: str) -> None:
         """Close the connection because of what the robot sent."""

@@ -7,12 +7,12 @@ import logging
 import socket
 from typing import TYPE_CHECKING, TypeVar, cast
 
+from rce.buffers import write_together
 from rce.link.carrier import Carrier, CarrierHandler
 from rce.link.exceptions import LinkLost, ProtocolError
 from rce.link.frames import (
     FRAGMENT_SIZE,
     HANDSHAKE_SIZE,
-    HEADER_SIZE,
     Frame,
     FrameReader,
     FrameType,
@@ -171,9 +171,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         size = len(frame.payload)
         if self._straight and size <= FRAGMENT_SIZE and not self._lanes:
             queue.counters.count_frame(frame)
-            self.sent += HEADER_SIZE + size
-            for buffer in frame_chunk(frame):
-                transport.write(buffer)
+            self._write(frame_chunk(frame))
             return
         self._lanes.add(queue, frame)
         self.go_on()
@@ -356,11 +354,12 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
 
     def _write(self, chunk: Chunk) -> int:
         assert self._transport is not None
-        size = 0
-        for buffer in chunk:
-            size += len(buffer)
-            self._transport.write(buffer)
+        size = sum(map(len, chunk))
         self.sent += size
+        if len(chunk) > 1:
+            write_together(self._transport, chunk)
+        else:
+            self._transport.write(chunk[0])
         return size
 
     def _heartbeat(self) -> None:

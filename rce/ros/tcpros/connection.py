@@ -9,6 +9,7 @@ import asyncio
 import logging
 from typing import Protocol, cast
 
+from rce.buffers import write_together
 from rce.ros.errors import TcprosError
 from rce.ros.tcpros.framing import MAX_FRAME, Chunks, FrameReader
 from rce.ros.tcpros.header import MAX_HEADER
@@ -90,10 +91,11 @@ class Connection(asyncio.BufferedProtocol):
         transport = self._transport
         if transport is None or self._closing:
             return
-        for chunk in chunks:
-            transport.write(chunk)
         if len(chunks) > 1:
+            write_together(transport, chunks)
             self._learn_size(len(chunks[-1]))
+        else:
+            transport.write(chunks[0])
 
     def close(self) -> None:
         """Close once what was written is out."""
