@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import re
-from logging.handlers import RotatingFileHandler
 from typing import TYPE_CHECKING
 
 from rce.config.exceptions import LogFileError
@@ -90,6 +89,8 @@ def rotating_file(path: Path, *, size: int, count: int) -> logging.Handler:
     Raises:
         OSError: It cannot be written.
     """
+    from logging.handlers import RotatingFileHandler  # loads pickle and more
+
     path.parent.mkdir(parents=True, exist_ok=True)
     return RotatingFileHandler(
         path, maxBytes=size, backupCount=count, encoding="utf-8", errors="backslashreplace"

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field
+
+from rce_master.http.model import Model
 
 Scalar = bool | int | float | str
 Value = Scalar | list[Scalar]
@@ -13,13 +15,13 @@ Amount = int | float | str
 """An amount as :mod:`rce.protocol.quantities` reads it."""
 
 
-class _In(BaseModel):
+class _In(Model):
     """Base of what is sent to the API; an unknown key is a mistake."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
 
-class Error(BaseModel):
+class Error(Model):
     """Why something was not done."""
 
     error: str
@@ -124,7 +126,7 @@ class ContainerIn(_In):
     """MB, or a text such as ``256M``."""
     bandwidth: Amount = 0
     """Bytes per second, or a text such as ``10Mbit``."""
-    special_features: list[str] = []
+    special_features: list[str] = Field(default=[])
     """Labels that the machine must have."""
     wait: bool = False
     """Wait for room if no machine has any."""
@@ -152,7 +154,7 @@ class NodeIn(_In):
     """``never``, ``on-failure`` or ``always``."""
     max_restarts: int = 5
     """In a row; 0 for no limit."""
-    after: list[str] = []
+    after: list[str] = Field(default=[])
     """Tags of nodes that must be ready before it starts."""
     heartbeat: str = ""
     """A topic that it publishes as long as it is well."""
@@ -186,7 +188,7 @@ class ConnectionIn(_In):
 # Out
 
 
-class TokenOut(BaseModel):
+class TokenOut(Model):
     """A bearer token; it cannot be read again later."""
 
     token: str
@@ -200,7 +202,7 @@ class TokenOut(BaseModel):
     """What it is good for: all that the user may do (empty), ``robot:ID`` or ``metrics``."""
 
 
-class TokenListed(BaseModel):
+class TokenListed(Model):
     """A token, without the text that it is used by."""
 
     id: str
@@ -220,7 +222,7 @@ class TokenListed(BaseModel):
     """Whether this request carries it."""
 
 
-class AuditRecord(BaseModel):
+class AuditRecord(Model):
     """Something that somebody did, or was refused."""
 
     id: int
@@ -240,19 +242,19 @@ class AuditRecord(BaseModel):
     """How often, for refusals that repeat."""
 
 
-class AuditOut(BaseModel):
+class AuditOut(Model):
     """Records of the audit log."""
 
     records: list[AuditRecord]
 
 
-class TokensOut(BaseModel):
+class TokensOut(Model):
     """Tokens."""
 
     tokens: list[TokenListed]
 
 
-class UserOut(BaseModel):
+class UserOut(Model):
     """A user."""
 
     name: str
@@ -262,7 +264,7 @@ class UserOut(BaseModel):
     containers: int
 
 
-class LimitOut(BaseModel):
+class LimitOut(Model):
     """How much of something a user may have, and has. Memory and disk in bytes."""
 
     limit: float
@@ -279,7 +281,7 @@ class UserLimitsOut(UserOut):
     """``containers``, ``slots``, ``cpu``, ``memory``, ``packages``, ``disk``."""
 
 
-class RobotOut(BaseModel):
+class RobotOut(Model):
     """A robot that is connected, or absent within its grace time."""
 
     id: str
@@ -292,7 +294,7 @@ class RobotOut(BaseModel):
     interfaces: int
 
 
-class WishOut(BaseModel):
+class WishOut(Model):
     """What a container asked for; zero or empty: nothing."""
 
     size: int
@@ -310,7 +312,7 @@ class WishOut(BaseModel):
     special_features: list[str]
 
 
-class ContainerOut(BaseModel):
+class ContainerOut(Model):
     """A container."""
 
     id: str
@@ -335,7 +337,7 @@ class ContainerOut(BaseModel):
     """Task set where its copy is being made, while its machine is drained; else empty."""
 
 
-class NodeOut(BaseModel):
+class NodeOut(Model):
     """A node."""
 
     user: str
@@ -360,7 +362,7 @@ class NodeOut(BaseModel):
     """How often it was started again by itself."""
 
 
-class ParameterOut(BaseModel):
+class ParameterOut(Model):
     """A parameter."""
 
     user: str
@@ -369,7 +371,7 @@ class ParameterOut(BaseModel):
     value: Value
 
 
-class InterfaceOut(BaseModel):
+class InterfaceOut(Model):
     """An interface."""
 
     user: str
@@ -387,7 +389,7 @@ class InterfaceOut(BaseModel):
     dropped: int
 
 
-class ConnectionOut(BaseModel):
+class ConnectionOut(Model):
     """A connection."""
 
     id: int
@@ -398,7 +400,7 @@ class ConnectionOut(BaseModel):
     """Whether both ends report it as open."""
 
 
-class StayingOut(BaseModel):
+class StayingOut(Model):
     """A container that a draining machine still has."""
 
     container: str
@@ -406,7 +408,7 @@ class StayingOut(BaseModel):
     why: str
 
 
-class MachineOut(BaseModel):
+class MachineOut(Model):
     """A task set and the machine it runs on."""
 
     process: str
@@ -439,55 +441,55 @@ class MachineOut(BaseModel):
     """Of a draining machine: the containers that it still has."""
 
 
-class UsersOut(BaseModel):
+class UsersOut(Model):
     """Users."""
 
     users: list[UserOut]
 
 
-class RobotsOut(BaseModel):
+class RobotsOut(Model):
     """Robots."""
 
     robots: list[RobotOut]
 
 
-class ContainersOut(BaseModel):
+class ContainersOut(Model):
     """Containers."""
 
     containers: list[ContainerOut]
 
 
-class NodesOut(BaseModel):
+class NodesOut(Model):
     """Nodes."""
 
     nodes: list[NodeOut]
 
 
-class ParametersOut(BaseModel):
+class ParametersOut(Model):
     """Parameters."""
 
     parameters: list[ParameterOut]
 
 
-class InterfacesOut(BaseModel):
+class InterfacesOut(Model):
     """Interfaces."""
 
     interfaces: list[InterfaceOut]
 
 
-class ConnectionsOut(BaseModel):
+class ConnectionsOut(Model):
     """Connections."""
 
     connections: list[ConnectionOut]
 
 
-class MachinesOut(BaseModel):
+class MachinesOut(Model):
     """Task sets and their machines."""
 
     machines: list[MachineOut]
 
 
-class LogOut(BaseModel):
+class LogOut(Model):
     """A piece of a log."""
 
     text: str

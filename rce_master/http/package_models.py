@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field
+
+from rce_master.http.model import Model
 
 
-class PackageKeyIn(BaseModel):
+class PackageKeyIn(Model):
     """A public key to trust."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
@@ -17,7 +19,7 @@ class PackageKeyIn(BaseModel):
     label: Annotated[str, Field(max_length=128)] = ""
 
 
-class PackageKeyOut(BaseModel):
+class PackageKeyOut(Model):
     """A public key that is trusted."""
 
     id: str
@@ -27,13 +29,13 @@ class PackageKeyOut(BaseModel):
     """Seconds since 1970."""
 
 
-class PackageKeysOut(BaseModel):
+class PackageKeysOut(Model):
     """A user's keys."""
 
     keys: list[PackageKeyOut]
 
 
-class PackageOut(BaseModel):
+class PackageOut(Model):
     """A version of a package."""
 
     user: str
@@ -61,11 +63,11 @@ class PackageOut(BaseModel):
     """Seconds since 1970."""
     nodes: list[str]
     """Nodes that need it, each ``CONTAINER/NODE``."""
-    warnings: list[str] = []
+    warnings: list[str] = Field(default=[])
     """What its owner should know; in the answer to a push only."""
 
 
-class PackagesOut(BaseModel):
+class PackagesOut(Model):
     """All versions of all packages."""
 
     packages: list[PackageOut]

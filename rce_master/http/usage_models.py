@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel
+from rce_master.http.model import Model
 
 
-class AdviceOut(BaseModel):
+class AdviceOut(Model):
     """What could be better, and the command that mends it."""
 
     about: str
@@ -14,7 +14,7 @@ class AdviceOut(BaseModel):
     command: str
 
 
-class NodeUsageOut(BaseModel):
+class NodeUsageOut(Model):
     """What a node consumes, with all processes that it started."""
 
     tag: str
@@ -27,7 +27,7 @@ class NodeUsageOut(BaseModel):
     restarts: int
 
 
-class ContainerUsageOut(BaseModel):
+class ContainerUsageOut(Model):
     """What a container consumes."""
 
     id: str
@@ -63,7 +63,7 @@ class ContainerUsageOut(BaseModel):
     advice: list[AdviceOut]
 
 
-class MachineUsageOut(BaseModel):
+class MachineUsageOut(Model):
     """What a container machine has, what is promised of it, and what its containers use."""
 
     process: str
@@ -85,7 +85,7 @@ class MachineUsageOut(BaseModel):
     advice: list[AdviceOut]
 
 
-class UsageOut(BaseModel):
+class UsageOut(Model):
     """What is consumed now."""
 
     time: float

@@ -24,9 +24,40 @@ HEADER = "imported package"
 
 NOT_LOADED = {
     "up": ("msgspec", "pydantic", "typer", "yaml", "psutil", "websockets", "platformdirs", "rce.config"),
-    "master": ("typer", "yaml", "cryptography", "prometheus_client", "PIL", "numpy", "rich", "psutil"),
-    "robot": ("typer", "yaml", "cryptography", "pydantic", "aiohttp", "h11", "PIL", "numpy", "rich"),
-    "container": ("typer", "yaml", "cryptography", "pydantic", "aiohttp", "PIL", "numpy", "rich"),
+    "master": (
+        "typer",
+        "yaml",
+        "cryptography",
+        "prometheus_client",
+        "PIL",
+        "numpy",
+        "rich",
+        "psutil",
+        "logging.handlers",
+    ),
+    "robot": (
+        "typer",
+        "yaml",
+        "cryptography",
+        "pydantic",
+        "aiohttp",
+        "h11",
+        "PIL",
+        "numpy",
+        "rich",
+        "logging.handlers",
+    ),
+    "container": (
+        "typer",
+        "yaml",
+        "cryptography",
+        "pydantic",
+        "aiohttp",
+        "PIL",
+        "numpy",
+        "rich",
+        "logging.handlers",
+    ),
 }
 LOADED = {"up": "uvloop", "master": "aiohttp", "robot": "websockets", "container": "psutil"}
 

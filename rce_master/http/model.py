@@ -1,0 +1,11 @@
+"""What the API's models have in common."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict
+
+
+class Model(BaseModel):
+    """A body. What validates and writes it is built at its first use: most masters use few of them."""
+
+    model_config = ConfigDict(defer_build=True)
