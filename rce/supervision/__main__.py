@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import signal
 import sys
 from typing import TYPE_CHECKING
 
@@ -65,5 +66,13 @@ def _complain(line: str) -> None:
     print(line, file=sys.stderr, flush=True)  # noqa: T201 - for whoever started it
 
 
+def main() -> int:
+    """Run the plan whose file is the first argument; returns the exit code."""
+    try:
+        return uvloop.run(run(Plan.take_over(int(sys.argv[1]))))
+    except KeyboardInterrupt:  # before signals are handled: nothing runs yet
+        return 128 + signal.SIGINT
+
+
 if __name__ == "__main__":
-    sys.exit(uvloop.run(run(Plan.take_over(int(sys.argv[1])))))
+    sys.exit(main())
