@@ -113,5 +113,5 @@ def _next(port: int, offset: int) -> int:
 
 
 def _program(name: str, module: str, document: dict[str, Any], *options: str) -> Program:
-    argv = [sys.executable, "-m", module, "--settings", json.dumps(document), *options]
+    argv = [sys.executable, "-P", "-m", module, "--settings", json.dumps(document), *options]
     return Program(name, argv, {WARNED_VARIABLE: "1"})

@@ -40,7 +40,7 @@ class Plan:
             # The command line is there for those who look for the process.
             os.execv(  # noqa: S606 - this interpreter
                 sys.executable,
-                [sys.executable, "-m", "rce.supervision", str(file.fileno()), *sys.argv],
+                [sys.executable, "-P", "-m", "rce.supervision", str(file.fileno()), *sys.argv],
             )
 
     @classmethod

@@ -56,6 +56,7 @@ class WorkerProcess:
             try:
                 self._process = await asyncio.create_subprocess_exec(
                     sys.executable,
+                    "-P",
                     "-m",
                     "rce_robot.conversion.worker",
                     str(theirs.fileno()),

@@ -53,7 +53,7 @@ async def rce_up(folder: Path, ports: list[int], *arguments: str) -> AsyncIterat
 def pid_of(folder: Path, module: str) -> int | None:
     for process in engine_processes(folder):
         with contextlib.suppress(psutil.NoSuchProcess, psutil.ZombieProcess):
-            if process.cmdline()[1:3] == ["-m", module]:
+            if process.cmdline()[1:4] == ["-P", "-m", module]:
                 return process.pid
     return None
 
@@ -107,3 +107,14 @@ async def test_a_bad_settings_file_lists_its_faults(folder: Path) -> None:
             await up.start(ready="RCE ready:")
     assert "master.http_port" in up.output()
     assert "robot.cuont" in up.output()
+
+
+async def test_programs_load_nothing_from_the_working_folder(folder: Path) -> None:
+    """``rce up`` starts in whatever folder its user is in; its files are not modules."""
+    (folder / "json.py").write_text("raise SystemExit('loaded from the working folder')\n")
+    (folder / "uvloop.py").write_text("raise SystemExit('loaded from the working folder')\n")
+    with contextlib.chdir(folder):
+        async with rce_up(folder, free_ports(5), "--runtime", "process") as up:
+            await up.start(ready="RCE ready:")
+            assert await up.stop() == 0
+    assert "loaded from" not in up.output()

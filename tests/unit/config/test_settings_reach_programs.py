@@ -76,7 +76,7 @@ def received(settings: EngineSettings) -> dict[str, EngineSettings]:
     """What each program reads from the command line that ``rce up`` gives it."""
     found = {}
     for program in programs(settings):
-        _, _, module, *arguments = program.argv
+        _, _, _, module, *arguments = program.argv
         options, app = APPS[module]
         context = typer.main.get_command(app).make_context(module, arguments)
         found[program.name] = options.read(module, context.params)
