@@ -207,6 +207,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     What podman keeps is the machine's; what a person finds out about the sandbox takes long.
     """
     for item in items:
+        if item.get_closest_marker("xdist_group"):
+            continue
         person = getattr(item, "callspec", None) and item.callspec.params.get("person")  # type: ignore[attr-defined]
         if any("podman" in marker.args for marker in item.iter_markers("needs")):
             item.add_marker(pytest.mark.xdist_group("podman"))

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[2]
 MOST_PACKAGES = 24
 """Distributions that the base brings, its own included; pip and setuptools are not counted."""
 
-pytestmark = [pytest.mark.e2e, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.e2e, pytest.mark.timeout(400), pytest.mark.xdist_group("base install")]
 
 ASK = """
 import asyncio

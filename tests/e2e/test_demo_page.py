@@ -189,7 +189,7 @@ async def test_the_page_on_a_phone() -> None:
         box = await page.locator("#map").bounding_box()
         assert box is not None
         assert box["width"] > 0.8 * PHONE["width"]
-        for button in await page.locator("button").all():
+        for button in await page.locator("button:visible").all():
             size = await button.bounding_box()
             assert size is not None
             assert size["height"] >= 30

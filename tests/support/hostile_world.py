@@ -395,7 +395,7 @@ class Hunger:
     async def _outcome(self) -> str:
         """Wait for the last word of the node, or for its end, or for its container's."""
         seen = ""
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 60
         while True:
             assert time.monotonic() < deadline, (
                 f"{self._thing}: no end ({seen[-300:]!r} {self._machine.faults})"

@@ -261,7 +261,8 @@ async def test_a_killed_node_says_by_what(machine: Machine) -> None:
     async with machine.engine():
         await machine.put(BOX, nodes=(own("talk.py"),))
         await machine.log_holds(BOX, "node", "hello")
-        os.kill(machine.node(BOX, "node").pid, signal.SIGSEGV)
+        node = await until(lambda: (one := machine.node(BOX, "node")) and one.pid and one)
+        os.kill(node.pid, signal.SIGSEGV)
         await machine.node_is(BOX, "node", NodeState.FAILED)
         text = (await read(machine, "node", LogStream.ENGINE)).text
         assert text.startswith("-- ended: killed by SIGSEGV")

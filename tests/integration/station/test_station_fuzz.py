@@ -8,6 +8,7 @@ from support.fuzzing import Tracebacks, exchange, requests
 from rce.web.server import HttpServer
 from rce_client.station.fleet_link import FleetLink
 from rce_client.station.live import Broadcast
+from rce_client.station.persons import SharedToken
 from rce_client.station.server import Station
 from rce_client.station.view import FleetView
 
@@ -41,7 +42,7 @@ class Planner(FleetLink):
 
 @pytest.mark.parametrize("login", [*LOGINS, [*LOGINS[0], *UPGRADE]])
 async def test_raw_requests_to_the_station(login: list[bytes]) -> None:
-    app = Station(FleetView(), Planner(), Broadcast(), token="token").make_app()
+    app = Station(FleetView(), Planner(), Broadcast(), entrance=SharedToken("token")).make_app()
     async with HttpServer(app, "127.0.0.1", 0) as server:
         port = int(server.url.rpartition(":")[2].rstrip("/"))
         with Tracebacks().watching() as log:
