@@ -125,11 +125,14 @@ def _containers(folder: Path) -> list[Path]:
 
 
 def _kill(traces: Traces, name: str) -> None:
+    found = False
     for process in traces.look():
         with contextlib.suppress(OSError):
             words = Path(f"/proc/{process.pid}/cmdline").read_bytes().split(b"\0")
-            if words[1:3] == [b"-m", name.encode()] and b"--end" not in words:
+            if words[1:4] == [b"-P", b"-m", name.encode()] and b"--end" not in words:
                 os.kill(process.pid, signal.SIGKILL)
+                found = True
+    assert found, f"{name} does not run"
 
 
 async def main(seed: int, count: int) -> int:
