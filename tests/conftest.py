@@ -201,6 +201,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         shutil.rmtree(session.config.option.basetemp, ignore_errors=True)
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest-xdist looks for the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Keep tests together, in one worker of a parallel run, that share what is made once or is the machine's.
 
