@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import signal
@@ -11,6 +12,7 @@ from contextlib import asynccontextmanager
 
 import aiohttp
 import msgspec
+import psutil
 import pytest
 from support.engine import Engine, running_engine, until
 from support.owner import Owner
@@ -42,6 +44,16 @@ def _runs(engine: Engine) -> bool:
     return bool(nodes) and bool(nodes[0]["pid"])
 
 
+def runs(engine: Engine, command: str) -> bool:
+    """Whether a command itself runs; not the tool that has it in its own command line."""
+    argv = command.split()
+    for process in engine.processes_of(command):
+        with contextlib.suppress(psutil.NoSuchProcess):
+            if process.cmdline() == argv:
+                return True
+    return False
+
+
 async def execute(owner: Owner, *words: str, typed: bytes = b"") -> tuple[int, bytes, bytes]:
     process = await owner.start("exec", *words)
     output, error = await process.communicate(typed)
@@ -70,14 +82,14 @@ async def test_commands_run_with_their_streams_and_exit_codes(runtime: str) -> N
         # What a command leaves in the background ends with it.
         code, _, _ = await execute(owner, "box", "sh", "-c", "sleep 4321 & sleep 4321 & echo")
         assert code == 0
-        await until(lambda: not engine.processes_of("sleep 4321"), what="nothing is left of the command")
+        await until(lambda: not runs(engine, "sleep 4321"), what="nothing is left of the command")
         # The pipe is not read: the command waits, and neither it nor the engine keeps much of what it writes.
         stuck = await owner.start("exec", "box", "yes")
         assert stuck.stdout is not None
         await stuck.stdout.read(1)
         stuck.kill()
         await stuck.wait()
-        await until(lambda: not engine.processes_of("yes"), what="the command ended with its user")
+        await until(lambda: not runs(engine, "yes"), what="the command ended with its user")
 
 
 @pytest.mark.parametrize("runtime", RUNTIMES)
@@ -103,9 +115,9 @@ async def test_a_shell_in_a_terminal(runtime: str) -> None:
         os.write(ours, b"echo $((6 * 7))x\n")
         await until(lambda: b"42x" in seen, timeout=30, what="an answer")
         os.write(ours, b"sleep 5432\n")
-        await until(lambda: engine.processes_of("sleep 5432"), what="the shell's command runs")
+        await until(lambda: runs(engine, "sleep 5432"), what="the shell's command runs")
         os.write(ours, b"\x03")  # Ctrl-C is the command's, not the tool's
-        await until(lambda: not engine.processes_of("sleep 5432"), what="the shell's command is interrupted")
+        await until(lambda: not runs(engine, "sleep 5432"), what="the shell's command is interrupted")
         os.write(ours, b"exit 3\n")
         assert await asyncio.wait_for(shell.wait(), 60) == 3
         loop.remove_reader(ours)
@@ -122,10 +134,10 @@ async def test_signals_reach_the_command() -> None:
         output, _ = await process.communicate()
         assert (process.returncode, output) == (9, b"caught\n")
         killed = await owner.start("exec", "box", "sleep", "6543")
-        await until(lambda: engine.processes_of("sleep 6543"), what="the command runs")
+        await until(lambda: runs(engine, "sleep 6543"), what="the command runs")
         killed.kill()
         await killed.wait()
-        await until(lambda: not engine.processes_of("sleep 6543"), what="it ended with its user")
+        await until(lambda: not runs(engine, "sleep 6543"), what="it ended with its user")
 
 
 @pytest.mark.parametrize("runtime", RUNTIMES)
@@ -157,7 +169,7 @@ async def test_parts_that_die_end_the_command_and_say_so() -> None:
             _, error = await asyncio.wait_for(process.communicate(), 60)
             assert process.returncode == 125
             assert b"the command has been ended" in error
-            await until(lambda: not engine.processes_of("sleep 7654"), what="nothing is left of it")
+            await until(lambda: not runs(engine, "sleep 7654"), what="nothing is left of it")
             await victim.start()
         await until(lambda: _again(owner), timeout=60, what="commands run again")
 
@@ -200,8 +212,8 @@ async def test_only_the_owner_and_administrators_run_commands() -> None:
                 assert b"as JSON text" in await socket.receive_bytes()
         # A login that ends takes its commands with it.
         process = await owner.start("exec", "box", "sleep", "8765")
-        await until(lambda: engine.processes_of("sleep 8765"), what="the command runs")
+        await until(lambda: runs(engine, "sleep 8765"), what="the command runs")
         await owner.rce("logout")
         _, error = await process.communicate()
         assert b"your login has ended" in error
-        await until(lambda: not engine.processes_of("sleep 8765"), what="it ended")
+        await until(lambda: not runs(engine, "sleep 8765"), what="it ended")

@@ -12,6 +12,7 @@ import fcntl
 import json
 import mmap
 import os
+import re
 import shutil
 import socket
 import struct
@@ -355,9 +356,7 @@ class Hunger:
             if thing in STARTED_BESIDE:
                 await self._start_another()
         found = {
-            "has": max(
-                (int(line.split()[1]) for line in text.splitlines() if line.startswith("has ")), default=0
-            ),
+            "has": max(map(int, re.findall(r"^has (\d+)$", text, re.MULTILINE)), default=0),
             "ended": self._end(text),
             "answers": answers,
             "tcp": (tcp_pages() - tcp) * mmap.PAGESIZE // MB,
@@ -404,17 +403,27 @@ class Hunger:
                 seen = await self._machine.log(self._id, "hog", -8192) or seen
             node = self._machine.node(self._id, "hog")
             is_over = node is not None and node.state is NodeState.FAILED
-            if '{"ended"' in seen or is_over or self._failures():
+            if '{"ended"' in seen or is_over or self._failures() or self._writes_no_more():
                 return seen
             await asyncio.sleep(0.05)
+
+    def _writes_no_more(self) -> bool:
+        """Whether the attack is that the environment, which writes the logs, stands still."""
+        if self._thing != "stop":
+            return False
+        try:
+            return _is_stopped(self._world.environment(self._id).pid)
+        except (AssertionError, LookupError, OSError, ValueError):  # it is being made
+            return False
 
     def _failures(self) -> int:
         return self._machine.manager._core.containers[self._id].failures
 
     def _end(self, text: str) -> str:
         for line in text.splitlines():
-            if line.startswith('{"ended"'):
-                return str(json.JSONDecoder().raw_decode(line)[0]["ended"])
+            _, begin, rest = line.partition('{"ended"')  # what processes write at once may share a line
+            if begin:
+                return str(json.JSONDecoder().raw_decode(begin + rest)[0]["ended"])
         return "the container died" if self._failures() else "killed"
 
 

@@ -8,7 +8,7 @@ import pytest
 from support.hostile_world import MEMORY_MB, MODULE, OUTSIDE, PROCESSES
 from support.persons import Person
 
-pytestmark = [pytest.mark.needs("bwrap")]
+pytestmark = [pytest.mark.needs("bwrap"), pytest.mark.xdist_group("starving")]
 
 KILLED, NO_SPACE, NO_MORE = {"killed"}, {"ENOSPC"}, {"EAGAIN"}
 OWN_PROCESSES = 4
