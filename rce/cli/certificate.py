@@ -26,7 +26,7 @@ def init(
     """Make an authority for this engine."""
     folder = _folder(certificates)
     _do(lambda: folder.make_authority(days))
-    typer.echo(f"made {folder.authority}: copy it to whoever connects")
+    typer.echo(f"made {folder.authority}: copy it to the machines that connect")
     typer.echo(f"made {folder.key(AUTHORITY)}: it signs certificates; keep it here and secret")
 
 

@@ -29,7 +29,7 @@ def relay(
         float | None, typer.Option(help="Let at most so many bytes pass per second.")
     ] = None,
     window: Annotated[float, typer.Option(help="Seconds over which --max-bytes is averaged.")] = 1.0,
-    lazy: Annotated[bool, typer.Option(help="Take messages only while somebody wants them.")] = False,
+    lazy: Annotated[bool, typer.Option(help="Take messages only while they are subscribed to.")] = False,
     latch: Annotated[bool, typer.Option(help="Keep the last message for later subscribers.")] = False,
     name: Annotated[str, typer.Option(help="Name of the node; default: one that nobody has.")] = "",
     master_uri: Annotated[str, typer.Option(help="The master; default: ROS_MASTER_URI.")] = "",

@@ -26,7 +26,7 @@ from rce.control.model import (
     EndpointUsage,
     LinkAddress,
 )
-from rce.control.tags import Unknown, names_of, unknown
+from rce.control.tags import TaggedReader
 
 CONTROL_VERSION = 2
 ACCEPTED_VERSIONS = (1, CONTROL_VERSION)
@@ -276,8 +276,6 @@ ToTaskSet = (
 )
 
 _encoder = msgspec.json.Encoder()
-_to_master: msgspec.json.Decoder[ToMaster] = msgspec.json.Decoder(ToMaster)
-_to_task_set: msgspec.json.Decoder[ToTaskSet] = msgspec.json.Decoder(ToTaskSet)
 
 
 def encode(message: ToMaster | ToTaskSet) -> str:
@@ -285,35 +283,7 @@ def encode(message: ToMaster | ToTaskSet) -> str:
     return _encoder.encode(message).decode()
 
 
-_NAMES_TO_MASTER = names_of(ToMaster)
-_NAMES_TO_TASK_SET = names_of(ToTaskSet)
-
-
-def decode_to_master(text: str | bytes) -> ToMaster | Unknown:
-    """Read a message that came from a task set.
-
-    Raises:
-        msgspec.ValidationError: It is none; the text names the place.
-    """
-    try:
-        return _to_master.decode(text)
-    except msgspec.ValidationError:
-        later = unknown(text, _NAMES_TO_MASTER)
-        if later is None:
-            raise
-        return later
-
-
-def decode_to_task_set(text: str | bytes) -> ToTaskSet | Unknown:
-    """Read a message that came from the master.
-
-    Raises:
-        msgspec.ValidationError: It is none; the text names the place.
-    """
-    try:
-        return _to_task_set.decode(text)
-    except msgspec.ValidationError:
-        later = unknown(text, _NAMES_TO_TASK_SET)
-        if later is None:
-            raise
-        return later
+decode_to_master = TaggedReader[ToMaster](ToMaster).read
+"""Read a message that came from a task set."""
+decode_to_task_set = TaggedReader[ToTaskSet](ToTaskSet).read
+"""Read a message that came from the master."""

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, get_args
+from collections.abc import Callable
+from typing import Any, Generic, NamedTuple, TypeVar, get_args
 
 import msgspec
 from msgspec import Struct
+
+T = TypeVar("T")
 
 
 class Unknown(NamedTuple):
@@ -18,26 +21,37 @@ class _Tagged(Struct):
     t: str
 
 
-_decode = msgspec.json.Decoder(_Tagged).decode
+_tag_of = msgspec.json.Decoder(_Tagged).decode
 
 
-def names_of(union: Any) -> frozenset[str]:
-    """Return the tags of a union of messages."""
-    return frozenset(kind.__name__ for kind in get_args(union))
-
-
-def unknown(text: str | bytes, names: frozenset[str]) -> Unknown | None:
-    """Look at a message that could not be read.
+class TaggedReader(Generic[T]):
+    """Reads the messages of a union, and tells those of a later release.
 
     Args:
-        text: The message.
-        names: The tags that are known.
-
-    Returns:
-        What it is if its tag is not known; None if it is simply wrong.
+        union: The union of :class:`msgspec.Struct` types, each tagged by its name.
     """
-    try:
-        name = _decode(text).t
-    except msgspec.MsgspecError:
-        return None
-    return None if name in names else Unknown(name[:100])
+
+    def __init__(self, union: Any) -> None:
+        self._decode: Callable[[str | bytes], T] = msgspec.json.Decoder(union).decode
+        self._names = frozenset(kind.__name__ for kind in get_args(union))
+
+    def read(self, text: str | bytes) -> T | Unknown:
+        """Read a message.
+
+        Raises:
+            msgspec.DecodeError: It is none; the text names the place.
+        """
+        try:
+            return self._decode(text)
+        except msgspec.ValidationError:
+            name = self._tag(text)
+            if name is None or name in self._names:
+                raise
+            return Unknown(name[:100])
+
+    @staticmethod
+    def _tag(text: str | bytes) -> str | None:
+        try:
+            return _tag_of(text).t
+        except msgspec.MsgspecError:
+            return None

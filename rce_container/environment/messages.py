@@ -12,7 +12,7 @@ from msgspec import Struct
 
 from rce.control.execution import Command
 from rce.control.model import EndpointSpec, EndpointStatus, InterfaceUsage, LinkAddress
-from rce.control.tags import Unknown, names_of, unknown
+from rce.control.tags import TaggedReader
 
 
 class Boot(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -144,38 +144,8 @@ ToManager = Report | Fault | Counters | Dial | Killed
 
 encode = msgspec.json.Encoder().encode
 """Write a message as JSON; holds no newline."""
-_to_environment: msgspec.json.Decoder[ToEnvironment] = msgspec.json.Decoder(ToEnvironment)
-_to_manager: msgspec.json.Decoder[ToManager] = msgspec.json.Decoder(ToManager)
-_NAMES_TO_ENVIRONMENT = names_of(ToEnvironment)
-_NAMES_TO_MANAGER = names_of(ToManager)
 decode_boot = msgspec.json.Decoder(Boot).decode
-
-
-def decode_to_environment(line: str | bytes) -> ToEnvironment | Unknown:
-    """Read a message that came from a manager.
-
-    Raises:
-        msgspec.DecodeError: It is none.
-    """
-    try:
-        return _to_environment.decode(line)
-    except msgspec.ValidationError:
-        later = unknown(line, _NAMES_TO_ENVIRONMENT)
-        if later is None:
-            raise
-        return later
-
-
-def decode_to_manager(line: str | bytes) -> ToManager | Unknown:
-    """Read a message that came from an environment.
-
-    Raises:
-        msgspec.DecodeError: It is none.
-    """
-    try:
-        return _to_manager.decode(line)
-    except msgspec.ValidationError:
-        later = unknown(line, _NAMES_TO_MANAGER)
-        if later is None:
-            raise
-        return later
+decode_to_environment = TaggedReader[ToEnvironment](ToEnvironment).read
+"""Read a message that came from a manager."""
+decode_to_manager = TaggedReader[ToManager](ToManager).read
+"""Read a message that came from an environment."""

@@ -89,7 +89,7 @@ async def set_password(call: Call) -> None:
     name = call.path("name")
     services = call.services
     if name != call.caller.name and not call.is_admin:
-        raise Forbidden("only an administrator changes somebody else's password")
+        raise Forbidden("only an administrator changes another user's password")
     if name not in services.realm.tables.users:
         raise NotFound(f"there is no user {name!r}")
     body = call.read(models.PasswordIn)
