@@ -193,12 +193,12 @@ class RobotSocket(GuardedConnection):
             self.receiver.on_part()
 
     def eof_received(self) -> bool | None:  # type: ignore[override]  # true keeps the transport, says asyncio
-        """Handle first what came before the end."""
-        if self._waits and self.transport.get_extra_info("sslcontext") is None:
-            self._eof = True
-            return True
-        super().eof_received()
-        return None
+        """Handle first what came before the end; over TLS only what has its turn before all is closed."""
+        if not self._waits:
+            super().eof_received()
+            return None
+        self._eof = True
+        return self.transport.get_extra_info("sslcontext") is None  # a TLS transport cannot be kept
 
     def process_event(self, event: Event) -> None:
         """Take complete data messages out of the base class's hands."""

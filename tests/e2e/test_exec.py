@@ -88,7 +88,7 @@ async def test_commands_run_with_their_streams_and_exit_codes(runtime: str) -> N
         assert stuck.stdout is not None
         await stuck.stdout.read(1)
         stuck.kill()
-        await stuck.wait()
+        await stuck.communicate()
         await until(lambda: not runs(engine, "yes"), what="the command ended with its user")
 
 
@@ -136,7 +136,7 @@ async def test_signals_reach_the_command() -> None:
         killed = await owner.start("exec", "box", "sleep", "6543")
         await until(lambda: runs(engine, "sleep 6543"), what="the command runs")
         killed.kill()
-        await killed.wait()
+        await killed.communicate()
         await until(lambda: not runs(engine, "sleep 6543"), what="it ended with its user")
 
 

@@ -11,7 +11,7 @@ import signal
 import ssl
 import sys
 import tempfile
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
@@ -222,6 +222,52 @@ async def test_robot_by_aiohttp_gets_its_message_back(world: World) -> None:
         await make_echo(socket)
         await await_message(socket, "over TLS")
         await socket.send_str(frame("DC", containerTag="echo"))
+
+
+class OneSegment:
+    """A TLS connection that gathers all that it sends until it is told to send."""
+
+    def __init__(self, world: World, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._in, self._out = ssl.MemoryBIO(), ssl.MemoryBIO()
+        self.tls = world.trusting().wrap_bio(self._in, self._out, server_hostname="127.0.0.1")
+        self._reader = reader
+        self._writer = writer
+
+    async def complete(self, step: Callable[[], Any]) -> Any:
+        """Do what needs the other end's answers."""
+        while True:
+            try:
+                return step()
+            except ssl.SSLWantReadError:
+                await self.send()
+                self._in.write(await self._reader.read(1 << 16))
+
+    async def send(self) -> None:
+        self._writer.write(self._out.read())
+        await self._writer.drain()
+
+
+@in_world
+async def test_a_robot_that_sends_much_and_ends_at_once_is_let_go(world: World) -> None:
+    """Its end arrives together with frames that have to wait for their turn."""
+    login = f"userID=testUser&robotID=hasty&password={hashlib.sha256(b'testUser').hexdigest()}"
+    head = (
+        f"GET /?{login} HTTP/1.1\r\nHost: 127.0.0.1:{world.robots}\r\n"
+        "Upgrade: websocket\r\nConnection: Upgrade\r\n"
+        "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+    )
+    reader, writer = await asyncio.open_connection("127.0.0.1", world.robots)
+    connection = OneSegment(world, reader, writer)
+    await connection.complete(connection.tls.do_handshake)
+    connection.tls.write(head.encode())
+    assert b" 101 " in await connection.complete(lambda: connection.tls.read(4096))
+    connection.tls.write(b"\x81\x82\0\0\0\0{}" * 2000)
+    with contextlib.suppress(ssl.SSLWantReadError):
+        connection.tls.unwrap()
+    await connection.send()
+    await world.says("robot_left testUser/hasty")
+    writer.close()
+    assert "Traceback" not in world.output()
 
 
 @in_world
