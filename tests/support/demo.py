@@ -19,6 +19,7 @@ from rce_client.demo.ports import Ports, option_of
 from support.engine import engine_processes, until
 from support.leaks import sweep_cgroups
 from support.ports import free_ports
+from support.processes import finish
 
 STOP_TIMEOUT_S = 120.0
 
@@ -69,9 +70,7 @@ async def run_headless(*options: object, timeout: float) -> tuple[int, dict[str,
         try:
             output, _ = await asyncio.wait_for(process.communicate(), timeout + STOP_TIMEOUT_S)
         finally:
-            if process.returncode is None:
-                process.kill()
-                await process.wait()
+            await finish(process)
         text = output.decode()
         found = json.loads(report.read_text()) if report.exists() else {}
         report.unlink(missing_ok=True)

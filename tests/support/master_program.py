@@ -10,6 +10,8 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
+from support.processes import finish
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -82,6 +84,5 @@ async def master(folder: Path, *args: str, end: signal.Signals = signal.SIGTERM)
         assert line.startswith("rce-master ready: http://127.0.0.1:"), line
         yield line.split()[-1]
     finally:
-        process.send_signal(end)
-        code = await process.wait()
-    assert code == (0 if end != signal.SIGKILL else -signal.SIGKILL)
+        await finish(process, end)
+    assert process.returncode == (0 if end != signal.SIGKILL else -signal.SIGKILL)

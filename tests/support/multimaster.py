@@ -17,6 +17,7 @@ from rce.ros.multimaster.settings import DiscoverySettings
 from rce.ros.multimaster.sync import MasterSync, SyncSettings
 from rce.ros.node import Node
 from support.ports import free_port
+from support.processes import finish
 
 STRING = "std_msgs/String"
 FAST = 10.0
@@ -110,9 +111,7 @@ async def process(*argv: str, env: dict[str, str]) -> AsyncIterator[asyncio.subp
     try:
         yield started
     finally:
-        if started.returncode is None:
-            started.kill()
-        await started.communicate()
+        await finish(started)
 
 
 @asynccontextmanager

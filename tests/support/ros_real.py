@@ -10,12 +10,11 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
-import psutil
-
 from rce.ros.core import Core
 from rce.ros.errors import XmlRpcError
 from rce.ros.xmlrpc import RpcClient
 from support.ports import free_port
+from support.processes import finish
 
 PATIENCE_S = 120.0
 """Seconds that a program of a real ROS may take: some start slowly."""
@@ -62,7 +61,7 @@ class Graph:
             async with asyncio.timeout(PATIENCE_S):
                 output, _ = await process.communicate(stdin.encode())
         finally:
-            await end(process, signal.SIGKILL)
+            await finish(process)
         text = output.decode(errors="replace")
         assert not check or process.returncode == 0, f"{' '.join(argv)}: {text}"
         return text
@@ -78,7 +77,7 @@ class Graph:
                 await self.until(lambda: self.node(node), what=f"{node} is registered")
             yield process
         finally:
-            await end(process, signal.SIGINT)
+            await interrupt(process)
 
     async def says(self, *argv: str, text: str, count: int = 1) -> str:
         """Run a program until it has printed ``text`` so many times; return what it printed."""
@@ -99,8 +98,7 @@ class Graph:
                     assert line, f"{argv} ended and printed {printed!r}"
                     printed += line.decode(errors="replace")
         finally:
-            await end(process, signal.SIGKILL)
-            await process.stdout.read()
+            await finish(process)
         return printed
 
     async def ask(self, method: str, *arguments: Any) -> Any:
@@ -138,23 +136,10 @@ class Graph:
         return found
 
 
-async def end(process: asyncio.subprocess.Process, number: signal.Signals) -> None:
-    """End a process that has a session of its own, and all of its children."""
-    if process.returncode is None:
-        family: list[psutil.Process] = []
-        with contextlib.suppress(psutil.NoSuchProcess):
-            family = psutil.Process(process.pid).children(recursive=True)
-        with contextlib.suppress(ProcessLookupError):
-            process.send_signal(number)
-        try:
-            async with asyncio.timeout(20):
-                await process.wait()
-        except TimeoutError:
-            process.kill()
-            await process.wait()
-        for child in family:
-            with contextlib.suppress(psutil.NoSuchProcess):
-                child.kill()
+async def interrupt(process: asyncio.subprocess.Process) -> None:
+    """End a program as Ctrl-C does; some of a real ROS's do not always end by that, and are killed."""
+    with contextlib.suppress(TimeoutError):
+        await finish(process, signal.SIGINT, patience=20)
 
 
 @contextlib.asynccontextmanager

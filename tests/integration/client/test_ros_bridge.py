@@ -12,6 +12,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from support.processes import finish
 
 from rce.ros.core import Core
 from rce.ros.node import Node
@@ -93,10 +94,7 @@ async def program(*arguments: str, master: str = "http://127.0.0.1:1/") -> Async
     try:
         yield Program(process)
     finally:
-        with contextlib.suppress(ProcessLookupError):
-            process.kill()
-        await process.wait()
-        process._transport.close()  # type: ignore[attr-defined]
+        await finish(process)
 
 
 def write(folder: Path, data: Any) -> str:

@@ -38,7 +38,7 @@ async def program(core: Core, exe: str, *arguments: str) -> AsyncIterator[asynci
     finally:
         if process.returncode is None:
             process.terminate()
-        assert await asyncio.wait_for(process.wait(), 15) == 0
+        assert await asyncio.wait_for(process.wait(), 60) == 0
 
 
 class Fleet:

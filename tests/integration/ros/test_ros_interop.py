@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.processes import finish
 
 from rce.ros.core import Core
 from rce.ros.errors import ServiceFault
@@ -76,12 +77,10 @@ async def tool(core: Core, *argv: str) -> str:
         *argv, env=environment(core), stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT
     )
     try:
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(60):
             output, _ = await process.communicate()
     finally:
-        if process.returncode is None:
-            process.kill()
-            await process.wait()
+        await finish(process)
     text = output.decode()
     assert process.returncode == 0, text
     return text

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import signal
 import subprocess
 import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-from support.ros_real import Graph, end
+from support.ros_real import Graph, interrupt
 
 from rce.ros.types import TypeRegistry
 
@@ -46,9 +45,7 @@ async def running(graph: Graph, *argv: str) -> AsyncIterator[Example]:
     try:
         yield Example(process)
     finally:
-        await end(process, signal.SIGINT)
-        assert process.stdout is not None
-        await process.stdout.read()
+        await interrupt(process)
 
 
 def example(graph: Graph, name: str, *arguments: str) -> contextlib.AbstractAsyncContextManager[Example]:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import signal
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
 import pytest
-from support.ros_real import PATIENCE_S, Graph, end
+from support.ros_real import PATIENCE_S, Graph, interrupt
 
 from rce.ros.errors import ServiceFault
 from rce.ros.node import Node, Publisher
@@ -51,7 +50,7 @@ async def running(graph: Graph, program: str, part: str) -> AsyncIterator[Progra
     try:
         yield Program(process.stdout)
     finally:
-        await end(process, signal.SIGINT)
+        await interrupt(process)
 
 
 async def until_set(node: Node, name: str, value: Any) -> None:

@@ -8,6 +8,7 @@ import random
 from typing import Any
 
 import pytest
+from support.processes import finish
 
 from rce.ros.tf import Buffer, Quaternion, StampedTransform, Transform, TransformError, Vector
 from rce.ros.types import Time
@@ -113,9 +114,7 @@ async def ask_tf2(trees: list[dict[str, Any]]) -> list[list[Any]]:
     try:
         output, _ = await asyncio.wait_for(process.communicate(json.dumps(trees).encode()), 50)
     finally:
-        if process.returncode is None:
-            process.kill()
-            await process.wait()
+        await finish(process)
     answers: list[list[Any]] = json.loads(output)
     return answers
 

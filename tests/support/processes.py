@@ -1,0 +1,86 @@
+"""Programs that tests start themselves, ended whatever they still print."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import sys
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import psutil
+
+from rce.ros.core import Core
+
+EXAMPLES = Path(__file__).parents[2] / "examples" / "ros"
+PATIENCE_S = 60.0
+
+
+async def finish(
+    process: asyncio.subprocess.Process,
+    number: signal.Signals = signal.SIGKILL,
+    *,
+    patience: float = PATIENCE_S,
+) -> bytes:
+    """End a program and its children, unless they have ended, and return what it still printed.
+
+    asyncio's ``wait()`` returns once the program's pipes are closed, which one that is not read may never be.
+
+    Args:
+        process: The program. No other task may read its output.
+        number: The signal that ends it.
+        patience: After so many seconds it is killed.
+
+    Raises:
+        TimeoutError: It had to be killed.
+    """
+    children = _children(process.pid) if process.returncode is None else []
+    if process.returncode is None:
+        with contextlib.suppress(ProcessLookupError):
+            process.send_signal(number)
+    try:
+        async with asyncio.timeout(patience):
+            output, _ = await process.communicate()
+    except TimeoutError:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        _kill(children)  # they may hold its output
+        await process.communicate()
+        raise
+    _kill(children)
+    return output or b""
+
+
+def _children(pid: int) -> list[psutil.Process]:
+    try:
+        return psutil.Process(pid).children(recursive=True)
+    except psutil.NoSuchProcess:
+        return []
+
+
+def _kill(processes: list[psutil.Process]) -> None:
+    for one in processes:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            one.kill()
+
+
+@contextlib.asynccontextmanager
+async def example(core: Core, name: str, *argv: str) -> AsyncIterator[asyncio.subprocess.Process]:
+    """Run an example node; at the end it is interrupted, if it still runs, and must leave cleanly."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable,
+        str(EXAMPLES / name),
+        *argv,
+        env=os.environ | {"ROS_MASTER_URI": core.uri},
+        stdout=asyncio.subprocess.PIPE,
+        start_new_session=True,
+    )
+    try:
+        yield process
+    except BaseException:
+        await finish(process)
+        raise
+    await finish(process, signal.SIGINT)
+    assert process.returncode == 0
