@@ -2,7 +2,8 @@
 
 An event loop's own ``create_connection`` is not used with names. uvloop's looks a name up in a future of its
 own; when the call is cancelled meanwhile (a timeout is enough), the lookup's failure is reported on stderr as
-an exception that was never retrieved.
+an exception that was never retrieved. And a program whose event loop looks a name up cannot end until the
+name server has answered (:mod:`rce.lookups`).
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ import asyncio
 import socket
 from typing import Any
 from urllib.parse import urlsplit
+
+from rce.lookups import LOOKUPS
 
 _PORTS = {"https": 443, "wss": 443}
 
@@ -31,7 +34,7 @@ async def resolve(host: str, port: int) -> list[Address]:
     found = _numeric(host, port)
     if found is not None:
         return [found]
-    infos = await asyncio.get_running_loop().getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    infos = await LOOKUPS.addresses(host, port)
     return [(socket.AddressFamily(family), address) for family, _, _, _, address in infos]
 
 

@@ -108,7 +108,9 @@ class App:
                 for one in runtimes.values():
                     stack.callback(one.close)
                 library = await asyncio.to_thread(self._library, state, tls)
-                reach = own_address(self.master, self.control_port) if is_any(self.host) else self.host
+                reach = self.host
+                if is_any(reach):
+                    reach = await own_address(self.master, self.control_port, quitting.told)
                 manager = Manager(
                     name=name,
                     info=_machine(self.settings, offers, limiter, detail),
@@ -202,7 +204,8 @@ class Quitting:
     """Hears signals from now on; a manager that comes later ends at once what an earlier one left."""
 
     def __init__(self) -> None:
-        self._event = asyncio.Event()
+        self.told = asyncio.Event()
+        """Set by the first signal."""
         self._manager: Manager | None = None
         for number in end_signals():
             asyncio.get_running_loop().add_signal_handler(number, self._on_signal)
@@ -210,12 +213,12 @@ class Quitting:
     def of(self, manager: Manager) -> asyncio.Event:
         """Return what tells a manager to end; a second signal makes it kill its containers."""
         self._manager = manager
-        return self._event
+        return self.told
 
     def _on_signal(self) -> None:
-        if self._event.is_set() and self._manager is not None:
+        if self.told.is_set() and self._manager is not None:
             self._manager.kill_all()
-        self._event.set()
+        self.told.set()
 
 
 def _machine(settings: ContainerSettings, offers: Offers, limiter: Limiter, detail: str) -> MachineInfo:

@@ -26,6 +26,7 @@ from rce.link import LinkHub
 from rce.link.address import in_url, is_any, own_address
 from rce.link.listening import listen_on
 from rce.link.unix import remove_stale_sockets, socket_name
+from rce.lookups import LOOKUPS
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce.supervision.signals import end_signals
@@ -73,21 +74,28 @@ class App:
         loop = asyncio.get_running_loop()
         for number in end_signals():
             loop.add_signal_handler(number, stop.set)
-        async with self.started(ready):
+        async with self.started(ready, stop):
             # What is there now stays; to look through it for garbage again and again takes 20 ms each time.
             gc.collect()
             gc.freeze()
             await stop.wait()
 
     @contextlib.asynccontextmanager
-    async def started(self, ready: Callable[[str], None]) -> AsyncIterator[None]:
-        """Run for as long as the context lasts."""
+    async def started(
+        self, ready: Callable[[str], None], stop: asyncio.Event | None = None
+    ) -> AsyncIterator[None]:
+        """Run for as long as the context lasts.
+
+        Args:
+            ready: As for :meth:`run`.
+            stop: Set when the context is to be left at once: nothing is waited for at its start then.
+        """
         settings = self.settings
         for_robots, for_task_sets = self.tls.for_clients(), self.tls.for_task_sets()
         machine = settings.machine or socket.gethostname()
         reach = settings.public_host or settings.host
         if is_any(reach):
-            reach = own_address(self.master, self.control_port)
+            reach = await own_address(self.master, self.control_port, stop)
         name = f"robot_{secrets.token_hex(4)}"
         packages = _package_index(self.packages)
         types = TypeRegistry(packages)
@@ -175,9 +183,7 @@ async def _listen(
 
 async def _bind(host: str, port: int) -> socket.socket:
     """Take the WebSocket port, so that its number is known before anything is told to the master."""
-    infos = await asyncio.get_running_loop().getaddrinfo(
-        host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-    )
+    infos = await LOOKUPS.addresses(host or None, port, flags=socket.AI_PASSIVE)
     family, _, _, _, address = infos[0]
     listener = socket.socket(family, socket.SOCK_STREAM)
     try:

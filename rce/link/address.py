@@ -2,22 +2,34 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import ipaddress
 import socket
+from typing import TYPE_CHECKING
+
+from rce.lookups import LOOKUPS
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine
 
 _SOMEWHERE = "192.0.2.1"
 """An address that nobody has (RFC 5737); the way to it is the way to everybody outside."""
 
 
-def own_address(master: str, port: int) -> str:
+async def own_address(master: str, port: int, hurry: asyncio.Event | None = None) -> str:
     """Return the address of this machine on the way to the master, or outside if the master is here.
 
-    Nothing is sent for it.
+    Nothing is sent for it but a question to the name server, if the master is given by name.
+
+    Args:
+        master: Host of the master.
+        port: Its port.
+        hurry: Once this is set, the answer to that question is not waited for.
     """
-    found = _address_towards(master, port)
+    found = await _unless(hurry or asyncio.Event(), _address_towards(master, port))
     if found is None or ipaddress.ip_address(found).is_loopback:
-        found = _address_towards(_SOMEWHERE, port)
+        found = await _address_towards(_SOMEWHERE, port)
     return found or "127.0.0.1"
 
 
@@ -31,10 +43,21 @@ def in_url(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-def _address_towards(host: str, port: int) -> str | None:
-    with contextlib.suppress(OSError):
-        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+async def _address_towards(host: str, port: int) -> str | None:
+    with contextlib.suppress(OSError, UnicodeError):
+        family, _, _, _, address = (await LOOKUPS.addresses(host, port, kind=socket.SOCK_DGRAM))[0]
         with socket.socket(family, socket.SOCK_DGRAM) as probe:
             probe.connect(address)
             return str(probe.getsockname()[0]).partition("%")[0]
     return None
+
+
+async def _unless(event: asyncio.Event, work: Coroutine[None, None, str | None]) -> str | None:
+    """Return the result of some work; None if an event is set before there is one."""
+    tasks = asyncio.ensure_future(work), asyncio.ensure_future(event.wait())
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        return tasks[0].result() if tasks[0].done() else None
+    finally:
+        for task in tasks:
+            task.cancel()

@@ -30,8 +30,8 @@ class Program:
     argv: Sequence[str]
     env: Mapping[str, str] = field(default_factory=dict)
     final: Sequence[str] = ()
-    """A command that removes what the program leaves if it is killed. It runs after the program's last end if
-    that was not a proper one, and also when the supervisor itself is killed."""
+    """A command that removes what the programs leave if they are killed. It runs after the last end of all if
+    one of them did not end properly, and also when the supervisor itself is killed."""
 
 
 class Supervisor:
@@ -84,9 +84,13 @@ class Supervisor:
             self._finals[program.name] = await FinalCommand.arm(program.final)
 
     async def _end_finally(self) -> None:
-        """Remove what programs left that did not end properly."""
+        """Remove what programs left that did not end properly.
+
+        One may have been killed before, and the next have ended before it removed what the first one left.
+        """
+        is_clean = not any(child.returncode for child in self._children.values())
         for name, final in self._finals.items():
-            if self._children[name].returncode == 0:
+            if is_clean:
                 await final.disarm()
             elif code := await final.run():
                 self._show(f"[up] what {name} left could not be removed: exit code {code}")

@@ -16,8 +16,11 @@ _INTERNET = (socket.AF_INET, socket.AF_INET6)
 
 
 def own_hosts(more: Iterable[str] = ()) -> tuple[str, ...]:
-    """Return this machine's names and addresses, and those of ``more`` that name a machine."""
-    found = ["localhost", "127.0.0.1", "::1", socket.gethostname(), socket.getfqdn()]
+    """Return this machine's names and addresses, and those of ``more`` that name a machine.
+
+    No name server is asked.
+    """
+    found = ["localhost", "127.0.0.1", "::1", socket.gethostname()]
     for addresses in psutil.net_if_addrs().values():
         found += [address.address for address in addresses if address.family in _INTERNET]
     return tuple(dict.fromkeys(host for host in (*found, *more) if _is_useful(host)))

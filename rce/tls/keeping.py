@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 from typing import TYPE_CHECKING
 
+from rce.lookups import LOOKUPS
 from rce.tls.exceptions import CertificateError
 
 if TYPE_CHECKING:
@@ -30,7 +31,8 @@ async def keep_certificates(settings: EngineSettings, say: Callable[[str], None]
     if not settings.tls.enabled:
         yield
         return
-    if done := await asyncio.to_thread(ensure, settings):
+    full_name = await LOOKUPS.own_name()
+    if done := await asyncio.to_thread(ensure, settings, full_name):
         say(done)
     task = asyncio.create_task(_keep(settings, say))
     try:
@@ -40,8 +42,12 @@ async def keep_certificates(settings: EngineSettings, say: Callable[[str], None]
         await asyncio.wait([task])
 
 
-def ensure(settings: EngineSettings) -> str:
+def ensure(settings: EngineSettings, full_name: str) -> str:
     """Make what is missing of the engine's certificates; blocks.
+
+    Args:
+        settings: Of the engine.
+        full_name: Of this machine.
 
     Returns:
         What was done, in words; empty if nothing.
@@ -55,14 +61,14 @@ def ensure(settings: EngineSettings) -> str:
     binds = (settings.master.bind, settings.robot.bind, settings.container.bind)
     named = (settings.master_host, settings.robot.public_host or "", *binds)
     folder = CertificateFolder(settings.certificates.absolute())
-    return folder.ensure(settings.tls.name, own_hosts(named))
+    return folder.ensure(settings.tls.name, own_hosts((full_name, *named)))
 
 
 async def _keep(settings: EngineSettings, say: Callable[[str], None]) -> None:
     while True:
         await asyncio.sleep(CHECK_EVERY_S)
         try:
-            done = await asyncio.to_thread(ensure, settings)
+            done = await asyncio.to_thread(ensure, settings, await LOOKUPS.own_name())
         except CertificateError as error:
             done = f"cannot renew certificates: {error}"
         if done:

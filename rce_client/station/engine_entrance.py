@@ -15,6 +15,7 @@ from typing import Any, Self
 import aiohttp
 from yarl import URL
 
+from rce.web.client import session_connector
 from rce_client.station.persons import Action, EntranceError, Person
 
 _log = logging.getLogger(__name__)
@@ -69,8 +70,7 @@ class EngineEntrance:
 
     async def __aenter__(self) -> Self:
         """Begin; the master need not be there."""
-        tls = self._account.tls
-        connector = aiohttp.TCPConnector(ssl=True if tls is None else tls)
+        connector = session_connector(self._account.tls)
         self._session = aiohttp.ClientSession(timeout=_TIMEOUT, connector=connector)
         self._writer = asyncio.create_task(self._write_notes())
         return self

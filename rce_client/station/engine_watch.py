@@ -12,6 +12,8 @@ from typing import Any
 import aiohttp
 from yarl import URL
 
+from rce.web.client import session_connector
+
 _log = logging.getLogger(__name__)
 
 POLL_S = 1.0
@@ -47,7 +49,7 @@ class EngineWatch:
 
     async def run(self) -> None:
         """Watch until cancelled; then give the token back."""
-        connector = aiohttp.TCPConnector(ssl=True if self._tls is None else self._tls)
+        connector = session_connector(self._tls)
         async with aiohttp.ClientSession(
             timeout=TIMEOUT, raise_for_status=True, connector=connector
         ) as session:

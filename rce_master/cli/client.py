@@ -14,6 +14,7 @@ import typer
 from rce.tls.exceptions import CertificateError
 from rce.tls.faults import explain_to_client
 from rce.tls.identity import client_context
+from rce.web.client import session_connector
 from rce_master.cli.exceptions import ApiError, CliError
 from rce_master.events import Event
 from rce_master.exceptions import MasterError
@@ -59,7 +60,7 @@ class ApiClient:
             tls = client_context(Path(self._authority) if self._authority else None)
         except CertificateError as error:
             raise CliError(str(error)) from error
-        connector = aiohttp.TCPConnector(ssl=True if tls is None else tls)
+        connector = session_connector(tls)
         self._session = aiohttp.ClientSession(headers=self._headers, timeout=timeout, connector=connector)
         return self
 

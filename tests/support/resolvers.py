@@ -58,7 +58,7 @@ async def silent_resolver(folder: Path) -> AsyncIterator[tuple[SilentResolver, l
     """Run a resolver; yields it and the words before a command that lets a program ask it. Needs root."""
     address = f"127.{random.randint(1, 254)}.{random.randint(1, 254)}.{random.randint(2, 254)}"
     config = folder / "resolv.conf"
-    config.write_text(f"nameserver {address}\noptions timeout:30 attempts:1\n")
+    config.write_text(f"nameserver {address}\noptions timeout:30 attempts:5\n")
     loop = asyncio.get_running_loop()
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.bind((address, 53))

@@ -9,6 +9,7 @@ from urllib.parse import urlsplit
 
 import psutil
 
+from rce.lookups import LOOKUPS
 from rce.ros.multimaster.errors import NoSuchInterface
 from rce.ros.node.settings import LOOPBACK, is_loopback
 
@@ -26,7 +27,7 @@ def split_group(text: str) -> tuple[str, str]:
     return group or DEFAULT_GROUP, interface
 
 
-def address_of(interface: str) -> str:
+async def address_of(interface: str) -> str:
     """Return the IPv4 address of an interface, given by its name, address or host name.
 
     Raises:
@@ -36,8 +37,9 @@ def address_of(interface: str) -> str:
         if entry.family == socket.AF_INET:
             return entry.address
     try:
-        address = socket.gethostbyname(interface)
-    except OSError as error:
+        infos = await LOOKUPS.addresses(interface, 0, family=socket.AF_INET)
+        address: str = infos[0][4][0]
+    except (OSError, UnicodeError) as error:
         raise NoSuchInterface(
             f"{interface!r} is neither an interface with an IPv4 address nor a host"
         ) from error
@@ -46,7 +48,7 @@ def address_of(interface: str) -> str:
     return address
 
 
-def own_address(interface: str, group: str, environ: Mapping[str, str] | None = None) -> str:
+async def own_address(interface: str, group: str, environ: Mapping[str, str] | None = None) -> str:
     """Return the address under which others see this machine.
 
     Args:
@@ -61,9 +63,9 @@ def own_address(interface: str, group: str, environ: Mapping[str, str] | None = 
     environ = os.environ if environ is None else environ
     named = interface or environ.get("ROS_IP", "")
     if named:
-        return address_of(named)
+        return await address_of(named)
     if hostname := environ.get("ROS_HOSTNAME", ""):
-        address = address_of(hostname)
+        address = await address_of(hostname)
         if not is_loopback(address):  # many systems say of their own name that it is on loopback
             return address
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:

@@ -120,7 +120,7 @@ class Discovery:
     async def __aenter__(self) -> Self:
         settings = self.settings
         group, interface = addresses.split_group(settings.mcast_group)
-        address = addresses.own_address(interface, group)
+        address = await addresses.own_address(interface, group)
         async with AsyncExitStack() as stack:
             self._rpc = await stack.enter_async_context(RpcClient())
             self._node = await stack.enter_async_context(self._make_node())

@@ -155,7 +155,7 @@ class GraphMember:
     # ------------------------------------------------------------------ life
 
     async def __aenter__(self) -> Self:
-        settings = self._settings
+        settings = self._settings = await self._settings.placed()
         async with AsyncExitStack() as stack:
             scratch = memoryview(bytearray(SCRATCH_SIZE))
             rpc = await stack.enter_async_context(RpcClient())

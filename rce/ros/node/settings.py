@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import ipaddress
 import os
 import socket
@@ -12,11 +13,14 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+from rce.lookups import LOOKUPS
 from rce.ros.logfiles import log_folder
 from rce.ros.names import Resolver, parse_arguments
 
 DEFAULT_MASTER_URI = "http://127.0.0.1:11311/"
 LOOPBACK = "127.0.0.1"
+_DISCARD = 9
+"""A port; that of no service."""
 EVERYWHERE = "0.0.0.0"  # noqa: S104 - nodes of other machines must reach it
 
 
@@ -27,9 +31,7 @@ class NodeSettings:
     resolver: Resolver
     master_uri: str
     host: str
-    """Name or address under which others reach the node."""
-    bind: str
-    """Address to listen on."""
+    """Name or address under which others reach the node; empty if the way to the master tells it."""
     parameters: Mapping[str, Any]
     """Private parameters to set: name without ``~`` to value."""
     log_file: Path | None = None
@@ -74,14 +76,21 @@ class NodeSettings:
             specials.get("__hostname")
             or specials.get("__ip")
             or environ.get("ROS_HOSTNAME")
-            or environ.get("ROS_IP")
-            or address_towards(master)
+            or environ.get("ROS_IP", "")
         )
-        bind = LOOPBACK if is_loopback(host) else EVERYWHERE
         parameters = {key: parse_value(text) for key, text in arguments.parameters.items()}
         log = specials.get("__log")
         log_file = log_folder(environ) / log if log else None  # a full path stays what it is
-        return cls(resolver, master, host, bind, parameters, log_file)
+        return cls(resolver, master, host, parameters, log_file)
+
+    @property
+    def bind(self) -> str:
+        """The address to listen on."""
+        return LOOPBACK if is_loopback(self.host) else EVERYWHERE
+
+    async def placed(self) -> NodeSettings:
+        """Return these settings with a host. The master's name may be looked up for it."""
+        return self if self.host else dataclasses.replace(self, host=await address_towards(self.master_uri))
 
 
 def anonymous_name(name: str) -> str:
@@ -100,7 +109,7 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def address_towards(uri: str) -> str:
+async def address_towards(uri: str) -> str:
     """Return the address of this machine that faces the server at ``uri``.
 
     A master on loopback means that the whole graph is on this machine: loopback then. Where that is not so
@@ -110,13 +119,13 @@ def address_towards(uri: str) -> str:
     host = urlsplit(uri).hostname or LOOPBACK
     if is_loopback(host):
         return LOOPBACK
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect((host, 9))
-            address: str = probe.getsockname()[0]
-        except OSError:
-            return socket.gethostname()
-    return address
+    try:
+        infos = await LOOKUPS.addresses(host, _DISCARD, family=socket.AF_INET, kind=socket.SOCK_DGRAM)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.connect(infos[0][4])
+            return str(probe.getsockname()[0])
+    except (OSError, UnicodeError):
+        return socket.gethostname()
 
 
 def parse_value(text: str) -> Any:

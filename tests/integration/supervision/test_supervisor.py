@@ -125,6 +125,21 @@ async def test_what_a_killed_program_leaves_is_removed_at_the_end(tmp_path: Path
     assert note.read_text() == "once\n"
 
 
+async def test_what_another_killed_program_leaves_is_removed_at_the_end(tmp_path: Path) -> None:
+    """One program's command also removes what is left of another one that ends before it has begun."""
+    note, gone = tmp_path / "note", asyncio.Event()
+    proper = (
+        "import signal, sys, time; signal.signal(signal.SIGTERM, lambda *_: sys.exit());"
+        "print('x ready: y', flush=True); time.sleep(1000)"
+    )
+    first = Program("killed", [sys.executable, "-c", READY])
+    second = Program("proper", [sys.executable, "-c", proper], final=["sh", "-c", f"echo once >> {note}"])
+    async with asyncio.timeout(60):
+        gone.set()
+        await run_until(Supervisor([first, second], print), gone)
+    assert note.read_text() == "once\n"
+
+
 async def test_a_program_that_ended_properly_needs_no_more(tmp_path: Path) -> None:
     note, done = tmp_path / "note", asyncio.Event()
     code = (

@@ -9,20 +9,24 @@ from rce.link import address
 from rce.link.address import in_url, is_any, own_address
 
 
-def test_a_master_on_the_same_machine_does_not_make_others_look_on_theirs(
+async def test_a_master_on_the_same_machine_does_not_make_others_look_on_theirs(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     ways = {"127.0.0.1": "127.0.0.1", "10.0.0.9": "10.0.0.2", "192.0.2.1": "10.0.0.7"}
-    monkeypatch.setattr(address, "_address_towards", lambda host, _: ways.get(host))
-    assert own_address("127.0.0.1", 8080) == "10.0.0.7"
-    assert own_address("10.0.0.9", 8080) == "10.0.0.2"
-    assert own_address("nowhere.example", 8080) == "10.0.0.7"
+
+    async def towards(host: str, _: int) -> str | None:
+        return ways.get(host)
+
+    monkeypatch.setattr(address, "_address_towards", towards)
+    assert await own_address("127.0.0.1", 8080) == "10.0.0.7"
+    assert await own_address("10.0.0.9", 8080) == "10.0.0.2"
+    assert await own_address("nowhere.example", 8080) == "10.0.0.7"
     ways.clear()
-    assert own_address("127.0.0.1", 8080) == "127.0.0.1"
+    assert await own_address("127.0.0.1", 8080) == "127.0.0.1"
 
 
-def test_the_address_is_one_of_this_machine() -> None:
-    found = own_address("127.0.0.1", 8080)
+async def test_the_address_is_one_of_this_machine() -> None:
+    found = await own_address("127.0.0.1", 8080)
     family = socket.AF_INET6 if ipaddress.ip_address(found).version == 6 else socket.AF_INET
     with socket.socket(family, socket.SOCK_DGRAM) as probe:
         probe.bind((found, 0))

@@ -15,16 +15,16 @@ def test_groups_with_interfaces() -> None:
     assert addresses.split_group("@eth0") == ("226.0.0.0", "eth0")
 
 
-def test_an_interface_can_be_named() -> None:
-    assert addresses.address_of("lo") == addresses.address_of("127.0.0.1") == "127.0.0.1"
+async def test_an_interface_can_be_named() -> None:
+    assert await addresses.address_of("lo") == await addresses.address_of("127.0.0.1") == "127.0.0.1"
     with pytest.raises(NoSuchInterface):
-        addresses.address_of("192.0.2.77")
+        await addresses.address_of("192.0.2.77")
 
 
-def test_the_environment_names_the_address() -> None:
-    assert addresses.own_address("", "226.0.0.0", {"ROS_IP": "127.0.0.1"}) == "127.0.0.1"
-    by_route = addresses.own_address("", "226.0.0.0", {})
-    assert addresses.own_address("", "226.0.0.0", {"ROS_HOSTNAME": "localhost"}) == by_route
+async def test_the_environment_names_the_address() -> None:
+    assert await addresses.own_address("", "226.0.0.0", {"ROS_IP": "127.0.0.1"}) == "127.0.0.1"
+    by_route = await addresses.own_address("", "226.0.0.0", {})
+    assert await addresses.own_address("", "226.0.0.0", {"ROS_HOSTNAME": "localhost"}) == by_route
 
 
 @pytest.mark.parametrize(

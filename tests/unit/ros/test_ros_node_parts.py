@@ -19,8 +19,8 @@ def gather(
     return NodeSettings.gather("node", namespace=namespace, argv=argv, environ=environ or {})
 
 
-def test_defaults() -> None:
-    settings = gather()
+async def test_defaults() -> None:
+    settings = await gather().placed()
     assert settings.master_uri == "http://127.0.0.1:11311/"
     assert settings.resolver.node_name == "/node"
     assert (settings.host, settings.bind) == ("127.0.0.1", "127.0.0.1")

@@ -1,0 +1,58 @@
+"""What HTTP clients of the engine connect by."""
+
+from __future__ import annotations
+
+import socket
+from typing import TYPE_CHECKING
+
+import aiohttp
+from aiohttp.abc import AbstractResolver, ResolveResult
+
+from rce.lookups import LOOKUPS
+
+if TYPE_CHECKING:
+    import ssl
+
+
+class NameResolver(AbstractResolver):
+    """Looks host names up without delaying the program's end (:mod:`rce.lookups`)."""
+
+    async def resolve(
+        self, host: str, port: int = 0, family: socket.AddressFamily = socket.AF_INET
+    ) -> list[ResolveResult]:
+        """Return the addresses of a host.
+
+        Raises:
+            OSError: The name cannot be resolved.
+        """
+        infos = await LOOKUPS.addresses(host, port, family=family, flags=socket.AI_ADDRCONFIG)
+        return [
+            ResolveResult(
+                hostname=host,
+                host=_text(family_, address),
+                port=port,
+                family=family_,
+                proto=protocol,
+                flags=socket.AI_NUMERICHOST | socket.AI_NUMERICSERV,
+            )
+            for family_, _, protocol, _, address in infos
+        ]
+
+    async def close(self) -> None:
+        """Do nothing: lookups belong to the program."""
+
+
+def session_connector(tls: ssl.SSLContext | None) -> aiohttp.TCPConnector:
+    """Return the connector for an ``aiohttp.ClientSession``, which closes it.
+
+    Args:
+        tls: Checks servers; None for the authorities that the system trusts.
+    """
+    return aiohttp.TCPConnector(ssl=True if tls is None else tls, resolver=NameResolver())
+
+
+def _text(family: int, address: tuple[str, int] | tuple[str, int, int, int]) -> str:
+    """Write an address; one of a link with its interface."""
+    if family == socket.AF_INET6 and len(address) == 4 and address[3] and "%" not in address[0]:  # noqa: PLR2004
+        return f"{address[0]}%{address[3]}"
+    return address[0]
