@@ -102,7 +102,7 @@ class ConverterForm:
         if self._element_size:
             return size > _MAX_LIGHT_ELEMENTS * self._element_size
         # A text beyond ASCII takes ten times as long; what leaves as binary values takes no time.
-        return size > _ANY_CHARACTERS and not self._holds_bytes and not bytes(payload[_FIXED:]).isascii()
+        return size > _ANY_CHARACTERS and not self._holds_bytes and not _is_ascii(payload)
 
     def read(self, msg: Any, warn: Callable[[str], None]) -> Buffer:
         """Serialize the object; fields that the message does not have are ignored with a warning."""
@@ -133,6 +133,16 @@ _MAX_LIGHT = 12 << 20
 _ANY_CHARACTERS = 1 << 20
 _FIXED = 64
 """Bytes at the beginning that may be numbers, such as a text's length."""
+
+
+_SLICE = 64 << 10
+"""Bytes of a payload that are looked at at a time: no large copy is made."""
+
+
+def _is_ascii(payload: Buffer) -> bool:
+    """Tell whether all that may be text is plain."""
+    view = memoryview(payload)
+    return all(bytes(view[i : i + _SLICE]).isascii() for i in range(_FIXED, len(view), _SLICE))
 
 
 def _element_size(kind: MessageType) -> int:

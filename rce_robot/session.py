@@ -29,6 +29,7 @@ from rce.protocol.messages import (
     type_of,
 )
 from rce.protocol.stream import Fault, LargeData, ProtocolStream
+from rce.protocol.weight import is_light, utf8_in_steps
 from rce_robot.exceptions import RobotError
 from rce_robot.outbox import Outbox, Overflow
 from rce_robot.outgoing import LatchedDelivery, Outgoing, Serialized
@@ -36,7 +37,7 @@ from rce_robot.websocket import LARGE_PART
 
 if TYPE_CHECKING:
     from collections import Counter
-    from collections.abc import Coroutine, Sequence
+    from collections.abc import Coroutine, Iterator, Sequence
 
     from rce.protocol.calls import CallId
     from rce.protocol.messages import Request
@@ -46,6 +47,9 @@ if TYPE_CHECKING:
     from rce_robot.websocket import RobotSocket
 
 _log = logging.getLogger(__name__)
+
+LARGE_TEXT = 1 << 20
+"""Texts from here on are handled in steps, between which other users have their turns, in bytes."""
 
 MAX_REASON = 100
 """Characters of a reason that a close frame has room for."""
@@ -270,14 +274,37 @@ class Session:
 
     # From the robot: rce_robot.websocket.Receiver
 
-    def on_text(self, text: bytes) -> None:
-        """Handle a text frame."""
-        for event in self._stream.feed_text(text, self._now()):
-            if type(event) is Fault and not _is_utf8(text):
-                self._socket.fail(CloseCode.INVALID_DATA, "a text frame is not UTF-8")
-                return
-            self._handle(event, len(text))
+    def on_text(self, text: bytes) -> Iterator[None] | None:
+        """Handle a text frame, a large one in steps."""
+        if len(text) >= LARGE_TEXT:
+            return self._handle_in_steps(text)
+        events = self._stream.feed_text(text, self._now())
+        if _has_fault(events) and not all(utf8_in_steps(text)):
+            self._refuse_text()
+        else:
+            self._handle_events(events, len(text))
+        return None
+
+    def _handle_in_steps(self, text: bytes) -> Iterator[None]:
+        light = is_light(text)
+        yield
+        events = self._stream.feed_text(text, self._now(), light=light)
+        yield
+        if _has_fault(events):
+            for valid in utf8_in_steps(text):
+                if not valid:
+                    self._refuse_text()
+                    return
+                yield
+        self._handle_events(events, len(text))
+
+    def _handle_events(self, events: Sequence[Event], size: int) -> None:
+        for event in events:
+            self._handle(event, size)
         self._look_at_pending()
+
+    def _refuse_text(self) -> None:
+        self._socket.fail(CloseCode.INVALID_DATA, "a text frame is not UTF-8")
 
     def on_binary(self, data: bytes) -> None:
         """Handle a binary frame."""
@@ -401,9 +428,5 @@ def _outgoing(message: ErrorReport | InterfaceStatus | LatchedSources) -> Outgoi
     return Outgoing(text.encode() if isinstance(text, str) else text)
 
 
-def _is_utf8(text: bytes) -> bool:
-    try:
-        text.decode()
-    except UnicodeDecodeError:
-        return False
-    return True
+def _has_fault(events: Sequence[Event]) -> bool:
+    return any(type(event) is Fault for event in events)

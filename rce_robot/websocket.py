@@ -15,7 +15,6 @@ The rule for writing is the transport's own: write while :attr:`RobotSocket.writ
 from __future__ import annotations
 
 import contextlib
-import math
 import socket
 import struct
 from collections import deque
@@ -24,27 +23,27 @@ from typing import TYPE_CHECKING, Protocol
 from websockets.frames import CloseCode, Frame, Opcode
 from websockets.protocol import State
 
-from rce.buffers import write_together
+from rce.buffers import unfilled, write_together
 from rce.guard.websocket import GuardedConnection
+from rce_robot.steps import LARGE_FRAME, Steps
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import Generator
+    from collections.abc import Iterator, Sequence
 
     from websockets.protocol import Event
-    from websockets.streams import StreamReader
 
     from rce.guard.loop_share import LoopShare
     from rce_robot.outgoing import Buffer, Outgoing
 
-LARGE_PART = 64 << 10
+LARGE_PART = LARGE_FRAME
 """Bytes of an incomplete message from which on the receiver is told of every part."""
-
-READS_PER_STEP = 4
-"""Reads of the parser before others may have their turn; a frame takes three or four."""
 
 MAX_FRAGMENTS = 4096
 """Frames that one message may be split into."""
+
+JOIN_PER_STEP = 1 << 20
+"""Bytes of a message in fragments that are joined before others may have their turn."""
 
 UNSENT_LOW_WATER = 256 << 10
 """Bytes that the kernel holds for a slow robot beyond what is on its way; more would only grow stale."""
@@ -62,8 +61,12 @@ _JOIN_BELOW = 16 << 10
 class Receiver(Protocol):
     """What a :class:`RobotSocket` tells of. All methods are called in the event loop and must not block."""
 
-    def on_text(self, text: bytes) -> None:
-        """A text message came; not yet checked to be UTF-8."""
+    def on_text(self, text: bytes) -> Iterator[None] | None:
+        """A text message came; not yet checked to be UTF-8.
+
+        Returns:
+            What is left to do, in steps between which others have their turns; None if nothing is.
+        """
 
     def on_binary(self, data: bytes) -> None:
         """A binary message came."""
@@ -89,7 +92,8 @@ class RobotSocket(GuardedConnection):
     @property
     def held(self) -> int:
         """Bytes of a message that is not complete, and of those that the network has not taken yet, about."""
-        incomplete = len(self.protocol.reader.buffer) + self._fragment_bytes + self._input_bytes
+        parts = self._steps.held + self._fragment_bytes + self._work_bytes
+        incomplete = len(self.protocol.reader.buffer) + self._input_bytes + parts
         return incomplete + self.transport.get_write_buffer_size()
 
     @property
@@ -125,6 +129,7 @@ class RobotSocket(GuardedConnection):
         self._failed = True
         self._fragments.clear()
         self._fragment_bytes = 0
+        self._forget_work()
         self._forget_input()
         if self.protocol.state is State.OPEN:
             self.protocol.fail(code, reason)
@@ -140,12 +145,15 @@ class RobotSocket(GuardedConnection):
         self._user = user
 
     def go_on(self) -> bool:
-        """Handle a few frames of what came; return whether there is more."""
+        """Handle a few frames of what came, or a part of a large one; return whether there is more."""
+        if self._work:
+            self._work_on()
+            return True
         data = self._input.popleft() if self._input else b""
         self._input_bytes -= len(data)
         self._steps.allow()
         super().data_received(data)
-        if self._input or self._steps.stopped:
+        if self._input or self._steps.stopped or self._work:
             return True
         self._end_of_input()
         return False
@@ -162,10 +170,13 @@ class RobotSocket(GuardedConnection):
         """Whether it waits for its turn."""
         self._paused_reading = False
         self._eof = False
-        self._steps = _Steps(self.protocol.reader)
-        self._fragments: list[bytes | bytearray] = []
+        self._steps = Steps(self.protocol.reader)
+        self._fragments: list[bytes] = []
         self._fragment_bytes = 0
         self._opcode = Opcode.TEXT
+        self._work: deque[tuple[Iterator[None], int]] = deque()
+        """Messages that are handled in steps, with their sizes; those behind them wait."""
+        self._work_bytes = 0
         self._failed = False
         sock = transport.get_extra_info("socket")
         if sock is not None and hasattr(socket, "TCP_NOTSENT_LOWAT") and sock.family != socket.AF_UNIX:
@@ -189,7 +200,7 @@ class RobotSocket(GuardedConnection):
         if not self._share.run(self._user, self) and not self.transport.is_closing():
             self._paused_reading = True
             self.transport.pause_reading()
-        if len(self.protocol.reader.buffer) > LARGE_PART and self.receiver is not None and not self._failed:
+        if self._steps.held > LARGE_PART and self.receiver is not None and not self._failed:
             self.receiver.on_part()
 
     def eof_received(self) -> bool | None:  # type: ignore[override]  # true keeps the transport, says asyncio
@@ -204,10 +215,14 @@ class RobotSocket(GuardedConnection):
         """Take complete data messages out of the base class's hands."""
         if type(event) is not Frame or event.opcode > Opcode.BINARY:
             super().process_event(event)
-        elif event.fin and event.opcode is not Opcode.CONT:
-            self._deliver(event.opcode, event.data)
+            return
+        data = self._steps.take()
+        if data is None:
+            data = bytes(event.data)
+        if event.fin and event.opcode is not Opcode.CONT:
+            self._deliver(event.opcode, data)
         else:
-            self._collect(event)
+            self._collect(event, data)
 
     def resume_writing(self) -> None:
         """Tell the receiver."""
@@ -217,6 +232,7 @@ class RobotSocket(GuardedConnection):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Tell the receiver."""
+        self._forget_work()
         self._forget_input()
         self._steps.allow(None)
         if self._share is not None:
@@ -244,66 +260,72 @@ class RobotSocket(GuardedConnection):
         if self._steps.stopped:
             self.protocol.reader.buffer.clear()
 
-    def _collect(self, frame: Frame) -> None:
+    def _collect(self, frame: Frame, data: bytes) -> None:
         if frame.opcode is not Opcode.CONT:
             self._opcode = frame.opcode
-        self._fragments.append(bytes(frame.data))
-        self._fragment_bytes += len(frame.data)
+        self._fragments.append(data)
+        self._fragment_bytes += len(data)
+        if self.protocol.current_size is not None:
+            self.protocol.current_size = self._fragment_bytes  # it was not told of large ones
         if len(self._fragments) > MAX_FRAGMENTS:
             self.fail(CloseCode.MESSAGE_TOO_BIG, "too many fragments")
         elif frame.fin:
-            data = b"".join(self._fragments)
-            self._fragments.clear()
-            self._fragment_bytes = 0
-            self._deliver(self._opcode, data)
+            fragments, self._fragments = self._fragments, []
+            size, self._fragment_bytes = self._fragment_bytes, 0
+            if size < JOIN_PER_STEP:
+                self._deliver(self._opcode, b"".join(fragments))
+            else:
+                self._add_work(self._join(self._opcode, fragments, size), size)
 
-    def _deliver(self, opcode: Opcode, data: Buffer) -> None:
+    def _join(self, opcode: Opcode, fragments: Sequence[bytes], size: int) -> Iterator[None]:
+        memory = unfilled(size)
+        filled = 0
+        with memory.getbuffer() as view:
+            for fragment in fragments:
+                for start in range(0, len(fragment), JOIN_PER_STEP):
+                    part = memoryview(fragment)[start : start + JOIN_PER_STEP]
+                    view[filled : filled + len(part)] = part
+                    filled += len(part)
+                    if filled // JOIN_PER_STEP > (filled - len(part)) // JOIN_PER_STEP:
+                        yield
+        yield from self._handle(opcode, memory.getvalue())
+
+    def _deliver(self, opcode: Opcode, data: bytes) -> None:
         if self._failed:
             return
         if self.receiver is None:
             self.fail(CloseCode.PROTOCOL_ERROR, "a message came before the handshake was answered")
-        elif opcode is Opcode.TEXT:
-            self.receiver.on_text(bytes(data))
-        else:
-            self.receiver.on_binary(bytes(data))
+        elif self._work:
+            self._add_work(self._handle(opcode, data), len(data))
+        elif opcode is not Opcode.TEXT:
+            self.receiver.on_binary(data)
+        elif (rest := self.receiver.on_text(data)) is not None:
+            self._add_work(rest, len(data))
 
+    def _handle(self, opcode: Opcode, data: bytes) -> Iterator[None]:
+        if self.receiver is None:
+            return
+        if opcode is not Opcode.TEXT:
+            self.receiver.on_binary(data)
+        elif (rest := self.receiver.on_text(data)) is not None:
+            yield from rest
 
-class _Steps:
-    """Lets the library's parser stop after a few frames; it goes on with the next data, or with none.
+    def _add_work(self, work: Iterator[None], size: int) -> None:
+        self._work.append((work, size))
+        self._work_bytes += size
 
-    Args:
-        reader: Where the parser reads.
-    """
+    def _work_on(self) -> None:
+        """Do a step of the oldest message."""
+        work, size = self._work[0]
+        for _ in work:
+            return
+        if self._work and self._work[0][0] is work:  # else the connection failed
+            self._work.popleft()
+            self._work_bytes -= size
 
-    def __init__(self, reader: StreamReader) -> None:
-        self._left: float = math.inf
-        self._reader = reader
-        self._read = reader.read_exact
-        self.stopped = False
-        """Whether the parser could go on."""
-        reader.read_exact = self._read_exact  # type: ignore[method-assign]  # the library makes the reader
-
-    def allow(self, reads: int | None = READS_PER_STEP) -> None:
-        """Let so many reads pass; None for any number."""
-        self._left = math.inf if reads is None else reads
-        self.stopped = False
-
-    def _read_exact(self, n: int) -> Generator[None, None, bytearray]:
-        self._left -= 1
-        while self._left < 0:
-            self.stopped = True
-            yield
-        reader = self._reader
-        if n < LARGE_PART:
-            return (yield from self._read(n))
-        while len(reader.buffer) < n and not reader.eof:
-            yield
-        if len(reader.buffer) < n:
-            return (yield from self._read(n))  # says what is wrong
-        data = reader.buffer  # taken as it is: a copy of a large message takes long
-        reader.buffer = data[n:]
-        del data[n:]
-        return data
+    def _forget_work(self) -> None:
+        self._work.clear()
+        self._work_bytes = 0
 
 
 def _add_frame(buffers: list[Buffer], first: int, head: bytes, body: Buffer) -> None:

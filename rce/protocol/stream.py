@@ -177,17 +177,21 @@ class ProtocolStream:
         """Take a frame as a WebSocket library gives it: ``str`` for text, ``bytes`` for binary."""
         return self.feed_text(frame, now) if isinstance(frame, str) else self.feed_binary(frame, now)
 
-    def feed_text(self, text: str | bytes, now: float) -> list[Event]:
+    def feed_text(self, text: str | bytes, now: float, *, light: bool | None = None) -> list[Event]:
         """Take a text frame.
 
         Args:
             text: Its text, or its UTF-8.
             now: Seconds on the caller's clock.
+            light: What :func:`~rce.protocol.weight.is_light` says of it; None if nobody has asked yet.
         """
         if len(text) > self._limits.max_text:
             return [self._too_long(text)]
-        if self._defer_large and isinstance(text, bytes) and not is_light(text):
-            return [self._defer(text)]
+        if self._defer_large and isinstance(text, bytes):
+            if light is None:
+                light = is_light(text)
+            if not light:
+                return [self._defer(text)]
         return self._feed_light(text, now)
 
     def _feed_light(self, text: str | bytes, now: float) -> list[Event]:

@@ -7,16 +7,22 @@ text is light, a heavy one may turn out not to be.
 
 from __future__ import annotations
 
+import codecs
 import re
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from rce.protocol.exceptions import MessageError
 from rce.protocol.messages import NO_ID
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 _SHORT = 8 << 10
 """Bytes up to which a text is light whatever it holds."""
 _SLICE = 64 << 10
 """Bytes that are counted at a time."""
+_CHECKED = 256 << 10
+"""Bytes that are checked to be UTF-8 at a time."""
 _MAX_OPENERS = 2048
 _MAX_COMMAS = 16384
 _MAX_ESCAPES = 16384
@@ -57,6 +63,23 @@ def is_light(text: bytes) -> bool:
         and _has_at_most(text, b"{", _MAX_OPENERS)
         and (size <= _ANY_CHARACTERS or (text.isascii() and _has_at_most(text, b"\\", _MAX_ESCAPES)))
     )
+
+
+def utf8_in_steps(text: bytes) -> Iterator[bool]:
+    """Check in steps of about a millisecond that a text is UTF-8.
+
+    Yields:
+        Whether it is as far as it was looked at; nothing after the first False.
+    """
+    decoder = codecs.getincrementaldecoder("utf-8")()
+    for start in range(0, len(text), _CHECKED):
+        end = start + _CHECKED
+        try:
+            decoder.decode(text[start:end], final=end >= len(text))
+        except UnicodeDecodeError:
+            yield False
+            return
+        yield True
 
 
 def check_elements(text: bytes, *, max_elements: int, max_values: int) -> None:

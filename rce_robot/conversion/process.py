@@ -10,6 +10,7 @@ import struct
 import sys
 from typing import TYPE_CHECKING
 
+from rce.buffers import unfilled
 from rce_robot.conversion.exceptions import ConversionFailed
 from rce_robot.conversion.jobs import HEAD, MAX_PARTS, decode_result, pack
 
@@ -148,7 +149,7 @@ class _PacketReader(asyncio.BufferedProtocol):
             )
 
     def _begin(self, size: int) -> None:
-        self._view = memoryview(bytearray(size))
+        self._view = unfilled(size).getbuffer() if size else memoryview(b"")
         self._filled = 0
 
     def _part_received(self, part: memoryview) -> None:

@@ -9,14 +9,18 @@ import struct
 from typing import TYPE_CHECKING, Any
 
 import psutil
+import pytest
 from support.cloud import DIGEST, running_cloud
 from support.engine import until
 from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed
 
 from rce_robot.conversion.pool import ConversionSettings
 from rce_robot.settings import SessionSettings
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
     from support.cloud import Cloud
 
 STRING = "std_msgs/String"
@@ -172,3 +176,51 @@ async def test_messages_that_are_compressed_are_refused() -> None:
             robot.transport.write(struct.pack("!BB", 0xC1, 0x80 | 2) + bytes(4) + b"{}")
             await asyncio.wait_for(robot.wait_closed(), 10)
             assert robot.close_code == 1002
+
+
+async def test_a_large_message_in_fragments_is_put_together() -> None:
+    """Fragments of all sizes, and a ping between them; a small message after it comes after it."""
+    async with running_cloud(PATIENT) as cloud:
+        end = await cloud.joined("tag", "SubscriberConverter", STRING)
+        async with dial(cloud, "testUser", "testRobot") as robot:
+            await end.active.until(lambda: end.is_active)
+            text = "x" * 5_000_000
+            whole = say(json.dumps({"data": text}))
+
+            async def pieces() -> AsyncIterator[str]:
+                yield whole[:10]
+                await robot.ping()
+                yield whole[10:100_000]
+                yield whole[100_000:4_500_000]
+                yield whole[4_500_000:]
+
+            await robot.send(pieces())
+            await robot.send(say('{"data":"after"}'))
+            async with asyncio.timeout(60):
+                first, second = await end.received.get(), await end.received.get()
+            assert first[4:] == text.encode()
+            assert second[4:] == b"after"
+
+
+async def test_fragments_over_the_longest_message_end_the_connection() -> None:
+    limit = 1 << 20
+
+    async def pieces() -> AsyncIterator[bytes]:
+        while True:
+            yield bytes(100_000)
+
+    async with (
+        running_cloud(SessionSettings(ping_interval=None, max_message=limit)) as cloud,
+        dial(cloud, "testUser", "testRobot") as robot,
+    ):
+        with pytest.raises(ConnectionClosed):
+            await asyncio.wait_for(robot.send(pieces()), 60)
+        await asyncio.wait_for(robot.wait_closed(), 60)
+        assert robot.close_code == 1009
+
+
+async def test_a_large_text_that_is_not_utf8_ends_the_connection() -> None:
+    async with running_cloud(PATIENT) as cloud, dial(cloud, "testUser", "testRobot") as robot:
+        await robot.send(b'"' + b"x" * 3_000_000 + b'\xff"', text=True)
+        await asyncio.wait_for(robot.wait_closed(), 60)
+        assert robot.close_code == 1007

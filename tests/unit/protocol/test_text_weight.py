@@ -13,7 +13,7 @@ from rce.protocol.exceptions import MessageError
 from rce.protocol.large import read_large
 from rce.protocol.messages import DataMessage
 from rce.protocol.stream import Fault, LargeData, ProtocolStream
-from rce.protocol.weight import Address, check_elements, find_address, is_light
+from rce.protocol.weight import Address, check_elements, find_address, is_light, utf8_in_steps
 
 STRING = "std_msgs/String"
 
@@ -105,3 +105,21 @@ def test_an_address_that_only_seems_to_be_one_is_refused() -> None:
     text = data_message({"data": "x"}, iTag="other")
     with pytest.raises(MessageError, match="'tag'"):
         read_large(text, {}, Address("tag"))
+
+
+@pytest.mark.parametrize(
+    ("text", "valid"),
+    [
+        (b"", True),
+        ("\xe4\u20ac\U0001f916".encode() * 200_000, True),
+        (b"x" * 1_000_000 + b"\xff", False),
+        (b"\xff" + b"x" * 1_000_000, False),
+        (b"x" * 1_000_000 + b"\xe2\x82", False),
+        (b"x" * (256 * 1024 - 1) + "\u20ac".encode(), True),
+    ],
+)
+def test_utf8_is_checked_in_steps(text: bytes, valid: bool) -> None:
+    steps = list(utf8_in_steps(text))
+    assert all(steps) == valid
+    assert len(steps) <= len(text) // (256 * 1024) + 1
+    assert not any(step is False for step in steps[:-1])
