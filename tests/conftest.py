@@ -215,6 +215,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.xdist_group("podman"))
         elif person:
             item.add_marker(pytest.mark.xdist_group(f"person {person}"))
+        elif _shares_with_its_module(item):
+            item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
+
+
+def _shares_with_its_module(item: pytest.Item) -> bool:
+    """Whether a test uses something that its module makes once."""
+    info = getattr(item, "_fixtureinfo", None)
+    made = info.name2fixturedefs.values() if info is not None else ()
+    return any(fixture[-1].scope == "module" for fixture in made)
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:

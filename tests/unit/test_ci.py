@@ -5,12 +5,30 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from support.ports import END, FIRST, free_ports, slice_of
 
 ROOT = Path(__file__).parents[2]
+
+TOGETHER = """
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    with Path("made").open("a") as file:
+        file.write(os.environ["PYTEST_XDIST_WORKER"] + "\\n")
+
+@pytest.mark.parametrize("number", range(6))
+def test_uses_it(made, number):
+    time.sleep(0.1)
+"""
 
 
 def run_ci(folder: Path, lint: int, tests: int) -> subprocess.CompletedProcess[str]:
@@ -43,3 +61,22 @@ def test_workers_have_ports_of_their_own() -> None:
     assert slice_of("", 1) == range(FIRST, END)
     found = free_ports(500)
     assert len(set(found)) == 500
+
+
+def test_a_parallel_run_makes_once_what_a_module_shares(tmp_path: Path) -> None:
+    shutil.copy(ROOT / "tests" / "conftest.py", tmp_path)
+    (tmp_path / "pytest.ini").write_text(f"[pytest]\npythonpath = {ROOT / 'tests'}\n")
+    (tmp_path / "test_together.py").write_text(TOGETHER)
+    environ = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+    environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-p", "xdist", "-n", "2", "--dist", "loadgroup"],
+        cwd=tmp_path,
+        env=environ,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout
+    assert "6 passed" in done.stdout
+    assert len((tmp_path / "made").read_text().split()) == 1
