@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from websockets.exceptions import InvalidHandshake, InvalidStatus, WebSocketException
 
 from rce.tls.faults import explain_to_client, find_tls_error
-from rce_client.exceptions import ClientError, InUseError, RefusedError, UnavailableError
+from rce_client.exceptions import ClientError, InUseError, RefusedError, UnavailableError, UntrustedError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -67,7 +67,7 @@ def judge(error: Exception) -> ClientError:
         return judge_status(response.status_code, body or response.reason_phrase)
     if why := explain_to_client(error):
         untrusted = isinstance(find_tls_error(error), ssl.SSLCertVerificationError)
-        return RefusedError(0, why) if untrusted else UnavailableError(why)
+        return UntrustedError(why) if untrusted else UnavailableError(why)
     if isinstance(error, (OSError, EOFError, InvalidHandshake, WebSocketException)):
         late = isinstance(error, TimeoutError)
         return UnavailableError("no answer in time" if late else str(error) or type(error).__name__)

@@ -23,7 +23,14 @@ from rce.protocol.stream import Fault
 from rce_client.courier import Courier, Target, Timing
 from rce_client.desired import Desired
 from rce_client.ends import ServiceClient, read_call_fault
-from rce_client.exceptions import InterfaceError, InUseError, LostError, NotConnectedError, RefusedError
+from rce_client.exceptions import (
+    InterfaceError,
+    InUseError,
+    LostError,
+    NotConnectedError,
+    RefusedError,
+    UntrustedError,
+)
 from rce_client.own_interfaces import OwnInterfaces
 from rce_client.reminder import Reminder
 from rce_client.requests import Requests
@@ -78,7 +85,7 @@ class Connection(Requests, OwnInterfaces):
         password: The user's password; only its SHA-256 is sent. Empty if there is a token.
         robot_id: Names this robot; one connection at a time.
         token: The robot's own token (``rce robot add``), in place of the user's password.
-        tls: TLS settings; the system's if None.
+        tls: TLS settings, or what gives them for each connection; the system's if None.
         on_error: Called with the text of every ``ER`` that belongs to no service call.
         on_state: Called with every new state and a few words.
         timing: Times and sizes.
@@ -93,7 +100,7 @@ class Connection(Requests, OwnInterfaces):
         robot_id: str,
         *,
         token: str = "",
-        tls: ssl.SSLContext | None = None,
+        tls: ssl.SSLContext | Callable[[], ssl.SSLContext] | None = None,
         on_error: Callable[[str], None] | None = None,
         on_state: Callable[[State, str], None] | None = None,
         timing: Timing | None = None,
@@ -272,8 +279,9 @@ class Connection(Requests, OwnInterfaces):
         self._set_state(State.CONNECTING, CONNECTING)
 
     def on_failure(self, error: ClientError) -> None:
-        """It failed. A program that does not listen is told in the log that its robotID is in use."""
-        if self.on_state is None and isinstance(error, InUseError) and self._reminder.is_due(str(error)):
+        """It failed. A program that does not listen is told in the log what only a person can repair."""
+        repairable = isinstance(error, (InUseError, UntrustedError))
+        if self.on_state is None and repairable and self._reminder.is_due(str(error)):
             _log.warning("%s: %s", self.robot_id, error)
         self._set_state(State.CONNECTING, str(error))
 

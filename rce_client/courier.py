@@ -19,13 +19,13 @@ from rce.protocol.limits import Limits
 from rce.protocol.stream import ProtocolStream
 from rce_client.backoff import Backoff, judge
 from rce_client.discovery import VERSION, locate
-from rce_client.exceptions import InUseError, LostError, RefusedError
+from rce_client.exceptions import InUseError, LostError, RefusedError, UntrustedError
 from rce_client.sendqueue import Parcel, QueueLimits, SendQueue
 from rce_client.socket import EngineSocket
 
 if TYPE_CHECKING:
     import ssl
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from rce.protocol.codec import Frame
     from rce.protocol.stream import Event
@@ -50,8 +50,16 @@ class Target:
     token: str = field(default="", repr=False)
     """The robot's own token, in place of its user's password."""
     version: str = VERSION
-    tls: ssl.SSLContext | None = None
-    """For ``https`` and ``wss``; the system's settings if None."""
+    tls: ssl.SSLContext | Callable[[], ssl.SSLContext] | None = None
+    """For ``https`` and ``wss``, or what gives it for each connection; the system's settings if None."""
+
+    def context(self) -> ssl.SSLContext | None:
+        """Return the TLS settings for the next connection.
+
+        Raises:
+            CertificateError: They cannot be made.
+        """
+        return self.tls() if callable(self.tls) else self.tls
 
     def handshake(self, *, header: bool) -> tuple[str, dict[str, str]]:
         """Return query and headers of the WebSocket handshake; the password itself never leaves this machine.
@@ -102,7 +110,7 @@ class Listener(Protocol):
         """An attempt to connect begins."""
 
     def on_failure(self, error: ClientError) -> None:
-        """It failed; another one follows unless the error is a :class:`RefusedError`."""
+        """It failed; another one follows, or :meth:`Courier.run` ends with this error."""
 
     def on_connected(self) -> None:
         """The connection is there; what is posted from now on is sent."""
@@ -131,6 +139,7 @@ class Courier:
         self._idle = asyncio.Event()
         self._idle.set()
         self.connected = False
+        self._was_connected = False
         self.features: frozenset[str] = frozenset()
         """What the endpoint of this connection knows beyond the first protocol."""
         self.dropped = self._queue.dropped
@@ -138,6 +147,9 @@ class Courier:
 
     async def run(self) -> None:
         """Connect again and again, until cancelled.
+
+        An engine that was connected before and cannot prove any more who it is (an expired certificate, for
+        example) is tried again: that ends no robot's program, and is repaired by the operator.
 
         Raises:
             RefusedError: The engine does not want this client.
@@ -150,7 +162,8 @@ class Courier:
             except Exception as raised:
                 error = judge(raised)
                 self._listener.on_failure(error)
-                if isinstance(error, RefusedError):
+                repairable = self._was_connected and isinstance(error, UntrustedError)
+                if isinstance(error, RefusedError) and not repairable:
                     raise error from raised
                 delay = next(delays)
                 await asyncio.sleep(min(delay, IN_USE_DELAY) if isinstance(error, InUseError) else delay)
@@ -202,9 +215,8 @@ class Courier:
 
     async def _dial(self) -> EngineSocket:
         target, timing = self._target, self._timing
-        found = await locate(
-            target.url, target.user, version=target.version, tls=target.tls, timeout=timing.locate
-        )
+        tls = target.context()
+        found = await locate(target.url, target.user, version=target.version, tls=tls, timeout=timing.locate)
         parts = urlsplit(found.url)
         query, headers = target.handshake(header=found.takes_header)
         async with asyncio.timeout(timing.open):
@@ -213,7 +225,7 @@ class Courier:
             urlunsplit(parts._replace(query=f"{query}&{FEATURES_KEY}={','.join(sorted(FEATURES))}")),
             sock=sock,
             additional_headers=headers,
-            ssl=(target.tls or True) if parts.scheme == "wss" else None,
+            ssl=(tls or True) if parts.scheme == "wss" else None,
             compression=None,  # costs more time than it saves for all but slow links
             proxy=None,
             max_size=timing.max_message,
@@ -229,7 +241,7 @@ class Courier:
 
     async def _use(self, socket: EngineSocket) -> LostError:
         """Send and receive until the connection ends; return why it did."""
-        self.connected = True
+        self.connected = self._was_connected = True
         told = socket.response.headers.get(FEATURES_HEADER, "") if socket.response is not None else ""
         self.features = FEATURES & set(told.split(","))
         error = LostError("the connection was closed")

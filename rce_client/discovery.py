@@ -16,7 +16,7 @@ import h11
 
 from rce.dialing import open_socket
 from rce_client.backoff import judge, judge_status
-from rce_client.exceptions import RefusedError, UnavailableError
+from rce_client.exceptions import RefusedError, UnavailableError, UntrustedError
 
 if TYPE_CHECKING:
     import ssl
@@ -55,8 +55,9 @@ async def locate(
         timeout: Seconds for the whole exchange.
 
     Raises:
-        RefusedError: The master does not take this client, or the URL is none, or one with ``https`` leads to
-            an endpoint without TLS.
+        RefusedError: The master does not take this client, or the URL is none.
+        UntrustedError: The master does not prove who it is, or a URL with ``https`` leads to an endpoint
+            without TLS.
         UnavailableError: It may on another attempt.
     """
     parts = urlsplit(url)
@@ -85,8 +86,7 @@ async def locate(
         raise judge(error) from error
     found = _read_answer(url, status, body)
     if parts.scheme == "https" and urlsplit(found.url).scheme != "wss":
-        raise RefusedError(
-            0,
+        raise UntrustedError(
             f"the master at {url} sends robots to {found.url}, which is not encrypted: what proves who"
             " this robot is would travel in clear; run rce-robot with --tls, or behind a proxy with"
             " --public-url wss://...",

@@ -4,6 +4,7 @@
 
     ClientError
     +-- RefusedError          the engine says no, and asking again will not help (credentials, version)
+    |   +-- UntrustedError    the engine cannot prove who it is: certificate, or no TLS where there was some
     +-- UnavailableError      nobody answers, or not now: worth another try
     |   +-- InUseError        another client has this robotID
     |   +-- LostError         the connection broke
@@ -35,6 +36,16 @@ class RefusedError(ClientError):
 
     def __str__(self) -> str:
         return f"refused ({self.status}): {self.reason}" if self.status else self.reason
+
+
+class UntrustedError(RefusedError):
+    """The engine does not prove who it is: its certificate is not good, or it offers no TLS where it must.
+
+    Nothing was told to it. A client that was connected before goes on trying, as the operator can repair it.
+    """
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(0, reason)
 
 
 class UnavailableError(ClientError):

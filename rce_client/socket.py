@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from websockets.asyncio.client import ClientConnection
+from rce.tls.websocket import TlsClientConnection
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -15,7 +15,7 @@ JOIN_BELOW = 64 << 10
 """Below this many bytes a copy costs less than another system call and another packet."""
 
 
-class EngineSocket(ClientConnection):
+class EngineSocket(TlsClientConnection):
     """A connection; made by ``websockets.asyncio.client.connect(create_connection=EngineSocket)``."""
 
     async def send_frames(self, frames: Sequence[Frame]) -> None:

@@ -165,6 +165,7 @@ class Master:
             port=settings.control_port,
             contents=self._contents.read,
             tls=for_task_sets.mutual_server if for_task_sets else None,
+            is_revoked=for_task_sets.is_revoked if for_task_sets else None,
             on_execution=services.executions.arrived,
         )
         http = HttpServer(app, settings.bind, settings.http_port, for_clients.server if for_clients else None)

@@ -51,21 +51,58 @@ def issue(
 
 
 @app.command()
-def show(certificates: Certificates = None) -> None:
-    """List certificates and when they expire."""
+def revoke(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="As it was issued.")],
+    certificates: Certificates = None,
+) -> None:
+    """Revoke all certificates of a name."""
+    folder = _folder(certificates)
+    added = _do(lambda: folder.revoke(name))
+    if not added:
+        typer.echo(f"the certificates of {name} were revoked before")
+        return
+    serials = ", ".join(f"{one.serial:x}" for one in added)
+    typer.echo(f"revoked {name} (serial number {serials}) in {folder.revoked}")
+    typer.echo(
+        "a master that uses this folder refuses it from now on; copy the file to the folders of other"
+        " machines. A machine that was stolen needs a new secret too: rce secret new"
+    )
+
+
+@app.command("list")
+def list_(certificates: Certificates = None) -> None:
+    """List certificates, when they expire, and what was revoked."""
     folder = _folder(certificates)
     found = list(folder.all())
     if not found:
         typer.echo(f"rce certificate: no certificates in {folder.path}; run: rce certificate init", err=True)
         raise typer.Exit(1)
-    width = max(len("NAME"), *(len(name) for name, _ in found))
-    typer.echo(f"{'NAME':<{width}}  {'EXPIRES':<10}  {'STATE':<16}  HOSTS")
+    revoked = {one.serial: one.since for one in _do(folder.revocations)}
+    owners = _do(folder.owners)
+    here: set[int] = set()
+    rows: list[tuple[str, str, str, str]] = []
     for name, details in found:
         if isinstance(details, str):
-            typer.echo(f"{name:<{width}}  {'-':<10}  {'unreadable':<16}  {details}")
+            rows.append((name, "-", "unreadable", details))
             continue
+        here.add(details.serial)
         hosts = "(authority)" if details.is_authority else ", ".join(details.hosts) or "-"
-        typer.echo(f"{name:<{width}}  {details.expires:%Y-%m-%d}  {_state(details):<16}  {hosts}")
+        since = revoked.get(details.serial)
+        state = _state(details) if since is None else f"revoked {since:%Y-%m-%d}"
+        rows.append((name, f"{details.expires:%Y-%m-%d}", state, hosts))
+    for serial, since in revoked.items():
+        if serial not in here:
+            row = owners.get(serial, "-"), "-", f"revoked {since:%Y-%m-%d}", f"(serial number {serial:x})"
+            rows.append(row)
+    width = max(len("NAME"), *(len(row[0]) for row in rows))
+    for name, expires, state, hosts in (("NAME", "EXPIRES", "STATE", "HOSTS"), *rows):
+        typer.echo(f"{name:<{width}}  {expires:<10}  {state:<18}  {hosts}")
+
+
+@app.command(hidden=True)
+def show(certificates: Certificates = None) -> None:
+    """List certificates, as ``list`` does."""
+    list_(certificates)
 
 
 def _state(details: Details) -> str:

@@ -34,6 +34,7 @@ from rce.control.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, MAX_QUEUED, MAX_TE
 from rce.dialing import open_url_socket
 from rce.tls.exceptions import CertificateError
 from rce.tls.faults import explain_to_client
+from rce.tls.websocket import TlsClientConnection
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -100,6 +101,8 @@ class TaskSetChannel:
         self._inbox: asyncio.Queue[ToTaskSet] = asyncio.Queue(MAX_QUEUED)
         self._socket: ClientConnection | None = None
         self._failures = 0
+        self._told = ""
+        """Why there was no connection, as the log has it."""
         self._handler_failed = False
         self._welcomed = asyncio.Event()
 
@@ -211,6 +214,7 @@ class TaskSetChannel:
                 ping_timeout=self._timeouts.ping_timeout,
                 close_timeout=self._timeouts.close,
                 max_size=MAX_FRAME,
+                create_connection=TlsClientConnection,
             ) as socket:
                 try:
                     await self._talk(socket)
@@ -230,13 +234,21 @@ class TaskSetChannel:
             _log.error("the master at %s refuses this task set: %s", self._url, error)
             return self._timeouts.backoff_refused
         except (OSError, TimeoutError, WebSocketException, CertificateError) as error:
-            why = explain_to_client(error)
-            level = (logging.INFO if why is None else logging.ERROR) if self._failures == 0 else logging.DEBUG
-            _log.log(level, "no connection to the master at %s: %s", self._url, why or error)
+            self._tell(error)
         if self._handler_failed:  # it may fail again, so not at once
             self._handler_failed = False
             return self._timeouts.backoff_refused
         return self._next_delay()
+
+    def _tell(self, error: Exception) -> None:
+        """Log why there is no connection: plainly at first, and whenever the reason is another one."""
+        why = explain_to_client(error)
+        words = why or str(error) or "no answer in time"
+        level = logging.INFO if why is None else logging.ERROR
+        if words == self._told:
+            level = logging.DEBUG
+        self._told = words
+        _log.log(level, "no connection to the master at %s: %s", self._url, words)
 
     def _next_delay(self) -> float:
         """Draw a wait below a bound that doubles (full jitter), so that task sets do not all dial at once."""
@@ -291,6 +303,7 @@ class TaskSetChannel:
             case Welcome():
                 _log.info("connected to master %s at %s", message.master, self._url)
                 self._failures = 0
+                self._told = ""
                 self._welcomed.set()
                 await self._inbox.put(message)
             case Refused():

@@ -11,6 +11,7 @@ from websockets.asyncio.client import connect
 from rce.control.execution import MAX_DATA, path_of
 from rce.control.timeouts import DEFAULT_TIMEOUTS, ControlTimeouts
 from rce.dialing import open_url_socket
+from rce.tls.websocket import TlsClientConnection
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -67,5 +68,6 @@ class RunDialer:
             close_timeout=self._timeouts.close,
             max_size=MAX_DATA + 2,
             max_queue=4,
+            create_connection=TlsClientConnection,
         ) as master:
             yield master

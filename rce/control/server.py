@@ -51,8 +51,8 @@ _log = logging.getLogger(__name__)
 STRANGERS_PER_ADDRESS = PER_ADDRESS
 """Connections from one address that have not shown the secret yet."""
 
-SECRET_CHECK_S = 1.0
-"""How often it is looked whether the secrets that were shown are still accepted."""
+PROOF_CHECK_S = 1.0
+"""How often it is looked whether the secrets and certificates that were shown are still accepted."""
 
 _GARBAGE, _POLICY, _INTERNAL, _GOING_AWAY = 1007, 1008, 1011, 1001
 _MAX_REASON = 123  # bytes of a WebSocket close frame's reason
@@ -77,6 +77,7 @@ class ControlServer:
         contents: Gives contents to task sets that ask for them (:mod:`rce.control.contents`).
         tls: Gives the TLS context for each connection, which demands the task sets' certificates; none for a
             plain channel.
+        is_revoked: Tells by its serial number whether a task set's certificate was revoked.
         on_execution: Takes a connection that a task set dialed for a run (:mod:`rce.control.execution`), and
             returns when it is done with it.
     """
@@ -94,10 +95,12 @@ class ControlServer:
         timeouts: ControlTimeouts = DEFAULT_TIMEOUTS,
         contents: ReadContent | None = None,
         tls: Context | None = None,
+        is_revoked: Callable[[int], bool] | None = None,
         on_execution: Callable[[str, ServerConnection], Awaitable[None]] | None = None,
     ) -> None:
         self._secret = secret
         self._tls = tls
+        self._is_revoked = is_revoked
         self._gate: TlsGate | None = None
         self._contents = contents
         self._on_execution = on_execution
@@ -146,7 +149,7 @@ class ControlServer:
             close_timeout=self._timeouts.close,
             max_size=MAX_FRAME,
         )
-        self._watcher = asyncio.create_task(self._watch_secret())
+        self._watcher = asyncio.create_task(self._watch_proofs())
         return self
 
     async def __aexit__(
@@ -160,15 +163,21 @@ class ControlServer:
             await self._gate.close()
         await self._server.wait_closed()
 
-    async def _watch_secret(self) -> None:
-        """End the connections of task sets that proved themselves by a secret that is accepted no more."""
+    async def _watch_proofs(self) -> None:
+        """End the connections of task sets whose secret or certificate is accepted no more."""
         while True:
-            await asyncio.sleep(SECRET_CHECK_S)
+            await asyncio.sleep(PROOF_CHECK_S)
             for socket, shown in list(self._shown.items()):
                 if not self._secret.matches(shown):
                     del self._shown[socket]
                     _log.info("the task set at %s must show the new secret", socket.remote_address)
                     await socket.close(_POLICY, "the engine's secret was changed; show the new one")
+                elif self._is_revoked is not None and self._is_revoked(_serial_of(socket)):
+                    del self._shown[socket]
+                    _log.warning(
+                        "the task set at %s is dropped: its certificate was revoked", socket.remote_address
+                    )
+                    await socket.close(_POLICY, "this task set's certificate was revoked")
 
     async def _admit(self, socket: ServerConnection, request: Request) -> Response | None:
         refusal = self._authenticate(socket, request)
@@ -291,6 +300,12 @@ class ControlServer:
                     _log.info("%r sent a %s, which this release does not know", peer, name)
                 case _:
                     await self._on_message(peer, message)
+
+
+def _serial_of(socket: ServerConnection) -> int:
+    """Return the serial number of a task set's certificate; 0 if it has shown none."""
+    shown = socket.transport.get_extra_info("peercert") or {}
+    return int(str(shown.get("serialNumber", "0")), 16)
 
 
 def _clip(reason: str) -> str:

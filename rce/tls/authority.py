@@ -29,7 +29,7 @@ CERTIFICATE_DAYS = 397
 """How long a certificate is valid; browsers accept no more of public authorities."""
 RENEWAL_DAYS = 30
 """A certificate with fewer days left is to be renewed."""
-_CLOCK_SKEW = timedelta(hours=1)
+CLOCK_SKEW = timedelta(hours=1)
 """Robots' clocks may be late."""
 _MAX_COMMON_NAME = 64
 _NAME_SIGNS = str.maketrans("", "", "-._*")
@@ -53,6 +53,8 @@ class Details:
     """Names and addresses that it is good for."""
     expires: datetime
     is_authority: bool
+    serial: int = 0
+    """By which it is revoked."""
 
     def days_left(self, now: datetime | None = None) -> float:
         """Return the days until it expires; negative afterwards."""
@@ -145,6 +147,7 @@ def read_details(pem: bytes) -> Details:
         hosts=tuple(hosts),
         expires=found.not_valid_after_utc,
         is_authority=is_authority,
+        serial=found.serial_number,
     )
 
 
@@ -174,7 +177,7 @@ def _builder(
         .issuer_name(issuer)
         .public_key(key)
         .serial_number(x509.random_serial_number())
-        .not_valid_before(min(now, end) - _CLOCK_SKEW)
+        .not_valid_before(min(now, end) - CLOCK_SKEW)
         .not_valid_after(end if latest is None else min(end, latest))
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
     )

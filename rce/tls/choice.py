@@ -81,8 +81,8 @@ class TlsChoice:
         return identity
 
     def _own(self) -> TlsFiles:
-        authority = self.folder / "authority.pem"
-        return TlsFiles(self.folder / f"{self.name}.pem", self.folder / f"{self.name}.key", authority)
+        certificate, key = self.folder / f"{self.name}.pem", self.folder / f"{self.name}.key"
+        return TlsFiles(certificate, key, self.folder / "authority.pem", self.folder / "revoked.pem")
 
 
 def plain_warning(what: str, *hosts: str) -> str | None:

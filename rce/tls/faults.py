@@ -3,18 +3,37 @@
 from __future__ import annotations
 
 import ssl
+from datetime import UTC, datetime
 
+_PLAIN = (
+    "the server does not speak TLS at this port; remove --tls, or use http:// (ws://), where the network is"
+    " trusted, or start the engine with --tls"
+)
+_FOREIGN = (
+    "the server does not trust our certificate: another authority issued it; issue one with the server's"
+    " authority (rce certificate issue NAME), and copy it with its key here"
+)
+_OWN_EXPIRED = (
+    "our certificate has expired; renew it where its authority is (rce certificate issue NAME), and copy it"
+    " with its key here"
+)
+_OWN_REVOKED = (
+    "our certificate was revoked; if that is an error, issue another one (rce certificate issue NAME), and"
+    " copy it with its key here"
+)
 _AT_CLIENTS = {
-    "WRONG_VERSION_NUMBER": "the server does not speak TLS at this port; start the engine with --tls,"
-    " or use http:// where the network is trusted",
-    "RECORD_LAYER_FAILURE": "the server does not speak TLS at this port; start the engine with --tls,"
-    " or use http:// where the network is trusted",
-    "TLSV13_ALERT_CERTIFICATE_REQUIRED": "the server demands a certificate of its authority;"
-    " issue one (rce certificate issue NAME), copy it with its key and authority.pem here, start with --tls",
-    "TLSV1_ALERT_UNKNOWN_CA": "the server does not trust our certificate: another authority issued it;"
-    " issue one with the server's authority (rce certificate issue NAME)",
-    "SSLV3_ALERT_CERTIFICATE_EXPIRED": "our certificate has expired; renew it: rce certificate issue NAME",
-    "TLSV1_ALERT_DECRYPT_ERROR": "the server does not trust our certificate: another authority issued it",
+    "WRONG_VERSION_NUMBER": _PLAIN,
+    "RECORD_LAYER_FAILURE": _PLAIN,
+    "HTTP_REQUEST": _PLAIN,
+    "TLSV13_ALERT_CERTIFICATE_REQUIRED": "the server demands a certificate of its authority, which task sets"
+    " have and robots do not; is this port the right one? For a task set: issue one (rce certificate issue"
+    " NAME), copy it with its key and authority.pem here, and start with --tls",
+    "TLSV1_ALERT_UNKNOWN_CA": _FOREIGN,
+    "TLSV1_ALERT_DECRYPT_ERROR": _FOREIGN,
+    "SSLV3_ALERT_CERTIFICATE_EXPIRED": _OWN_EXPIRED,
+    "SSLV3_ALERT_CERTIFICATE_REVOKED": _OWN_REVOKED,
+    "SSLV3_ALERT_BAD_CERTIFICATE": "the server does not accept our certificate; look at the server's log, and"
+    " at the clocks of both machines",
 }
 _AT_SERVERS = {
     "HTTP_REQUEST": "it speaks plain HTTP at a TLS port",
@@ -23,8 +42,14 @@ _AT_SERVERS = {
     "TLSV1_ALERT_UNKNOWN_CA": "it does not trust our certificate: it has another authority, or none",
     "SSLV3_ALERT_BAD_CERTIFICATE": "it does not accept our certificate",
     "SSLV3_ALERT_CERTIFICATE_UNKNOWN": "it does not accept our certificate",
-    "SSLV3_ALERT_CERTIFICATE_EXPIRED": "our certificate has expired; renew it: rce certificate issue NAME",
+    "SSLV3_ALERT_CERTIFICATE_EXPIRED": _OWN_EXPIRED,
+    "SSLV3_ALERT_CERTIFICATE_REVOKED": _OWN_REVOKED,
     "CERTIFICATE_VERIFY_FAILED": "its certificate is not one of the engine's authority",
+}
+_BAD_AT_SERVERS = {
+    "certificate has expired": "its certificate has expired; renew it: rce certificate issue NAME",
+    "certificate revoked": "its certificate was revoked",
+    "certificate is not yet valid": "its certificate is not yet valid; look at the clocks of both machines",
 }
 _DEPTH = 5
 
@@ -46,22 +71,40 @@ def explain_to_client(error: BaseException) -> str | None:
     """Say why a server cannot be talked to; None if TLS is not the reason."""
     found = find_tls_error(error)
     if isinstance(found, ssl.SSLCertVerificationError):
-        said = getattr(found, "verify_message", str(found))
-        if "expired" in said:
-            return "the server's certificate has expired; renew it there: rce certificate issue NAME"
-        if "not valid for" in said or "mismatch" in said.lower():
-            return (
-                f"the server's certificate is for another name ({said.rstrip('.')});"
-                " issue it with that name: rce certificate issue NAME --host HOST"
-            )
-        return (
-            f"the server's certificate is not trusted ({said}); give its engine's authority.pem:"
-            " --authority FILE, or to task sets --certificates FOLDER"
-        )
+        return _explain_server(getattr(found, "verify_message", str(found)))
     if found is None:
         return None
     reason = getattr(found, "reason", "")
     return _AT_CLIENTS.get(reason, f"TLS failed: {reason or found}")
+
+
+def _explain_server(said: str) -> str:
+    """Say what is wrong with a server's certificate, of which OpenSSL said so much."""
+    if "expired" in said:
+        return (
+            "the server's certificate has expired; renew it there: rce certificate issue NAME"
+            f" (the clock here says {_clock()})"
+        )
+    if "not yet valid" in said:
+        return (
+            f"the server's certificate is not yet valid: the clock here says {_clock()}; set the clock of"
+            " this machine, or that of the machine that issued the certificate"
+        )
+    if "revoked" in said:
+        return "the server's certificate was revoked; issue it anew there: rce certificate issue NAME"
+    if "not valid for" in said or "mismatch" in said.lower():
+        return (
+            f"the server's certificate is for another name ({said.rstrip('.')});"
+            " issue it with that name: rce certificate issue NAME --host HOST"
+        )
+    return (
+        f"the server's certificate is not trusted ({said}); give its engine's authority.pem:"
+        " --authority FILE, or to task sets --certificates FOLDER"
+    )
+
+
+def _clock() -> str:
+    return f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
 
 
 def explain_to_server(error: BaseException) -> str:
@@ -74,5 +117,6 @@ def explain_to_server(error: BaseException) -> str:
     reason = getattr(found, "reason", "")
     text = _AT_SERVERS.get(reason, f"TLS failed: {reason or found}")
     if isinstance(found, ssl.SSLCertVerificationError):
-        return f"{text} ({getattr(found, 'verify_message', found)})"
+        said = getattr(found, "verify_message", str(found))
+        return _BAD_AT_SERVERS.get(said, f"{text} ({said})")
     return text

@@ -1,7 +1,8 @@
 """The folder ``certificates/`` with an engine's authority and what it has issued.
 
-It holds ``authority.pem``, ``authority.key``, and ``NAME.pem`` with ``NAME.key`` for each name. Only its
-owner may enter it. A machine that issues nothing has no ``authority.key``.
+It holds ``authority.pem``, ``authority.key``, and ``NAME.pem`` with ``NAME.key`` for each name; beside them
+what was issued and what was revoked (:mod:`rce.tls.revocation`). Only its owner may enter it. A machine that
+issues nothing has no ``authority.key``.
 """
 
 from __future__ import annotations
@@ -11,8 +12,11 @@ import os
 import re
 import stat
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import msgspec
 
 from rce.tls.authority import (
     AUTHORITY_DAYS,
@@ -26,11 +30,16 @@ from rce.tls.authority import (
     read_details,
 )
 from rce.tls.exceptions import CertificateError
+from rce.tls.revocation import Record, Revocation, make_list, read_list
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
 AUTHORITY = "authority"
+REVOKED = "revoked"
+"""Name of the file with the list of revoked certificates, without its suffix."""
+_KEPT_NAMES = AUTHORITY, REVOKED
+_RECORDS = "issued.jsonl"
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,62}")
 
 
@@ -53,6 +62,11 @@ class CertificateFolder:
         """The authority's certificate, which clients need."""
         return self.certificate(AUTHORITY)
 
+    @property
+    def revoked(self) -> Path:
+        """The list of what the authority has revoked; there is none before the first."""
+        return self.certificate(REVOKED)
+
     def has(self, name: str) -> bool:
         """Tell whether a certificate and its key are there."""
         return self.certificate(name).exists() and self.key(name).exists()
@@ -68,6 +82,8 @@ class CertificateFolder:
                 f"there is an authority in {self.path} already; all certificates that it issued depend on it"
             )
         self._write(AUTHORITY, make_authority(days))
+        for file in (self.revoked, self.path / _RECORDS):  # of a former authority
+            file.unlink(missing_ok=True)
 
     def issue(self, name: str, hosts: Iterable[str] = (), days: float = CERTIFICATE_DAYS) -> Details:
         """Issue a certificate, or renew it: programs that run load the new one by themselves.
@@ -84,24 +100,74 @@ class CertificateFolder:
         Raises:
             CertificateError: The name cannot be used, no authority is here, or a file cannot be written.
         """
-        if not _NAME.fullmatch(name) or name == AUTHORITY:
+        if not _NAME.fullmatch(name) or name in _KEPT_NAMES:
             raise CertificateError(
                 f"{name!r} cannot be a certificate's name: use up to 63 letters, digits, '.', '_' and '-',"
-                f" and not {AUTHORITY!r}"
+                f" and not {' or '.join(map(repr, _KEPT_NAMES))}"
             )
-        if not self.has(AUTHORITY):
-            raise CertificateError(
-                f"there is no authority with its key in {self.path}; make one: rce certificate init"
-            )
+        self._need_authority()
         hosts = tuple(hosts)
         if not hosts:
             with contextlib.suppress(CertificateError):
                 hosts = self.details(name).hosts
         if not hosts:
             hosts = (name,)
-        authority = Issued(_read(self.authority), _read(self.key(AUTHORITY)))
-        self._write(name, issue(authority, name, hosts, days))
+        issued = issue(self._authority(), name, hosts, days)
+        self._record(name, read_details(issued.certificate))
+        self._write(name, issued)
         return self.details(name)
+
+    def revoke(self, name: str) -> list[Revocation]:
+        """Revoke all certificates of a name; programs that check the list load it by themselves.
+
+        Returns:
+            Those that were not revoked before.
+
+        Raises:
+            CertificateError: The name has no certificate here, no authority is here, or a file cannot be read
+                or written.
+        """
+        self._need_authority()
+        serials = {int(record.serial, 16) for record in self._records() if record.name == name}
+        if name not in _KEPT_NAMES and self.certificate(name).exists():
+            if not is_signed_by(_read(self.certificate(name)), _read(self.authority)):
+                raise CertificateError(
+                    f"another authority issued {self.certificate(name)}: revoke it where that authority is"
+                )
+            serials.add(self.details(name).serial)
+        if not serials:
+            raise CertificateError(
+                f"no certificate {name!r} was issued in {self.path}; see: rce certificate list"
+            )
+        known = self.revocations()
+        now = datetime.now(UTC)
+        added = [Revocation(serial, now) for serial in sorted(serials - {one.serial for one in known})]
+        if added:
+            text = make_list(self._authority(), [*known, *added])
+            with self._writing():
+                _write_private(self.revoked, text)
+        return added
+
+    def revocations(self) -> list[Revocation]:
+        """Return what was revoked, oldest first.
+
+        Raises:
+            CertificateError: The list cannot be read.
+        """
+        if not self.revoked.exists():
+            return []
+        try:
+            return read_list(_read(self.revoked), _read(self.authority))
+        except CertificateError as error:
+            raise CertificateError(f"{self.revoked}: {error}") from error
+
+    def owners(self) -> dict[int, str]:
+        """Return the names of all certificates that were issued here and have not expired, by serial number.
+
+        Raises:
+            CertificateError: What was recorded cannot be read.
+        """
+        return {int(record.serial, 16): record.name for record in self._records()}
 
     def ensure(self, name: str, hosts: Iterable[str]) -> str:
         """Have an authority and a certificate that is good for ``hosts`` and not about to expire.
@@ -122,7 +188,8 @@ class CertificateFolder:
             return f"issued the certificate {name} in {self.path}"
         found = self.details(name)
         missing = [host for host in wanted if not found.covers(host)]
-        if found.days_left() > RENEWAL_DAYS and not missing:
+        revoked = any(one.serial == found.serial for one in self.revocations())
+        if found.days_left() > RENEWAL_DAYS and not missing and not revoked:
             return ""
         if not self.key(AUTHORITY).exists() or not is_signed_by(
             _read(self.certificate(name)), _read(self.authority)
@@ -130,6 +197,8 @@ class CertificateFolder:
             return ""  # it was issued elsewhere, so it is renewed there; the master warns when it is time
         self.issue(name, (*found.hosts, *missing))
         why = f"for {', '.join(missing)}" if missing else "before it expires"
+        if revoked:
+            why = "because it was revoked"
         return f"renewed the certificate {name} {why}"
 
     def details(self, name: str) -> Details:
@@ -143,20 +212,57 @@ class CertificateFolder:
     def all(self) -> Iterator[tuple[str, Details | str]]:
         """Yield the names of all certificates with what they say, or why they cannot be read."""
         for file in sorted(self.path.glob("*.pem")):
+            if file == self.revoked:
+                continue
             try:
                 yield file.stem, self.details(file.stem)
             except CertificateError as error:
                 yield file.stem, str(error)
 
-    def _write(self, name: str, issued: Issued) -> None:
+    def _need_authority(self) -> None:
+        if not self.has(AUTHORITY):
+            raise CertificateError(
+                f"there is no authority with its key in {self.path}; make one: rce certificate init"
+            )
+
+    def _authority(self) -> Issued:
+        return Issued(_read(self.authority), _read(self.key(AUTHORITY)))
+
+    def _records(self) -> list[Record]:
+        file = self.path / _RECORDS
+        if not file.exists():
+            return []
         try:
-            self.path.mkdir(mode=stat.S_IRWXU, parents=True, exist_ok=True)
-            self.path.chmod(stat.S_IRWXU)
+            return [_DECODER.decode(line) for line in _read(file).splitlines() if line]
+        except msgspec.MsgspecError as error:
+            raise CertificateError(f"{file}: {error}; remove the damaged line") from error
+
+    def _record(self, name: str, issued: Details) -> None:
+        """Add to what was issued, before it is handed out, and leave out what has expired."""
+        now = datetime.now(UTC)
+        kept = [record for record in self._records() if record.expires > now]
+        kept.append(Record(name, f"{issued.serial:x}", issued.expires))
+        with self._writing():
+            text = b"".join(msgspec.json.encode(record) + b"\n" for record in kept)
+            _write_private(self.path / _RECORDS, text)
+
+    def _write(self, name: str, issued: Issued) -> None:
+        with self._writing():
             # A program that looks between the two finds a pair that does not fit, and keeps the old one.
             _write_private(self.key(name), issued.key)
             _write_private(self.certificate(name), issued.certificate)
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            self.path.mkdir(mode=stat.S_IRWXU, parents=True, exist_ok=True)
+            self.path.chmod(stat.S_IRWXU)
+            yield
         except OSError as error:
             raise CertificateError(f"cannot write to {self.path}: {error}") from error
+
+
+_DECODER = msgspec.json.Decoder(Record)
 
 
 def details_of(file: Path) -> Details:

@@ -1,8 +1,8 @@
 """Take TLS connections in: a server's protocol sees one only after its handshake.
 
 asyncio's own TLS servers tell of no handshake that fails, and count no connection while it lasts. Here an
-accepted connection waits in a lobby until its handshake is done; one that fails is one line in the log, and a
-client that speaks plain HTTP is told so.
+accepted connection waits in a lobby until its handshake is done; one that fails is one line in the log and an
+alert to the client, and a client that speaks plain HTTP is told so.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, cast
 
 from rce.guard.complaints import Complaints
 from rce.guard.lobby import address_of
+from rce.tls.alerts import alert_of
 from rce.tls.exceptions import CertificateError
 from rce.tls.faults import explain_to_server
 
@@ -93,12 +94,11 @@ class TlsGate:
                     await self._shake_hands(sock, protocol)
                 elif first is not None:
                     self._complain(address, "it does not speak TLS")
-                    with contextlib.suppress(OSError):
-                        sock.send(_PLAIN_ANSWER)
-                        sock.shutdown(socket.SHUT_WR)
-                        await _discard(sock)
+                    await _part(sock, _PLAIN_ANSWER)
         except (OSError, EOFError, TimeoutError, CertificateError) as error:
             self._complain(address, "no handshake in time" if _is_late(error) else explain_to_server(error))
+            if alert := alert_of(error):
+                await _part(sock, alert)
         finally:
             guest.leave()
             sock.close()
@@ -116,9 +116,10 @@ class TlsGate:
                 ssl_handshake_timeout=HANDSHAKE_S,
                 ssl_shutdown_timeout=_SHUTDOWN_S,
             )
-        except BaseException:
-            with contextlib.suppress(OSError):
-                sock.shutdown(socket.SHUT_RDWR)
+        except BaseException as error:
+            if not alert_of(error):
+                with contextlib.suppress(OSError):
+                    sock.shutdown(socket.SHUT_RDWR)
             raise
 
     def _complain(self, address: str, why: str) -> None:
@@ -147,6 +148,14 @@ async def _first_byte(sock: socket.socket) -> int | None:
             await _readable(sock)
         else:
             return data[0] if data else None
+
+
+async def _part(sock: socket.socket, words: bytes) -> None:
+    """Send the last words to a client, and let it read them."""
+    with contextlib.suppress(OSError):
+        sock.send(words)
+        sock.shutdown(socket.SHUT_WR)
+        await _discard(sock)
 
 
 async def _discard(sock: socket.socket) -> None:

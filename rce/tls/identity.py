@@ -7,6 +7,7 @@ import ssl
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
+from rce.tls.alerts import AlertingContext
 from rce.tls.exceptions import CertificateError
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ class TlsFiles:
     key: Path | None = None
     authority: Path | None = None
     """Whose certificates the other end may have; the system's authorities if None."""
+    revoked: Path | None = None
+    """The authority's list of certificates that it has revoked; there may be no such file."""
 
 
 class TlsIdentity:
@@ -49,6 +52,8 @@ class TlsIdentity:
         self.files = files
         self._contexts: dict[str, tuple[_Signature, ssl.SSLContext]] = {}
         self._bad: dict[str, _Signature] = {}
+        self._serials: frozenset[int] = frozenset()
+        self._serials_of: object = None
 
     def server(self) -> ssl.SSLContext:
         """Return the context of a server that asks clients for no certificate.
@@ -74,6 +79,25 @@ class TlsIdentity:
         """
         return self._get("client", self._make_client)
 
+    def is_revoked(self, serial: int) -> bool:
+        """Tell whether the authority has revoked a certificate. For connections that are there already.
+
+        Args:
+            serial: Of the certificate.
+        """
+        files = self.files
+        stamp = None if files.revoked is None else _stamp(files.revoked)
+        if stamp != self._serials_of and files.revoked is not None and files.authority is not None:
+            self._serials_of = stamp
+            from rce.tls.revocation import read_list
+
+            try:
+                found = read_list(files.revoked.read_bytes(), files.authority.read_bytes()) if stamp else []
+                self._serials = frozenset(one.serial for one in found)
+            except (OSError, CertificateError) as error:
+                _log.warning("the former list of revoked certificates stays in use: %s", error)
+        return serial in self._serials
+
     def _get(self, role: str, make: Callable[[], ssl.SSLContext]) -> ssl.SSLContext:
         now = self._signature()
         signature, context = self._contexts.get(role, (None, None))
@@ -95,10 +119,10 @@ class TlsIdentity:
 
     def _signature(self) -> _Signature:
         files = self.files
-        return tuple(_stamp(file) for file in (files.certificate, files.key, files.authority))
+        return tuple(_stamp(file) for file in (files.certificate, files.key, files.authority, files.revoked))
 
     def _make_server(self) -> ssl.SSLContext:
-        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context = AlertingContext(ssl.PROTOCOL_TLS_SERVER)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
         self._load_certificate(context)
         return context
@@ -130,6 +154,21 @@ class TlsIdentity:
                 f"cannot use the authority {authority}: {_reason(error)};"
                 " copy authority.pem from the engine's certificates folder"
             ) from error
+        self._refuse_revoked(context, authority)
+
+    def _refuse_revoked(self, context: ssl.SSLContext, authority: Path) -> None:
+        revoked = self.files.revoked
+        if revoked is None or not revoked.exists():
+            return
+        from rce.tls.revocation import read_list  # takes 10 MB, which only engines with a list spend
+
+        try:
+            read_list(revoked.read_bytes(), authority.read_bytes())
+            context.load_verify_locations(revoked)
+        except (OSError, CertificateError) as error:
+            why = _reason(error) if isinstance(error, OSError) else error
+            raise CertificateError(f"cannot use the list of revoked certificates {revoked}: {why}") from error
+        context.verify_flags |= ssl.VERIFY_CRL_CHECK_LEAF
 
     def _load_certificate(self, context: ssl.SSLContext) -> None:
         certificate, key = self.files.certificate, self.files.key
@@ -155,7 +194,21 @@ def client_context(authority: Path | None) -> ssl.SSLContext | None:
     Raises:
         CertificateError: The authority cannot be used.
     """
-    return None if authority is None else TlsIdentity(TlsFiles(authority=authority)).client()
+    contexts = client_contexts(authority)
+    return None if contexts is None else contexts()
+
+
+def client_contexts(authority: Path | None) -> Context | None:
+    """Return what gives a client's context for each connection, by the authority's file as it is then.
+
+    Raises:
+        CertificateError: The authority cannot be used.
+    """
+    if authority is None:
+        return None
+    contexts = TlsIdentity(TlsFiles(authority=authority)).client
+    contexts()
+    return contexts
 
 
 def _no_password() -> str:

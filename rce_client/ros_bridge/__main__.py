@@ -30,10 +30,10 @@ from rce_client.ros_bridge.bridge import build, joined_graph, wait_ready
 from rce_client.ros_bridge.plan import check, make_plan
 
 if TYPE_CHECKING:
-    import ssl
     from collections.abc import Iterable
 
     from rce.config.client import ClientConfig
+    from rce.tls.identity import Context
     from rce_client.ros_bridge.plan import Plan
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
@@ -81,7 +81,7 @@ def bridge(
 
 
 async def run(
-    config: ClientConfig, plan: Plan, types: TypeRegistry, master_uri: str, tls: ssl.SSLContext | None = None
+    config: ClientConfig, plan: Plan, types: TypeRegistry, master_uri: str, tls: Context | None = None
 ) -> None:
     """Bridge until SIGINT or SIGTERM. A second signal ends the program at once, and leaves what it made.
 
@@ -107,7 +107,7 @@ async def run(
 
 
 async def serve(
-    config: ClientConfig, plan: Plan, types: TypeRegistry, master_uri: str, tls: ssl.SSLContext | None = None
+    config: ClientConfig, plan: Plan, types: TypeRegistry, master_uri: str, tls: Context | None = None
 ) -> None:
     """Bridge until cancelled or refused, then remove what was made."""
     conn = Connection(

@@ -10,13 +10,17 @@ import time
 from collections import OrderedDict
 from dataclasses import dataclass
 from http import HTTPStatus
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypedDict
 
 import aiohttp
 from yarl import URL
 
+from rce.tls.faults import explain_to_client
 from rce.web.client import session_connector
 from rce_client.station.persons import Action, EntranceError, Person
+
+if TYPE_CHECKING:
+    from rce.tls.identity import Context
 
 _log = logging.getLogger(__name__)
 
@@ -31,6 +35,13 @@ MAX_NOTES = 1000
 _TIMEOUT = aiohttp.ClientTimeout(total=10)
 
 
+class Secure(TypedDict):
+    """What each request to the master is made with."""
+
+    ssl: ssl.SSLContext | bool
+    allow_redirects: bool
+
+
 @dataclass(frozen=True, slots=True)
 class EngineAccount:
     """The user that the station itself works as."""
@@ -39,7 +50,13 @@ class EngineAccount:
     """Of the master."""
     user: str
     password: str
-    tls: ssl.SSLContext | None = None
+    tls: Context | None = None
+    """Gives the TLS settings for each connection; the system's if None."""
+
+    @property
+    def how(self) -> Secure:
+        """How its requests are made: in TLS by the authority as it is now, and never on elsewhere."""
+        return Secure(ssl=True if self.tls is None else self.tls(), allow_redirects=False)
 
     def __repr__(self) -> str:
         return f"EngineAccount(url={self.url!r}, user={self.user!r})"
@@ -70,7 +87,7 @@ class EngineEntrance:
 
     async def __aenter__(self) -> Self:
         """Begin; the master need not be there."""
-        connector = session_connector(self._account.tls)
+        connector = session_connector(None)
         self._session = aiohttp.ClientSession(timeout=_TIMEOUT, connector=connector)
         self._writer = asyncio.create_task(self._write_notes())
         return self
@@ -102,7 +119,8 @@ class EngineEntrance:
             if token in self._known and known is not None and now - asked < STALE_S:
                 return known
             raise EntranceError(
-                503, f"the engine cannot be reached, so nobody's login can be checked; try again ({error})"
+                503,
+                f"the engine cannot be reached, so no login can be checked; try again ({_words(error)})",
             ) from error
         self._known[token] = (now, person)
         self._known.move_to_end(token)
@@ -122,7 +140,7 @@ class EngineEntrance:
             token = await self._log_in(body, headers)
             person = await self.who(token)
         except (aiohttp.ClientError, TimeoutError) as error:
-            raise EntranceError(503, f"the engine cannot be reached; try again ({error})") from error
+            raise EntranceError(503, f"the engine cannot be reached; try again ({_words(error)})") from error
         if person is None or not person.sees:
             await self.log_out(token)
             raise EntranceError(403, f"user {user!r} may not see this fleet; an administrator gives the role")
@@ -132,7 +150,7 @@ class EngineEntrance:
         """Make a token worthless."""
         self._known.pop(token, None)
         try:
-            async with self._session.delete(self._api / "login", headers=_bearer(token)):
+            async with self._session.delete(self._api / "login", headers=_bearer(token), **self._account.how):
                 pass  # that it is worthless already is as good
         except (aiohttp.ClientError, TimeoutError) as error:
             _log.warning("a token was not given back, it expires by itself: %s", error)
@@ -145,7 +163,9 @@ class EngineEntrance:
             _log.warning("not in the audit log, too much waits: %s %s", action.name, action.subject)
 
     async def _ask(self, token: str) -> Person | None:
-        async with self._session.get(self._api / "user", headers=_bearer(token)) as reply:
+        async with self._session.get(
+            self._api / "user", headers=_bearer(token), **self._account.how
+        ) as reply:
             if reply.status in (HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN):
                 return None
             reply.raise_for_status()
@@ -153,7 +173,9 @@ class EngineEntrance:
         return Person(found["name"], found["role"], owns=found["name"] == self._account.user)
 
     async def _log_in(self, body: dict[str, Any], headers: dict[str, str]) -> str:
-        async with self._session.post(self._api / "login", json=body, headers=headers) as reply:
+        async with self._session.post(
+            self._api / "login", json=body, headers=headers, **self._account.how
+        ) as reply:
             answer = await reply.json()
             if reply.status != HTTPStatus.OK:
                 raise EntranceError(reply.status, str(answer.get("error", reply.reason)))
@@ -180,10 +202,16 @@ class EngineEntrance:
             "outcome": "done" if action.done else "refused",
         }
         headers = _bearer(token or self._own)
-        async with self._session.post(self._api / "audit", json=note, headers=headers) as reply:
+        async with self._session.post(
+            self._api / "audit", json=note, headers=headers, **self._account.how
+        ) as reply:
             if reply.status == HTTPStatus.UNAUTHORIZED and not token:
                 self._own = ""
             reply.raise_for_status()
+
+
+def _words(error: Exception) -> str:
+    return explain_to_client(error) or str(error) or "no answer in time"
 
 
 def _bearer(token: str) -> dict[str, str]:

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import ssl
 from collections.abc import Callable
 from http import HTTPStatus
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import aiohttp
 from yarl import URL
 
+from rce.tls.faults import explain_to_client
 from rce.web.client import session_connector
+from rce_client.station.engine_entrance import Secure
+
+if TYPE_CHECKING:
+    from rce.tls.identity import Context
 
 _log = logging.getLogger(__name__)
 
@@ -27,7 +31,7 @@ class EngineWatch:
         master: URL of the master.
         user: User ID.
         password: The user's password.
-        tls: TLS settings; the system's if None.
+        tls: Gives the TLS settings for each connection; the system's if None.
         on_state: Called with the engine's state whenever it changed; ``{"error": text}`` if out of reach.
     """
 
@@ -37,7 +41,7 @@ class EngineWatch:
         user: str,
         password: str,
         *,
-        tls: ssl.SSLContext | None = None,
+        tls: Context | None = None,
         on_state: Callable[[dict[str, Any]], None],
     ) -> None:
         self._tls = tls
@@ -47,9 +51,13 @@ class EngineWatch:
         self._token = ""
         self._last: dict[str, Any] = {}
 
+    @property
+    def _how(self) -> Secure:
+        return Secure(ssl=True if self._tls is None else self._tls(), allow_redirects=False)
+
     async def run(self) -> None:
         """Watch until cancelled; then give the token back."""
-        connector = session_connector(self._tls)
+        connector = session_connector(None)
         async with aiohttp.ClientSession(
             timeout=TIMEOUT, raise_for_status=True, connector=connector
         ) as session:
@@ -67,7 +75,7 @@ class EngineWatch:
                     self._token = ""
                 state = {"error": f"the master says {error.status}: {error.message}"}
             except (aiohttp.ClientError, TimeoutError) as error:
-                state = {"error": f"the master cannot be reached: {error}"}
+                state = {"error": f"the master cannot be reached: {explain_to_client(error) or error}"}
             if state != self._last:
                 self._last = state
                 self._on_state(state)
@@ -78,14 +86,14 @@ class EngineWatch:
             return
         headers = {"Authorization": f"Bearer {self._token}"}
         try:
-            async with session.delete(self._api / "login", headers=headers, allow_redirects=False):
+            async with session.delete(self._api / "login", headers=headers, **self._how):
                 self._token = ""
         except (aiohttp.ClientError, TimeoutError) as error:
             _log.info("the token of this station was not given back, it expires by itself: %s", error)
 
     async def _read(self, session: aiohttp.ClientSession) -> dict[str, Any]:
         if not self._token:
-            async with session.post(self._api / "login", json=self._login, allow_redirects=False) as reply:
+            async with session.post(self._api / "login", json=self._login, **self._how) as reply:
                 self._token = (await reply.json())["token"]
         containers, nodes, connections = [
             (await self._get(session, kind))[kind] for kind in ("containers", "nodes", "connections")
@@ -119,7 +127,7 @@ class EngineWatch:
             self._api / kind,
             headers=headers,
             params={"user": self._login["userID"]},
-            allow_redirects=False,
+            **self._how,
         ) as reply:
             found: dict[str, Any] = await reply.json()
             return found

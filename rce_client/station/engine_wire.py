@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import ssl
 from collections.abc import Awaitable, Callable
 from typing import Any
 
 from rce.config.client import ClientConfig
 from rce.protocol.messages import Request
+from rce.tls.identity import Context
 from rce_client.connection import Connection, State
 from rce_client.ends import ServiceClient
 from rce_client.exceptions import CallError, ClientError
@@ -35,10 +35,10 @@ class EngineWire(PlannerWire):
 
     Args:
         config: The operator's configuration; its first container is the planner's.
-        tls: TLS settings; the system's if None.
+        tls: Gives the TLS settings for each connection; the system's if None.
     """
 
-    def __init__(self, config: ClientConfig, tls: ssl.SSLContext | None = None) -> None:
+    def __init__(self, config: ClientConfig, tls: Context | None = None) -> None:
         if not config.containers:
             raise ValueError("containers: the fleet's configuration names no container for the planner")
         super().__init__("the planner's container is not ready yet")

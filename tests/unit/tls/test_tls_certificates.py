@@ -64,7 +64,9 @@ def test_files_are_private_and_complete(folder: CertificateFolder) -> None:
     folder.issue("cloud")
     assert stat.S_IMODE(folder.path.stat().st_mode) == 0o700
     files = {file.name: stat.S_IMODE(file.stat().st_mode) for file in folder.path.iterdir()}
-    assert files == dict.fromkeys(("authority.pem", "authority.key", "cloud.pem", "cloud.key"), 0o600)
+    assert files == dict.fromkeys(
+        ("authority.pem", "authority.key", "cloud.pem", "cloud.key", "issued.jsonl"), 0o600
+    )
 
 
 def test_second_authority_is_refused(folder: CertificateFolder) -> None:
@@ -140,3 +142,70 @@ def test_garbage_is_refused_with_its_file(folder: CertificateFolder) -> None:
     with pytest.raises(CertificateError, match="the authority cannot be read"):
         issue(Issued(b"x", b"y"), "cloud", [])
     assert dict(folder.all())[AUTHORITY] == folder.details(AUTHORITY)
+
+
+def test_revoked_name_loses_all_its_certificates(folder: CertificateFolder) -> None:
+    """OpenSSL takes the list as it is, and refuses the renewed certificate as well as the former one."""
+    former = folder.issue("machine", ("10.0.0.7",)).serial
+    renewed = folder.issue("machine", ("10.0.0.7",)).serial
+    other = folder.issue("other", ("10.0.0.8",)).serial
+    assert {one.serial for one in folder.revoke("machine")} == {former, renewed}
+    assert folder.revoke("machine") == []
+    assert {one.serial for one in folder.revocations()} == {former, renewed}
+    assert folder.owners() == {former: "machine", renewed: "machine", other: "other"}
+    server, client = contexts(folder, "machine")
+    client.load_verify_locations(folder.revoked)
+    client.verify_flags |= ssl.VERIFY_CRL_CHECK_LEAF
+    with pytest.raises(ssl.SSLCertVerificationError, match="revoked"):
+        shake_hands(server, client, "10.0.0.7")
+    server, client = contexts(folder, "other")
+    client.load_verify_locations(folder.revoked)
+    client.verify_flags |= ssl.VERIFY_CRL_CHECK_LEAF
+    shake_hands(server, client, "10.0.0.8")
+    assert folder.issue("machine").serial not in {one.serial for one in folder.revocations()}
+
+
+def test_revoked_certificate_of_the_engine_is_renewed_at_start(folder: CertificateFolder) -> None:
+    serial = folder.issue("engine", ("localhost",)).serial
+    assert folder.ensure("engine", ("localhost",)) == ""
+    folder.revoke("engine")
+    assert "because it was revoked" in folder.ensure("engine", ("localhost",))
+    assert folder.details("engine").serial != serial
+
+
+@pytest.mark.parametrize("name", ["unknown", AUTHORITY, "revoked"])
+def test_revoking_what_was_not_issued_is_refused(folder: CertificateFolder, name: str) -> None:
+    with pytest.raises(CertificateError, match=f"no certificate '{name}' was issued in"):
+        folder.revoke(name)
+    assert not folder.revoked.exists()
+
+
+def test_certificate_of_another_authority_is_revoked_elsewhere(
+    folder: CertificateFolder, tmp_path: Path
+) -> None:
+    other = CertificateFolder(tmp_path / "other")
+    other.make_authority()
+    other.issue("machine")
+    folder.certificate("machine").write_bytes(other.certificate("machine").read_bytes())
+    with pytest.raises(CertificateError, match="another authority issued"):
+        folder.revoke("machine")
+
+
+def test_list_of_another_authority_is_named(folder: CertificateFolder, tmp_path: Path) -> None:
+    other = CertificateFolder(tmp_path / "other")
+    other.make_authority()
+    other.issue("machine")
+    other.revoke("machine")
+    folder.revoked.write_bytes(other.revoked.read_bytes())
+    with pytest.raises(CertificateError, match="another authority signed it"):
+        folder.revocations()
+
+
+def test_new_authority_begins_with_nothing_revoked(folder: CertificateFolder) -> None:
+    folder.issue("machine")
+    folder.revoke("machine")
+    for file in (folder.authority, folder.key(AUTHORITY)):
+        file.unlink()
+    folder.make_authority()
+    assert folder.revocations() == []
+    assert folder.owners() == {}
