@@ -12,8 +12,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import psutil
-
 from rce.config.exceptions import ShippedFileError
 from rce.config.folders import default_state_dir, run_dir
 from rce.config.resources import examples_dir
@@ -23,6 +21,7 @@ from rce.control.contents import ContentClient
 from rce.control.dialing import RunDialer
 from rce.control.limits import MEMORY_PER_SLOT
 from rce.control.messages import MachineInfo
+from rce.control.usage import machine_memory
 from rce.link.address import in_url, is_any, own_address
 from rce.link.handover import Doorman
 from rce.link.listening import listen_on
@@ -222,7 +221,7 @@ class Quitting:
 
 
 def _machine(settings: ContainerSettings, offers: Offers, limiter: Limiter, detail: str) -> MachineInfo:
-    memory = psutil.virtual_memory().total
+    memory = machine_memory()
     cores = os.cpu_count() or 0
     ceiling = limiter.ceiling()
     if ceiling.memory:

@@ -11,8 +11,6 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
-import psutil
-
 from rce.control.execution import FEATURE as EXEC
 from rce.control.execution import Command
 from rce.control.messages import (
@@ -31,6 +29,7 @@ from rce.control.messages import (
     Usage,
 )
 from rce.control.model import EndpointStatus, LinkAddress
+from rce.control.usage import cpu_seconds, resident_bytes
 from rce.protocol.names import EndpointId
 from rce_container import core, events
 from rce_container.bundles.supply import Library
@@ -135,7 +134,6 @@ class Manager:
         self._tasks: asyncio.TaskGroup
         self._empty = asyncio.Event()
         self._meter = UsageMeter()
-        self._process = psutil.Process()
         self._log_reads = LogReads(self._read_log, lambda chunk: self.send(chunk))  # noqa: PLW0108 - set later
 
     # The master's side
@@ -374,6 +372,4 @@ class Manager:
                 for unit in self._units.values()
             }
             usage = await asyncio.to_thread(self._meter.measure, wanted)
-            times = self._process.cpu_times()
-            memory = self._process.memory_info().rss
-            self.send(Usage(cpu_s=times.user + times.system, memory=memory, endpoints=usage))
+            self.send(Usage(cpu_s=cpu_seconds(), memory=resident_bytes(), endpoints=usage))

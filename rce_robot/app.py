@@ -12,14 +12,13 @@ import socket
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-import psutil
-
 from rce.config.exceptions import ShippedFileError
 from rce.config.folders import run_dir
 from rce.config.resources import examples_dir
 from rce.control.channel import TaskSetChannel
 from rce.control.messages import MachineInfo
 from rce.control.model import LinkAddress
+from rce.control.usage import machine_memory
 from rce.guard.lobby import Lobby
 from rce.guard.proxies import TrustedProxies
 from rce.link import LinkHub
@@ -111,7 +110,7 @@ class App:
                 _warn(plain_warning("robots' passwords and messages travel", settings.host))
             elif for_robots is not None and not settings.public_url:
                 _warn(name_warning(for_robots, reach))
-            info = MachineInfo(name=machine, cores=os.cpu_count() or 0, memory=psutil.virtual_memory().total)
+            info = MachineInfo(name=machine, cores=os.cpu_count() or 0, memory=machine_memory())
             lobby = Lobby("robots", per_address=settings.strangers_per_address, in_all=settings.strangers)
             task_set = RobotTaskSet(
                 hub,

@@ -11,7 +11,6 @@ import logging
 from typing import TYPE_CHECKING, Protocol
 
 import msgspec
-import psutil
 
 from rce.control.exceptions import ControlError
 from rce.control.messages import (
@@ -30,6 +29,7 @@ from rce.control.messages import (
     TaskSetKind,
     Usage,
 )
+from rce.control.usage import cpu_seconds, machine_memory, resident_bytes
 from rce.guard.budget import Ledger
 from rce.protocol.exceptions import HandshakeError
 from rce.protocol.messages import type_of
@@ -112,10 +112,9 @@ class RobotTaskSet:
         self._pool = pool
         self._ledger = Ledger(
             per_user=settings.user_memory,
-            in_all=settings.memory or psutil.virtual_memory().total // 2,
+            in_all=settings.memory or machine_memory() // 2,
         )
         self._tasks: asyncio.TaskGroup | None = None
-        self._process = psutil.Process()
 
     # The master's side
 
@@ -254,14 +253,13 @@ class RobotTaskSet:
                 self._channel.send(Status(status=namespace.status()))
 
     def _report_usage(self) -> None:
-        times = self._process.cpu_times()
         for namespace in self._namespaces.values():
             namespace.tick()
         self._ledger.refresh()
         self._channel.send(
             Usage(
-                cpu_s=times.user + times.system,
-                memory=self._process.memory_info().rss,
+                cpu_s=cpu_seconds(),
+                memory=resident_bytes(),
                 endpoints={str(id_): namespace.usage() for id_, namespace in self._namespaces.items()},
                 held=self._ledger.total,
                 shed=self._ledger.shed,

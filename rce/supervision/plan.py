@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import os
 import sys
-import tempfile
 from dataclasses import asdict, dataclass, field
 from typing import Any, NoReturn
 
@@ -33,7 +32,9 @@ class Plan:
         Raises:
             OSError: The interpreter cannot be started, or the plan not be written.
         """
-        with tempfile.TemporaryFile() as file:
+        from tempfile import TemporaryFile  # takes 1 MB, which the supervisor does not need
+
+        with TemporaryFile() as file:
             file.write(json.dumps(asdict(self)).encode())
             file.seek(0)
             os.set_inheritable(file.fileno(), True)

@@ -6,11 +6,12 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from http import HTTPStatus
-from typing import Any
-
-from pydantic import BaseModel
+from typing import TYPE_CHECKING, Any
 
 from rce import __version__
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
 
 PREFIX = "/api/v1"
 _FAILURES: dict[int, str] = {

@@ -47,7 +47,7 @@ def _claimed(call: Call) -> str:
 
 def _subject(call: Call) -> str:
     owner = call.request.query.get("user", call.user.name if call.user is not None else "")
-    words = [str(word) for word in call.request.match_info.values()]
+    words = list(call.parts.values())
     given = call.body.model_dump(include=set(_NAMES), exclude={"userID"}) if call.body is not None else {}
     words += [str(value) for value in given.values()]
     return "/".join((owner, *words)) if words else ""

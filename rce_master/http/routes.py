@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
-
-from pydantic import BaseModel, ValidationError
 
 from rce.guard.proxies import TrustedProxies
 from rce.web.openapi import Operation, Query
@@ -18,6 +16,7 @@ from rce_master.state.records import UserRole
 if TYPE_CHECKING:
     from aiohttp import web
     from aiohttp.web import StreamResponse
+    from pydantic import BaseModel
 
     from rce_master.audit import AuditLog
     from rce_master.auth import Authenticator
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from rce_master.state.records import User
     from rce_master.tokens import Tokens
 
-M = TypeVar("M", bound=BaseModel)
+M = TypeVar("M", bound="BaseModel")
 
 ACCESS_CHECK_S = 15.0
 """How long after its expiry a token may still keep a stream open."""
@@ -72,6 +71,8 @@ class Call:
     """None only on routes that are open to everybody."""
     token: str
     body: BaseModel | None
+    parts: Mapping[str, str]
+    """The parts of the path that the route names, by their names."""
 
     @property
     def address(self) -> str:
@@ -142,7 +143,7 @@ class Call:
 
     def path(self, name: str) -> str:
         """A part of the path."""
-        return self.request.match_info[name]
+        return self.parts[name]
 
     def query(self, name: str) -> str:
         """A query parameter that must be there.
@@ -259,20 +260,3 @@ class RouteTable:
 
 
 OF_USER = Query(name="user", description="Whose; administrators only. Default: own, in lists everybody's.")
-
-
-def read_body(model: type[BaseModel], text: bytes) -> BaseModel:
-    """Read a request's body.
-
-    Raises:
-        Invalid: It does not fit; the text names each fault with its path.
-    """
-    try:
-        return model.model_validate_json(text or b"{}")
-    except ValidationError as error:
-        faults = "; ".join(f"{_place(fault['loc'])}: {fault['msg']}" for fault in error.errors())
-        raise Invalid(faults) from None
-
-
-def _place(location: tuple[int | str, ...]) -> str:
-    return ".".join(map(str, location)) or "body"

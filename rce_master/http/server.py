@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
 import math
-from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from aiohttp import hdrs, web
 
-from rce.web.bodies import read_whole
-from rce.web.openapi import PREFIX, build_document
+from rce.web.openapi import PREFIX
 from rce.web.origin import ServerNames, is_foreign
 from rce_master.exceptions import (
     AuthError,
@@ -25,48 +22,21 @@ from rce_master.exceptions import (
     TooManyLogins,
     TooMuch,
 )
-from rce_master.http import (
-    api_account,
-    api_audit,
-    api_control,
-    api_exec,
-    api_limits,
-    api_machines,
-    api_packages,
-    api_read,
-    api_stream,
-    api_tokens,
-    api_usage,
-)
-from rce_master.http.access import admit, bearer, check_metrics
-from rce_master.http.auditing import note_done, note_refused
+from rce_master.http.access import check_metrics
 from rce_master.http.entry import Entry
 from rce_master.http.health import Health
-from rce_master.http.models import Error
-from rce_master.http.routes import Call, Route, Services, read_body
+from rce_master.http.late import LateApi
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
+
+    from rce_master.http.routes import Services
 
     Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 logger = logging.getLogger(__name__)
 
 MAX_BODY = 1 << 20
-
-ROUTES: list[Route] = [
-    *api_account.routes,
-    *api_limits.routes,
-    *api_tokens.routes,
-    *api_audit.routes,
-    *api_read.routes,
-    *api_control.routes,
-    *api_machines.routes,
-    *api_usage.routes,
-    *api_packages.routes,
-    *api_stream.routes,
-    *api_exec.routes,
-]
 
 
 def make_app(
@@ -86,39 +56,11 @@ def make_app(
     app.router.add_get("/", entry.handle)
     app.router.add_get("/healthz", Health(services.realm).handle)
     app.router.add_get("/metrics", _metrics(services))
-    app.router.add_get(f"{PREFIX}/openapi.json", _document())
-    for route in ROUTES:
-        app.router.add_route(route.method, PREFIX + route.path, _adapt(route, services))
+    app.router.add_route("*", PREFIX + "/{rest:.*}", LateApi(services).handle)
     return app
 
 
 # Routes
-
-
-def _adapt(route: Route, services: Services) -> Handler:
-    async def handle(request: web.Request) -> web.StreamResponse:
-        token, user = bearer(request, services)
-        if user is not None:
-            services.quotas.request(user)
-        call = Call(request, services, user, token, None)
-        try:
-            admit(route, user)
-            if route.body:
-                call = replace(call, body=read_body(route.body, await read_whole(request)))
-            reply = await route.handler(call)
-        except MasterError as error:
-            note_refused(route, call, error)
-            raise
-        note_done(route, call)
-        if isinstance(reply, web.StreamResponse):
-            return reply
-        if reply is None:
-            return web.Response(status=route.status)
-        return web.Response(
-            body=reply.model_dump_json().encode(), status=route.status, content_type="application/json"
-        )
-
-    return handle
 
 
 def _metrics(services: Services) -> Handler:
@@ -131,23 +73,6 @@ def _metrics(services: Services) -> Handler:
     async def handle(request: web.Request) -> web.Response:
         check_metrics(request, services)
         return scraped()()
-
-    return handle
-
-
-def _document() -> Handler:
-    @cache
-    def text() -> str:
-        document = build_document(
-            [route.operation for route in ROUTES],
-            title="RCE master",
-            description="Control of a robotics cloud.",
-            error=Error,
-        )
-        return json.dumps(document)
-
-    async def handle(_: web.Request) -> web.Response:
-        return web.Response(text=text(), content_type="application/json")
 
     return handle
 

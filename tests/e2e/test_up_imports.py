@@ -33,6 +33,7 @@ NOT_LOADED = {
         "numpy",
         "rich",
         "psutil",
+        "pydantic",
         "logging.handlers",
     ),
     "robot": (
@@ -45,6 +46,7 @@ NOT_LOADED = {
         "PIL",
         "numpy",
         "rich",
+        "psutil",
         "logging.handlers",
     ),
     "container": (
@@ -56,10 +58,11 @@ NOT_LOADED = {
         "PIL",
         "numpy",
         "rich",
+        "psutil",
         "logging.handlers",
     ),
 }
-LOADED = {"up": "uvloop", "master": "aiohttp", "robot": "websockets", "container": "psutil"}
+LOADED = {"up": "uvloop", "master": "aiohttp", "robot": "websockets", "container": "h11"}
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from support.fuzzing import Tracebacks, exchange, requests
 
-from rce_master.http.server import ROUTES
+from rce_master.http.api import ROUTES
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

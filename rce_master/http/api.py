@@ -1,0 +1,144 @@
+"""The REST API: its routes, what they read and answer, and the document that describes them.
+
+It is loaded with the first request for it: see :mod:`rce_master.http.late`.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from typing import TYPE_CHECKING
+
+from aiohttp import web
+from pydantic import BaseModel, ValidationError
+
+from rce.web.bodies import read_whole
+from rce.web.openapi import PREFIX, build_document
+from rce_master.exceptions import Invalid, MasterError
+from rce_master.http import (
+    api_account,
+    api_audit,
+    api_control,
+    api_exec,
+    api_limits,
+    api_machines,
+    api_packages,
+    api_read,
+    api_stream,
+    api_tokens,
+    api_usage,
+)
+from rce_master.http.access import admit, bearer
+from rce_master.http.auditing import note_done, note_refused
+from rce_master.http.models import Error
+from rce_master.http.routes import Call, Route, Services
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Mapping
+
+    Answer = Callable[[web.Request, Mapping[str, str]], Awaitable[web.StreamResponse]]
+
+ROUTES: list[Route] = [
+    *api_account.routes,
+    *api_limits.routes,
+    *api_tokens.routes,
+    *api_audit.routes,
+    *api_read.routes,
+    *api_control.routes,
+    *api_machines.routes,
+    *api_usage.routes,
+    *api_packages.routes,
+    *api_stream.routes,
+    *api_exec.routes,
+]
+
+
+class Api:
+    """Answers all requests for paths of the API.
+
+    Args:
+        services: What the handlers work with.
+    """
+
+    def __init__(self, services: Services) -> None:
+        self._router = web.UrlDispatcher()
+        self._answers: dict[web.AbstractRoute, Answer] = {}
+        for method in ("GET", "HEAD"):
+            self._add(method, "/openapi.json", _document)
+        for route in ROUTES:
+            self._add(route.method, route.path, _adapt(route, services))
+
+    def _add(self, method: str, path: str, answer: Answer) -> None:
+        self._answers[self._router.add_route(method, PREFIX + path, self.handle)] = answer
+
+    async def handle(self, request: web.Request) -> web.StreamResponse:
+        """Answer a request.
+
+        Raises:
+            HTTPException: There is no such path, or not with this method.
+            MasterError: It was not done.
+        """
+        found = await self._router.resolve(request)
+        if found.http_exception is not None:
+            raise found.http_exception
+        answer = self._answers[found.route]
+        return await answer(request, dict(found))
+
+
+def _adapt(route: Route, services: Services) -> Answer:
+    async def answer(request: web.Request, parts: Mapping[str, str]) -> web.StreamResponse:
+        token, user = bearer(request, services)
+        if user is not None:
+            services.quotas.request(user)
+        call = Call(request, services, user, token, None, parts)
+        try:
+            admit(route, user)
+            if route.body:
+                call = replace(call, body=read_body(route.body, await read_whole(request)))
+            reply = await route.handler(call)
+        except MasterError as error:
+            note_refused(route, call, error)
+            raise
+        note_done(route, call)
+        if isinstance(reply, web.StreamResponse):
+            return reply
+        if reply is None:
+            return web.Response(status=route.status)
+        return web.Response(
+            body=reply.model_dump_json().encode(), status=route.status, content_type="application/json"
+        )
+
+    return answer
+
+
+@cache
+def _text() -> str:
+    document = build_document(
+        [route.operation for route in ROUTES],
+        title="RCE master",
+        description="Control of a robotics cloud.",
+        error=Error,
+    )
+    return json.dumps(document)
+
+
+async def _document(_: web.Request, __: Mapping[str, str]) -> web.Response:
+    return web.Response(text=_text(), content_type="application/json")
+
+
+def read_body(model: type[BaseModel], text: bytes) -> BaseModel:
+    """Read a request's body.
+
+    Raises:
+        Invalid: It does not fit; the text names each fault with its path.
+    """
+    try:
+        return model.model_validate_json(text or b"{}")
+    except ValidationError as error:
+        faults = "; ".join(f"{_place(fault['loc'])}: {fault['msg']}" for fault in error.errors())
+        raise Invalid(faults) from None
+
+
+def _place(location: tuple[int | str, ...]) -> str:
+    return ".".join(map(str, location)) or "body"
