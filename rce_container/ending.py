@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 from collections.abc import AsyncIterator
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from rce.link.handover import Doorman
 from rce.link.unix import remove_stale_sockets
 from rce_container.bundles.cache import BundleCache
 from rce_container.bundles.supply import Library
+from rce_container.environment import proc
 from rce_container.exceptions import StateBusyError
 from rce_container.folder import StateFolder
 from rce_container.limits import choose_limiter
@@ -27,23 +29,30 @@ from rce_container.settings import ContainerSettings
 
 BUSY_PATIENCE_S = 60.0
 """Longer than a task set that was told to end takes for it."""
+KILLED_PATIENCE_S = 30.0
+"""For the end of one that was killed; the kernel may have much to clean up."""
 _BUSY_PAUSE_S = 0.05
+_log = logging.getLogger(__name__)
 
 
-async def end_containers(settings: ContainerSettings, state_dir: Path) -> None:
+async def end_containers(
+    settings: ContainerSettings, state_dir: Path, *, patience: float = BUSY_PATIENCE_S
+) -> None:
     """End the containers of a state directory as their task set would, and remove all that is left of them.
 
-    A task set that still uses the directory is waited for: it may be about to end.
+    A task set that still uses the directory is waited for: it may be about to end. One that does not, because
+    it hangs or was stopped (SIGSTOP), is killed.
 
     Args:
         settings: How long nodes are given.
         state_dir: The task set's state directory.
+        patience: Seconds for which a task set is waited for.
 
     Raises:
         ContainerError: The directory cannot be used, or a task set uses it and does not end.
     """
     remove_stale_sockets(run_dir(), "robot_*.sock")
-    async with _taken(state_dir) as state, contextlib.AsyncExitStack() as stack:
+    async with _taken(state_dir, patience) as state, contextlib.AsyncExitStack() as stack:
         limiter = await asyncio.to_thread(choose_limiter, state.token, state.cgroups)
         stack.callback(limiter.close)
         runtimes: dict[str, Runtime] = {
@@ -69,23 +78,32 @@ async def end_containers(settings: ContainerSettings, state_dir: Path) -> None:
 
 
 @contextlib.asynccontextmanager
-async def _taken(state_dir: Path) -> AsyncIterator[StateFolder]:
-    """Take a state directory as soon as nobody else has it."""
-    deadline = asyncio.get_running_loop().time() + BUSY_PATIENCE_S
+async def _taken(state_dir: Path, patience: float) -> AsyncIterator[StateFolder]:
+    """Take a state directory as soon as no other process has it; kill the one that keeps it too long."""
     folder = StateFolder(state_dir, run_dir())
-    while True:
-        try:
-            state = folder.__enter__()
-        except StateBusyError:
-            if asyncio.get_running_loop().time() > deadline:
-                raise
-            await asyncio.sleep(_BUSY_PAUSE_S)
-            continue
-        break
+    state = await _take_within(folder, patience)
+    if state is None and (owner := folder.owner()) is not None:
+        _log.warning(
+            "rce-container (process %d) has not ended within %g s and is killed", owner.pid, patience
+        )
+        proc.kill(owner)
+        state = await _take_within(folder, KILLED_PATIENCE_S)
     try:
-        yield state
+        yield state or folder.__enter__()
     finally:
         folder.__exit__()
+
+
+async def _take_within(folder: StateFolder, patience: float) -> StateFolder | None:
+    """Take a state directory; None if another process still has it after some seconds."""
+    deadline = asyncio.get_running_loop().time() + patience
+    while True:
+        try:
+            return folder.__enter__()
+        except StateBusyError:
+            if asyncio.get_running_loop().time() > deadline:
+                return None
+            await asyncio.sleep(_BUSY_PAUSE_S)
 
 
 async def _no_master(sha256: str, offset: int) -> Piece:  # noqa: ARG001 - as a cache asks

@@ -22,6 +22,7 @@ import msgspec
 from msgspec import Struct
 
 from rce_container.archive import LOG_DAYS, LOG_SPACE, LogArchive
+from rce_container.environment import proc
 from rce_container.exceptions import StateBusyError, StateError
 from rce_container.trees import remove
 from rce_container.writing import write_whole
@@ -190,6 +191,7 @@ class StateFolder:
             self._containers.mkdir(mode=0o700, parents=True, exist_ok=True)
             self._lock = os.open(self._state / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._note_owner()
             self._run = self._run_base / f"c-{self.token}"
             self._run.mkdir(mode=0o700, parents=True, exist_ok=True)
         except BlockingIOError as error:
@@ -203,6 +205,20 @@ class StateFolder:
             raise StateError(
                 f"the path {self._run} is too long for sockets; set XDG_RUNTIME_DIR to a shorter one"
             )
+
+    def _note_owner(self) -> None:
+        own = proc.read(os.getpid())
+        os.truncate(self._lock, 0)
+        os.pwrite(self._lock, f"{own.pid} {own.start}\n".encode() if own is not None else b"", 0)
+
+    def owner(self) -> proc.Process | None:
+        """Return the process that has the state directory; None if it does not run or did not note itself."""
+        try:
+            pid, start = map(int, (self._state / "lock").read_text().split())
+        except (OSError, ValueError):
+            return None
+        found = proc.read(pid)
+        return found if found is not None and found.start == start else None
 
     def __exit__(self, *_: object) -> None:
         with contextlib.suppress(OSError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import shutil
 import signal
@@ -82,6 +83,41 @@ async def test_a_second_sigterm_waits_for_no_node(folder: Path) -> None:
         assert _text(logs).count(b"no ") == 1, "its pause was waited for"
         assert traces.left({engine.master.pid, engine.robots[0].pid}) == []
         await client.send("DC", {"containerTag": box})
+
+
+@pytest.mark.parametrize("runtime", ["process", pytest.param("namespace", marks=pytest.mark.needs("bwrap"))])
+async def test_end_of_containers_whose_manager_hangs(runtime: str) -> None:
+    """``rce-container --end`` kills the process that keeps the state directory, here a stopped one."""
+    async with running_engine(runtime=runtime) as engine, stranger(engine.url) as client:
+        box = f"box_{engine.http_port}"
+        traces = Traces(engine.folder, box)
+        await ask_for_echo(client, box, "testRobot")
+        await until(lambda: engine.processes_of("stringEcho.py"), timeout=60, what="the node runs")
+        traces.look()
+        os.kill(engine.container.pid, signal.SIGSTOP)
+        code = (
+            "import asyncio, pathlib, sys; from rce_container.ending import end_containers;"
+            "from rce_container.settings import ContainerSettings;"
+            "settings = ContainerSettings(machine='vm');"
+            "asyncio.run(end_containers(settings, pathlib.Path(sys.argv[1]), patience=0.1))"
+        )
+        folder = str(engine.folder / "container")
+        ender = Program("end", [sys.executable, "-P", "-c", code, folder], engine.env, engine.folder)
+        await ender.start(ready="")
+        try:
+            async with asyncio.timeout(60):
+                assert await _code(ender) == 0, ender.output()
+                assert await _code(engine.container) == -signal.SIGKILL
+        finally:
+            if engine.container.running:
+                await engine.container.kill()
+        assert "is killed" in ender.output()
+        assert traces.left({engine.master.pid, engine.robots[0].pid}) == []
+
+
+async def _code(program: Program) -> int:
+    assert program.process is not None
+    return await program.process.wait()
 
 
 def _text(logs: Path) -> bytes:
