@@ -69,6 +69,10 @@ class Carrier(ABC):
         """Bytes that are set aside for messages that have not come as a whole yet."""
 
     @abstractmethod
+    def drop_unfinished(self, size: int) -> list[Frame]:
+        """Forget the oldest of those messages until ``size`` bytes are free; return their first frames."""
+
+    @abstractmethod
     def control(self, frame: Frame) -> None:
         """Send a small frame of the link itself, before all messages. Ignored when the carrier ended."""
 
@@ -144,6 +148,10 @@ class LocalCarrier(Carrier):
     def unfinished_bytes(self) -> int:
         """Nothing: messages come as a whole."""
         return 0
+
+    def drop_unfinished(self, size: int) -> list[Frame]:  # noqa: ARG002 - messages come as a whole
+        """Return nothing."""
+        return []
 
     def abort(self, reason: Exception) -> None:
         """End both halves."""

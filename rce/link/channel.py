@@ -210,6 +210,20 @@ class Channel:
             case _:
                 raise ProtocolError(f"{frame.type.name} on a channel")
 
+    def frame_dropped(self, frame: Frame) -> None:
+        """Take note that a message of the peer was dropped while it came in, because memory is short.
+
+        Args:
+            frame: Its first frame, without payload.
+        """
+        match frame.type:
+            case FrameType.DATA:
+                self.slot.message_dropped(self, frame.id if frame.flags & LATCHED else None)
+            case FrameType.CALL:
+                self.fault(frame.id, Overloaded("the request was dropped: memory is short"))
+            case FrameType.REPLY:
+                self._calls.fail(frame.id, Overloaded("the answer was dropped: memory is short"))
+
     def _request_received(self, call_id: int, payload: bytes) -> None:
         server = self.slot.server
         if server is None:

@@ -12,7 +12,6 @@ from rce.guard.holdings import Holdings
 from rce.link.carrier import LocalCarrier
 from rce.link.channel import Channel
 from rce.link.dialer import keep_dialed
-from rce.link.exceptions import LinkLost
 from rce.link.link import Link, add_traffic
 from rce.link.pacing import Pacer
 from rce.link.queues import Backlog
@@ -120,11 +119,14 @@ class Endpoint:
         self._holdings.shed(self.waiting_bytes - goal)
 
     def drop_unfinished(self, size: int) -> None:
-        """End links on which most is incomplete, until ``size`` bytes are free; they are dialed anew."""
+        """Drop messages that have not come as a whole yet, until ``size`` bytes are free.
+
+        The oldest go first, of the links on which most is incomplete.
+        """
         goal = self.waiting_bytes - size
         for link in sorted(self._links.values(), key=lambda link: -link.unfinished_bytes):
-            if self.waiting_bytes > goal and link.unfinished_bytes:
-                link.abort(LinkLost("memory is short"))
+            if self.waiting_bytes > goal:
+                link.drop_unfinished(self.waiting_bytes - goal)
 
     async def apply(self, spec: EndpointSpec) -> None:
         """Make up the difference between ``spec`` and what is there.

@@ -21,6 +21,7 @@ into it.
 
 from __future__ import annotations
 
+import io
 import struct
 from enum import IntEnum
 from typing import TYPE_CHECKING, NamedTuple
@@ -133,21 +134,27 @@ def parse_sources(payload: bytes) -> frozenset[int]:
     return frozenset(struct.unpack(f"!{len(payload) // 4}I", payload))
 
 
+_NOTHING = io.BytesIO()
+
+
 class _Message:
     """A message that is being received; handed on only when all of its memory was filled."""
 
-    __slots__ = ("_buffer", "filled", "first", "total", "view")
+    __slots__ = ("_buffer", "dropped", "filled", "first", "total", "view")
 
     def __init__(self, first: Frame, total: int) -> None:
         self.first = first
         self.total = total
         self.filled = 0
+        self.dropped = False
+        """Whether nothing is kept of it; the rest is read to get past it."""
         self._buffer = unfilled(total)
         self.view = self._buffer.getbuffer()
 
     def write(self, data: memoryview) -> None:
         end = self.filled + len(data)
-        self.view[self.filled : end] = data
+        if not self.dropped:
+            self.view[self.filled : end] = data
         self.filled = end
 
     def finish(self) -> Frame:
@@ -156,7 +163,9 @@ class _Message:
 
     def discard(self) -> None:
         """Let go of the buffer, which complains if it is freed while it is looked into."""
+        self.dropped = True
         self.view.release()
+        self._buffer = _NOTHING
 
 
 class FrameReader:
@@ -186,7 +195,7 @@ class FrameReader:
         message = self._current
         # The last byte of a frame goes through the scratch: as long as whoever fills a buffer holds on to it,
         # which event loops do until `advance` returns, the message could not be taken without a copy.
-        if message is not None and self._missing > 1:
+        if message is not None and self._missing > 1 and not message.dropped:
             return message.view[message.filled : message.filled + self._missing - 1]
         return self._scratch[self._end :]
 
@@ -199,7 +208,7 @@ class FrameReader:
         Raises:
             ProtocolError: The bytes are no frames. The reader cannot be used any more.
         """
-        if self._current is not None and self._missing > 1:
+        if self._current is not None and self._missing > 1 and not self._current.dropped:
             self._current.filled += count
             self._missing -= count
             return []
@@ -230,12 +239,39 @@ class FrameReader:
             rest = rest[count:]
         return frames
 
+    def drop_unfinished(self, size: int) -> list[Frame]:
+        """Forget the oldest messages that have not come as a whole yet; what comes of them is passed over.
+
+        Not to be called between :meth:`get_buffer` and :meth:`advance`.
+
+        Args:
+            size: Bytes that are to be free, if so many are held.
+
+        Returns:
+            The first frame of each, without payload.
+        """
+        goal = self.held_bytes - size
+        dropped: list[Frame] = []
+        for message in self._messages():
+            if self.held_bytes <= goal:
+                break
+            if not message.dropped:
+                message.discard()
+                self.held_bytes -= message.total
+                dropped.append(message.first)
+        return dropped
+
     def close(self) -> None:
         """Forget the messages that did not become complete. The reader cannot be used any more."""
-        for message in {*self._unfinished.values(), *([self._current] if self._current else [])}:
+        for message in self._messages():
             message.discard()
         self._unfinished.clear()
         self._current = None
+
+    def _messages(self) -> list[_Message]:
+        """Return what has not come as a whole yet, oldest first."""
+        current = {} if self._current is None else {self._current: None}
+        return list(dict.fromkeys(self._unfinished.values()) | current)
 
     def _parse(self) -> list[Frame]:
         frames: list[Frame] = []
@@ -257,11 +293,12 @@ class FrameReader:
         if self._missing == 0:
             self._current = None
             if message.filled == message.total:
-                self.held_bytes -= message.total
                 if self._unfinished.get(message.first.channel) is message:
                     del self._unfinished[message.first.channel]
                     self._unfinished_bytes -= message.total
-                frames.append(message.finish())
+                if not message.dropped:
+                    self.held_bytes -= message.total
+                    frames.append(message.finish())
 
     def _parse_frame(self, frames: list[Frame]) -> bool:
         """Parse the frame at the start of the scratch; false if more of it must come first."""
@@ -311,9 +348,10 @@ class FrameReader:
         message = self._unfinished.pop(channel, None)
         if message is None:
             raise ProtocolError("ABORT without an unfinished message")
-        message.discard()
         self._unfinished_bytes -= message.total
-        self.held_bytes -= message.total
+        if not message.dropped:
+            self.held_bytes -= message.total
+        message.discard()
 
     def _compact(self) -> None:
         if self._start == self._end:

@@ -58,10 +58,16 @@ class Link:
         """Take note that :attr:`unfinished_bytes` grew."""
         self._on_growth()
 
-    def abort(self, reason: Exception) -> None:
-        """End the carrier; the dialing end makes another."""
-        if self.carrier is not None:
-            self.carrier.abort(reason)
+    def drop_unfinished(self, size: int) -> None:
+        """Drop the oldest messages that have not come as a whole yet, until ``size`` bytes are free.
+
+        The link goes on. Who waits for one of them is told; the log and the counters tell of the others.
+        """
+        dropped = [] if self.carrier is None else self.carrier.drop_unfinished(size)
+        for frame in dropped:
+            channel = self._channels.get(frame.channel)
+            if channel is not None:
+                channel.frame_dropped(frame)
 
     def pace(self, pacer: Pacer | None) -> None:
         """Limit what passes; none for no limit."""

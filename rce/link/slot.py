@@ -171,6 +171,14 @@ class InterfaceSlot:
             log.debug("interface %s refused a message", self._spec.tag, exc_info=True)
             self._fault_once(str(error) or type(error).__name__)
 
+    def message_dropped(self, channel: Channel, source: int | None) -> None:
+        """Take note that a peer's message was dropped while it came in: what its source latched is old."""
+        self.counters.dropped += 1
+        self._fault_once("memory is short; a message was dropped while it came in")
+        if source is not None:
+            name, ended = self._heard.hear(channel.number, source)
+            self._unlatch([*ended, name])
+
     def keep_sources(self, channel: Channel, sources: Collection[int]) -> None:
         """Have the interface forget what other sources of the peer latched."""
         self._unlatch(self._heard.retain(channel.number, sources))

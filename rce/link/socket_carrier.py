@@ -149,6 +149,10 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         """Bytes that are set aside for messages that have not come as a whole yet."""
         return 0 if self._ending else self._reader.held_bytes
 
+    def drop_unfinished(self, size: int) -> list[Frame]:
+        """Forget the oldest messages that have not come as a whole yet; the connection goes on."""
+        return [] if self._ending else self._reader.drop_unfinished(size)
+
     def control(self, frame: Frame) -> None:
         """Send a small frame of the link itself."""
         if self._ending or self._transport is None:

@@ -18,6 +18,7 @@ from rce.control.messages import (
     ClientReply,
     ClientRequest,
     Drop,
+    Fault,
     Gone,
     Hello,
     Left,
@@ -88,6 +89,7 @@ class FakeMaster:
         self.gone: list[str] = []
         self.requests: list[tuple[str, str, Any]] = []
         self.usage: Usage | None = None
+        self.faults: list[str] = []
         self.answer: Callable[[ClientRequest], Awaitable[tuple[str, ...]]] = self._agree
         self.peer: Peer | None = None
         self.url = ""
@@ -127,6 +129,8 @@ class FakeMaster:
                 self.gone.append(message.id)
             case Usage():
                 self.usage = message
+            case Fault():
+                self.faults.append(message.text)
             case _:
                 raise AssertionError(message)
         self.changed.set()
@@ -167,6 +171,8 @@ class End(Interface):
         self.received: asyncio.Queue[bytes] = asyncio.Queue()
         self.active = Signal()
         self.is_active = False
+        self.losses = 0
+        """How often it lost its last connection."""
         self.answer: Callable[[bytes], Awaitable[Buffer]] = self._echo
 
     async def _echo(self, payload: bytes) -> Buffer:
@@ -186,6 +192,7 @@ class End(Interface):
 
     def on_active(self, active: bool) -> None:
         self.is_active = active
+        self.losses += not active
         self.active.set()
 
 

@@ -12,6 +12,7 @@ from support.cloud import DIGEST, Cloud, running_cloud
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
+from rce.link import Overloaded
 from rce_robot.settings import SessionSettings
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ PATIENT = SessionSettings(ping_interval=None, drain_timeout=1.0)
 
 def dial(cloud: Cloud, user: str, robot: str) -> connect:
     query = f"userID={user}&robotID={robot}&password={DIGEST}"
-    return connect(f"{cloud.ws_url}?{query}", proxy=None, compression=None)
+    return connect(f"{cloud.ws_url}?{query}", proxy=None, compression=None, max_size=None)
 
 
 @asynccontextmanager
@@ -89,6 +90,7 @@ async def test_endless_messages_end_the_connection(robot_of: Any) -> None:
         )
         await still_served(good)
         await still_served(sockets[1])
+        await cloud.master.changed.until(lambda: "flood/f0" in cloud.master.left)
         again = await stack.enter_async_context(dial(cloud, "flood", "f0"))
         await still_served(again)
 
@@ -178,3 +180,48 @@ async def test_a_burst_of_latched_messages_reaches_a_robot_that_reads() -> None:
                     elif (message := json.loads(frame))["type"] == "DM":
                         tags.add(message["data"]["iTag"])
             assert tags == {f"map{number}" for number in range(count)}
+
+
+async def test_a_latched_burst_over_the_limit_does_not_end_the_link() -> None:
+    """60 MB of 20 topics begin to come in at once, of which the user may hold 16; the rest is dropped."""
+    count, size, limit = 20, 3 * MIB, 16 * MIB
+    async with running_cloud(PATIENT, user_memory=limit) as cloud:
+        ends = [await cloud.wire(f"map{number}", "PublisherForwarder", STRING) for number in range(count)]
+        after = await cloud.wire("after", "PublisherForwarder", STRING)
+        async with dial(cloud, "testUser", "testRobot") as robot:
+            for end in (*ends, after):
+                await end.active.until(lambda end=end: end.is_active)
+            for end in ends:
+                end.port.send(bytes(size), latched=True)
+
+            def moved() -> bool:
+                usage = cloud.master.usage
+                if usage is None or usage.held > limit:
+                    return False
+                interfaces = usage.endpoints["testUser/testRobot"].interfaces
+                came, dropped = (
+                    sum(getattr(interface, name) for interface in interfaces.values())
+                    for name in ("messages_in", "dropped")
+                )
+                return came > 0 and dropped > 0 and came + dropped >= count
+
+            await cloud.master.changed.until(moved)
+            assert any("memory is short" in fault for fault in cloud.master.faults)
+            after.port.send(b"\1\0\0\0x")
+            async with asyncio.timeout(60):
+                while True:
+                    frame = await robot.recv()
+                    if isinstance(frame, str) and '"iTag":"after"' in frame and '"DM"' in frame:
+                        break
+        assert [end.losses for end in (*ends, after)] == [0] * (count + 1)
+
+
+async def test_a_call_dropped_while_it_comes_in_ends_at_its_caller() -> None:
+    """A request of 30 MB comes to a robot whose user may hold 16 MB."""
+    async with running_cloud(PATIENT, user_memory=16 * MIB) as cloud:
+        end = await cloud.wire("serve", "ServiceClientForwarder", "std_srvs/SetBool")
+        async with dial(cloud, "testUser", "testRobot"):
+            await end.active.until(lambda: end.is_active)
+            with pytest.raises(Overloaded, match="the request was dropped: memory is short"):
+                await end.port.call(bytes(30 * MIB))
+            assert end.losses == 0

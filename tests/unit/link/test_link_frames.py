@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from itertools import zip_longest
 
 import pytest
 from hypothesis import given
@@ -125,6 +126,58 @@ def test_large_payload_is_read_in_place() -> None:
     assert got == frame
     assert type(got.payload) is bytes
     assert got.flags == LATCHED
+
+
+@given(
+    st.lists(LARGE, min_size=1, max_size=4, unique_by=lambda frame: frame.channel),
+    st.integers(0, 12),
+    st.integers(1, 300_000),
+    st.lists(st.sampled_from([1_000, 4_000, 70_000, 10**6]), min_size=1, max_size=3),
+)
+def test_dropped_messages_are_passed_over_and_others_come(
+    frames: list[Frame], when: int, size: int, cuts: list[int]
+) -> None:
+    reader = FrameReader(LIMITS)
+    parts = [fragments(frame, 10_000) for frame in frames]
+    written = [part for turn in zip_longest(*parts, fillvalue=b"") for part in turn if part]
+    got = fill(reader, b"".join(written[:when]), cuts)
+    before = reader.held_bytes
+    dropped = reader.drop_unfinished(size)
+    assert reader.held_bytes == before - sum(len(frames_of(frames, first).payload) for first in dropped)
+    assert reader.held_bytes <= max(0, before - size)
+    got += fill(reader, b"".join(written[when:]), cuts)
+    channels = {first.channel for first in dropped}
+    assert sorted(got) == sorted(frame for frame in frames if frame.channel not in channels)
+    assert reader.held_bytes == 0
+    assert fill(reader, b"".join(map(encode, frames)), cuts) == frames, "the channels can be used again"
+
+
+def frames_of(frames: list[Frame], first: Frame) -> Frame:
+    return next(frame for frame in frames if frame.channel == first.channel)
+
+
+def test_a_dropped_message_keeps_no_memory_while_its_rest_comes() -> None:
+    reader = FrameReader(LIMITS)
+    first, second, third = fragments(Frame(FrameType.DATA, 1, 0, 0, b"x" * 1_200_000), 400_000)
+    assert reader.feed(first) == []
+    assert reader.held_bytes == 1_200_000
+    (message,) = reader._unfinished.values()
+    assert [frame.channel for frame in reader.drop_unfinished(1)] == [1]
+    assert reader.held_bytes == 0
+    assert len(message._buffer.getbuffer()) == 0
+    assert reader.drop_unfinished(1) == []
+    assert reader.feed(second + third) == []
+
+
+def test_a_dropped_message_may_be_aborted() -> None:
+    reader = FrameReader(LIMITS)
+    frame = Frame(FrameType.DATA, 1, 0, 0, b"x" * 20_000)
+    first, second = fragments(frame, 10_000)
+    reader.feed(first)
+    reader.drop_unfinished(1)
+    assert reader.feed(encode(Frame(FrameType.ABORT, 1))) == []
+    assert reader.held_bytes == 0
+    assert reader.feed(first + second) == [frame]
 
 
 def test_abort_drops_the_unfinished_message() -> None:
