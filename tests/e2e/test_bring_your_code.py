@@ -12,7 +12,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
-from support.engine import Engine, running_engine, until
+from support.engine import Engine, running_engine
 from support.owner import Owner
 from support.stranger import stranger
 
@@ -45,7 +45,7 @@ async def bridge(owner: Owner, core: Core) -> AsyncIterator[None]:
     )
     assert process.stdout is not None
     try:
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(180):
             while b"rce-ros ready" not in (line := await process.stdout.readline()):
                 assert line, "rce-ros ended"
         yield
@@ -55,18 +55,23 @@ async def bridge(owner: Owner, core: Core) -> AsyncIterator[None]:
 
 
 async def ask(core: Core, text: str) -> str:
-    """Say something on the robot's side and hear what comes back."""
+    """Say something at the robot until the node in the cloud has heard it; return what comes back."""
     async with Node("robot", argv=[], master_uri=core.uri) as node:
         quiet = await node.advertise("/quiet", "std_msgs/String")
         loud = await node.subscribe("/loud", "std_msgs/String")
-        await quiet.wait_for_subscribers(1, timeout=20)
-        await until(lambda: loud.connections, what="the robot hears the cloud")
-        async with asyncio.timeout(30):
-            quiet.publish(data=text)
+
+        async def answer() -> str:
             async for heard in loud:
                 if heard.data.startswith(text.upper()):
                     return str(heard.data)
-    raise AssertionError("nothing came back")
+            raise AssertionError("nothing came back")
+
+        async with asyncio.timeout(180):
+            answering = asyncio.create_task(answer())
+            while not answering.done():
+                quiet.publish(data=text)
+                await asyncio.wait([answering], timeout=0.2)
+            return await answering
 
 
 def node_of(engine: Engine) -> tuple[str, int]:
