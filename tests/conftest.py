@@ -141,6 +141,8 @@ _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
         lambda: data_folder() is not None,
         "the folder of public maps and logs is absent (set RCE_DATA)",
     ),
+    "curl": (lambda: shutil.which("curl") is not None, "curl is missing (Debian: curl)"),
+    "openssl": (lambda: shutil.which("openssl") is not None, "openssl is missing (Debian: openssl)"),
     "systemd": (
         lambda: shutil.which("systemd-analyze") is not None,
         "systemd-analyze is missing (Debian: systemd)",

@@ -27,7 +27,7 @@ from rce.tls.folder import CertificateFolder
 from rce_client import Connection
 from rce_client.exceptions import RefusedError
 
-pytestmark = [pytest.mark.e2e]
+pytestmark = [pytest.mark.e2e, pytest.mark.needs("curl", "openssl")]
 
 BIN = Path(sys.executable).parent
 START_S = 120.0

@@ -142,6 +142,7 @@ SAME_OUTSIDE = {
     *(f"{name} socket of the machine" for name in ("docker", "podman", "bus", "systemd", "journal")),
     "sync",
     "message queues",
+    "real time",  # the cgroup that the tests run in may have no share of it
 }
 """What ends in the same way, or may, without a container: there is none of it, or everybody may do it."""
 
