@@ -32,11 +32,12 @@ from rce.tls.identity import Context
 from rce_container.bundles.cache import BundleCache
 from rce_container.bundles.requirements import Installer
 from rce_container.bundles.supply import Library
-from rce_container.exceptions import RuntimeUnavailableError
+from rce_container.exceptions import RuntimeUnavailableError, StateError
 from rce_container.folder import StateFolder
 from rce_container.limits import Limiter, choose_limiter
 from rce_container.manager import Manager
 from rce_container.offers import Offers, find_offers
+from rce_container.renewal import RENEW, inherited_children
 from rce_container.runtimes.base import Runtime, source_root
 from rce_container.runtimes.namespace import NamespaceRuntime
 from rce_container.runtimes.podman import PodmanRuntime
@@ -70,20 +71,51 @@ class App:
     state_dir: Path | None = None
     tls: TlsChoice = field(default_factory=TlsChoice)
 
-    async def run(self, ready: Callable[[str, str], None]) -> None:
+    async def run(self, ready: Callable[[str, str], None]) -> bool:
         """Run until SIGINT or SIGTERM; a second one ends the containers without waiting for their nodes.
 
         Args:
             ready: Called with the task set's name and its runtime when it listens.
+
+        Returns:
+            Whether the containers were let go of, so that the program can be started anew
+            (:mod:`rce_container.renewal`); else they ended.
 
         Raises:
             ContainerError: The state directory or the runtime cannot be used.
             OSError: The link port cannot be taken.
             CertificateError: The certificates cannot be used.
         """
+        with inherited_children():
+            quitting = Quitting()
+            work = asyncio.create_task(self._run(quitting, ready), name="task set")
+            quitting.on_renewal(work.cancel)
+            try:
+                await work
+            except asyncio.CancelledError:
+                if not quitting.renewal:
+                    work.cancel()
+                    raise
+            return quitting.renewal
+
+    def check(self) -> None:
+        """Find out whether the program could start with these settings.
+
+        Raises:
+            ContainerError: The state directory cannot be used.
+            CertificateError: The certificates cannot be used.
+        """
+        self.tls.for_task_sets()
+        if not os.access(_existing(self._state_dir), os.R_OK | os.W_OK | os.X_OK):
+            raise StateError(f"cannot use the state directory {self._state_dir}: it may not be written to")
+
+    @property
+    def _state_dir(self) -> Path:
+        return self.state_dir or default_state_dir() / "container"
+
+    async def _run(self, quitting: Quitting, ready: Callable[[str, str], None]) -> None:
         identity = self.tls.for_task_sets()
         tls = None if identity is None else identity.client
-        quitting = Quitting()
         uids = UidPool(self.settings.first_uid, self.settings.uids)
         namespace = NamespaceRuntime(home_bytes=self.settings.home_bytes, uids=uids)
         podman = PodmanRuntime(self.settings.images, home_bytes=self.settings.home_bytes, uids=uids)
@@ -94,9 +126,8 @@ class App:
         detail = "; ".join(filter(None, (detail, review)))
         offers = await asyncio.to_thread(find_offers, runtime, runtimes.values())
         await asyncio.to_thread(_compile_engine)
-        state_dir = self.state_dir or default_state_dir() / "container"
         keep = self.settings.log_days, self.settings.log_space
-        with StateFolder(state_dir, run_dir(), log_days=keep[0], log_space=keep[1]) as state:
+        with StateFolder(self._state_dir, run_dir(), log_days=keep[0], log_space=keep[1]) as state:
             name = state.name(self.name)
             doorman = Doorman(tls=self.settings.tls)
             async with contextlib.AsyncExitStack() as stack:
@@ -200,14 +231,26 @@ def package_path(given: Sequence[Path]) -> tuple[Path, ...]:
 
 
 class Quitting:
-    """Hears signals from now on; a manager that comes later ends at once what an earlier one left."""
+    """Hears signals from now on; a manager that comes later ends at once what an earlier one left.
+
+    Attributes:
+        renewal: Whether the program is to let go of its containers and start anew.
+    """
 
     def __init__(self) -> None:
         self.told = asyncio.Event()
         """Set by the first signal."""
         self._manager: Manager | None = None
+        self._let_go: Callable[[], object] = lambda: None
+        self.renewal = False
+        loop = asyncio.get_running_loop()
         for number in end_signals():
-            asyncio.get_running_loop().add_signal_handler(number, self._on_signal)
+            loop.add_signal_handler(number, self._on_signal)
+        loop.add_signal_handler(RENEW, self._on_renewal)
+
+    def on_renewal(self, let_go: Callable[[], object]) -> None:
+        """Have something called when the program is to start anew."""
+        self._let_go = let_go
 
     def of(self, manager: Manager) -> asyncio.Event:
         """Return what tells a manager to end; a second signal makes it kill its containers."""
@@ -218,6 +261,13 @@ class Quitting:
         if self.told.is_set() and self._manager is not None:
             self._manager.kill_all()
         self.told.set()
+
+    def _on_renewal(self) -> None:
+        if self._event.is_set() or self.renewal:  # an end that has begun goes on
+            return
+        log.info("starting anew; containers stay")
+        self.renewal = True
+        self._let_go()
 
 
 def _machine(settings: ContainerSettings, offers: Offers, limiter: Limiter, detail: str) -> MachineInfo:
@@ -241,6 +291,11 @@ def _machine(settings: ContainerSettings, offers: Offers, limiter: Limiter, deta
         limits=limiter.name,
         detail="; ".join(filter(None, (detail, limiter.detail, offers.detail))),
     )
+
+
+def _existing(path: Path) -> Path:
+    """Return the path, or of its parents the first that exists."""
+    return next(one for one in (path, *path.absolute().parents) if one.exists())
 
 
 def _compile_engine() -> None:

@@ -24,7 +24,10 @@ def container(
     end: Annotated[
         bool, typer.Option("--end", help="End the containers that a killed rce-container left, and stop.")
     ] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Check settings, secret and certificates, and stop.")
+    ] = False,
     verbose: Verbose = False,
 ) -> None:
     """Run a container task set: makes the containers of the master at MASTER_IP on this machine."""
-    raise typer.Exit(run(engine, end=end, verbose=verbose))
+    raise typer.Exit(run(engine, end=end, check=check, verbose=verbose))

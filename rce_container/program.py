@@ -19,25 +19,28 @@ from rce_container.app import App, package_path
 from rce_container.bundles.requirements import InstallerSettings
 from rce_container.ending import end_containers
 from rce_container.exceptions import ContainerError
+from rce_container.renewal import renew
 from rce_container.settings import ContainerSettings
 
 if TYPE_CHECKING:
     from rce.config.settings import EngineSettings
 
 
-def run(engine: EngineSettings, *, end: bool = False, verbose: bool = False) -> int:
+def run(engine: EngineSettings, *, end: bool = False, check: bool = False, verbose: bool = False) -> int:
     """Run a container task set until it is told to end.
 
     Args:
         engine: The settings.
         end: Whether only to end the containers that a killed ``rce-container`` left.
+        check: Whether only to find out whether it could start with these settings.
         verbose: Whether all is logged.
 
     Returns:
         The exit code; faults were told.
     """
     try:
-        log_as("rce-container", engine, verbose=verbose)
+        if not check:  # the file belongs to the program that runs
+            log_as("rce-container", engine, verbose=verbose)
     except LogFileError as error:
         print(f"rce-container: {error}", file=sys.stderr)  # noqa: T201 - for whoever started it
         return 1
@@ -78,7 +81,11 @@ def run(engine: EngineSettings, *, end: bool = False, verbose: bool = False) -> 
             state_dir=engine.container_state,
             tls=TlsChoice.of(engine),
         )
-        uvloop.run(program.run(_announce))
+        if check:
+            program.check()
+            return 0
+        if uvloop.run(program.run(_announce)):
+            renew()
     except (SecretError, RunDirError, ContainerError, CertificateError, OSError) as error:
         print(f"rce-container: {error}", file=sys.stderr)  # noqa: T201 - for whoever started it
         return 1

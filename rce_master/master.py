@@ -95,6 +95,12 @@ class Master:
             CertificateError: A certificate cannot be used.
         """
         realm = await Realm.open(self._store, self._settings.state)
+        if not self._settings.dev and not len(realm.tables.users):
+            logger.warning(
+                "there are no users, so no one can log in: stop this program and run"
+                " `rce user add NAME --admin --state-dir %s`",
+                self._settings.state_dir,
+            )
         events = EventLog(time.time())
         realm.listeners.append(lambda changes: _log_events(events, changes))
         reconciler = Reconciler(realm)

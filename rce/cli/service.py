@@ -6,6 +6,7 @@ import json
 import os
 import pwd
 import shutil
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -24,6 +25,7 @@ from rce.services.units import SYSTEM_STATE, Role, Service, unit
 SYSTEM_UNITS = Path("/etc/systemd/system")
 SYSTEM_CONFIG = Path("/etc/rce")
 USER = "rce"
+HOMES = (Path("/home"), Path("/root"))
 _PROGRAMS = {
     Role.ENGINE: ("rce", "up"),
     Role.MASTER: ("rce-master",),
@@ -104,7 +106,6 @@ def make_service(
         Role.CONTAINER: settings.container_state,
     }
     user = run_as if system and role in (Role.MASTER, Role.ROBOT) and run_as != "root" else ""
-    homes = (Path("/home"), Path("/root"))
     return Service(
         role=role,
         program=program,
@@ -113,7 +114,7 @@ def make_service(
         user=user,
         secret=(settings.secret_file or SYSTEM_CONFIG / "secret") if system and not settings.dev else None,
         state=states.get(role),
-        hide_homes=not any(program.is_relative_to(home) for home in homes),
+        hide_homes=not any(path.is_relative_to(home) for path in _needed(program) for home in HOMES),
     )
 
 
@@ -137,10 +138,12 @@ def _check(service: Service) -> None:
     """Refuse what would not start."""
     if not service.program.exists():
         _fail(f"{service.program} is not installed; install RCE with the extra 'server'")
-    if service.user and not service.hide_homes:
+    closed = next(filter(None, map(_closed_folder, _needed(service.program))), None)
+    if service.user and closed is not None:
         _fail(
-            f"{service.program} is in a home folder, where user {service.user} cannot go: install RCE"
-            " elsewhere, such as in /opt/rce (python3 -m venv /opt/rce), or give --run-as root"
+            f"user {service.user} may not enter {closed}, which {service.program} needs: install RCE where"
+            " every user may, with a Python that is there too (/usr/bin/python3 -m venv /opt/rce), or give"
+            " --run-as root"
         )
     if service.secret is not None and not service.secret.exists():
         _fail(
@@ -148,6 +151,16 @@ def _check(service: Service) -> None:
         )
     if not service.system and not default_secret_file().exists():
         typer.echo(f"note: there is no secret in {default_secret_file()} yet (rce secret new)")
+
+
+def _needed(program: Path) -> tuple[Path, ...]:
+    """Return where a program, its Python and this package are."""
+    return program, Path(sys.executable).resolve(), Path(sys.base_prefix), Path(__file__).resolve()
+
+
+def _closed_folder(path: Path) -> Path | None:
+    """Return the first folder on the way to a path that only its owner or group may enter."""
+    return next((each for each in reversed(path.parents) if not each.stat().st_mode & stat.S_IXOTH), None)
 
 
 def _make_user(name: str) -> None:

@@ -94,15 +94,15 @@ ProtectKernelModules=yes
 
 def unit(service: Service) -> str:
     """Return the text of a service's unit."""
-    command = " ".join(map(quoted, (str(service.program), *service.arguments)))
-    if service.secret is not None:
-        command += f" --secret-file %d/{_CREDENTIAL}"
+    bare = " ".join(map(quoted, (str(service.program), *service.arguments)))
+    command = bare if service.secret is None else f"{bare} --secret-file %d/{_CREDENTIAL}"
     wanted_by = "multi-user.target" if service.system else "default.target"
     parts = [
         f"# Made by `rce install-service {service.role}`.\n",
         f"[Unit]\nDescription={_TITLES[service.role]}\n",
         "Wants=network-online.target\nAfter=network-online.target\n" if service.system else "",
         f"\n[Service]\nType=exec\nExecStart={command}\n",
+        _reload(service, bare) if service.role is Role.CONTAINER else "",
         "Environment=PYTHONUNBUFFERED=1\nRestart=always\nRestartSec=2\nTimeoutStopSec=60\nKillMode=mixed\n",
         f"SyslogIdentifier=rce-{service.role}\n",
         "LimitNOFILE=524288\n" if service.system else "",
@@ -110,6 +110,13 @@ def unit(service: Service) -> str:
         f"\n[Install]\nWantedBy={wanted_by}\n",
     ]
     return "".join(parts)
+
+
+def _reload(service: Service, command: str) -> str:
+    """Return how the program starts anew in its own process, while its containers live on."""
+    if service.secret is not None:  # systemd 252 hands credentials to the main process only
+        command += f" --secret-file {quoted(str(service.secret))}"
+    return f"ExecReload={command} --check\nExecReload=/bin/kill -USR1 $MAINPID\n"
 
 
 def quoted(text: str) -> str:

@@ -49,6 +49,7 @@ _GIFTS = len(Gifts._fields)
 def main() -> None:
     """Serve a manager; in a forked child, be what was ordered."""
     die_before_others(OF_ENVIRONMENT)
+    set_title((sys.executable, "-m", "rce_container.nursery"), "rce-nursery")
     orders = socket.socket(fileno=os.dup(0))
     program = orders.recv(MAX_PACKET)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)

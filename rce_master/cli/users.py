@@ -61,7 +61,7 @@ def add(
 async def _add(name: str, role: str, password: str, state_dir: Path | None) -> None:
     async with _directory(state_dir) as users:
         await users.add(name, role, password)
-    typer.echo(f"added {name}")
+    typer.echo(f"added {name} {users.place}")
 
 
 @app.command("list")
@@ -97,7 +97,7 @@ def _is_own(name: str, state_dir: Path | None) -> bool:
 async def _passwd(name: str, old: str, password: str, state_dir: Path | None) -> None:
     async with _directory(state_dir) as users:
         await users.set_password(name, password, old)
-    typer.echo(f"changed the password of {name}")
+    typer.echo(f"changed the password of {name} {users.place}")
 
 
 @app.command("remove")
@@ -109,7 +109,7 @@ def remove(name: str, state_dir: StateDir = None) -> None:
 async def _remove(name: str, state_dir: Path | None) -> None:
     async with _directory(state_dir) as users:
         await users.remove(name)
-    typer.echo(f"removed {name}")
+    typer.echo(f"removed {name} {users.place}")
 
 
 @app.command("role")
@@ -125,6 +125,10 @@ async def _set_role(name: str, role: str, state_dir: Path | None) -> None:
 
 
 class _Directory(Protocol):
+    @property
+    def place(self) -> str:
+        """Where it is, for messages."""
+
     async def add(self, name: str, role: str, password: str) -> None: ...
     async def list(self) -> list[dict[str, Any]]: ...
     async def set_password(self, name: str, password: str, old: str) -> None: ...
@@ -135,8 +139,9 @@ class _Directory(Protocol):
 class _ApiDirectory:
     """Users over the API of a running master."""
 
-    def __init__(self, client: ApiClient) -> None:
+    def __init__(self, client: ApiClient, url: str) -> None:
         self._client = client
+        self.place = f"at {url}"
 
     async def add(self, name: str, role: str, password: str) -> None:
         await self._client.call("POST", "/users", {"name": name, "role": role, "password": password})
@@ -158,7 +163,8 @@ class _ApiDirectory:
 class _StoreDirectory:
     """Users right in the store, which is locked meanwhile."""
 
-    def __init__(self, state: State, store: Store) -> None:
+    def __init__(self, state: State, store: Store, folder: Path) -> None:
+        self.place = f"in {folder}"
         self._state = state
         self._store = store
         self._authenticator = Authenticator(state.tables)
@@ -202,7 +208,7 @@ async def _directory(state_dir: Path | None) -> AsyncIterator[_Directory]:
             state_dir = default_state_dir()
         else:
             async with ApiClient.of(login) as client:
-                yield _ApiDirectory(client)
+                yield _ApiDirectory(client, login.url)
             return
     async with _open_store(state_dir) as directory:
         yield directory
@@ -218,7 +224,7 @@ async def _open_store(state_dir: Path) -> AsyncIterator[_StoreDirectory]:
     except StoreBusy as error:
         raise CliError(f"{error}; to work over its API, log in there: rce login") from error
     try:
-        directory = _StoreDirectory(State.load(await store.load(), time.monotonic()), store)
+        directory = _StoreDirectory(State.load(await store.load(), time.monotonic()), store, folder)
         try:
             yield directory
         finally:

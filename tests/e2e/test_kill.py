@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+import os
+import signal
+from collections.abc import AsyncIterator, Awaitable, Callable
 
 import psutil
 import pytest
@@ -151,17 +153,39 @@ async def test_whole_container_dies_and_is_made_again() -> None:
         await check_echo(client, "made again")
 
 
+def zombies(parent: int) -> list[int]:
+    children = psutil.Process(parent).children()
+    return [process.pid for process in children if process.status() == psutil.STATUS_ZOMBIE]
+
+
+async def killed(engine: Engine, traffic: Traffic) -> None:
+    await engine.container.kill()
+    before = traffic.sent
+    await until(lambda: before + 50 in traffic.returned, what="traffic without a manager")
+    await engine.container.start()
+
+
+async def renewed(engine: Engine, traffic: Traffic) -> None:
+    """Executed anew, in the same process."""
+    shims = {process.pid for process in engine.processes_of("rce-container-shim")}
+    started = engine.container.output().count(" ready: ")
+    os.kill(engine.container.pid, signal.SIGUSR1)
+    await until(lambda: engine.container.output().count(" ready: ") > started, what="it is ready again")
+    assert engine.container.running
+    assert {process.pid for process in engine.processes_of("rce-container-shim")} == shims
+
+
 @pytest.mark.parametrize("runtime", RUNTIMES)
-async def test_manager_dies_and_adopts_its_containers(runtime: str) -> None:
+@pytest.mark.parametrize("change", [killed, renewed])
+async def test_next_manager_adopts_its_containers(
+    runtime: str, change: Callable[[Engine, Traffic], Awaitable[None]]
+) -> None:
     async with running_engine(runtime=runtime) as engine, stranger(engine.url) as client:
         await wire_echo(client)
         nodes = node_pids(engine)
         async with traffic(client) as running:
             await until(lambda: len(running.returned) > 20, what="traffic")
-            await engine.container.kill()
-            before = running.sent
-            await until(lambda: before + 50 in running.returned, what="traffic without a manager")
-            await engine.container.start()
+            await change(engine, running)
             await until(
                 lambda: [
                     c for c in engine.get("/api/v1/containers")["containers"] if c["state"] == "running"
@@ -174,6 +198,12 @@ async def test_manager_dies_and_adopts_its_containers(runtime: str) -> None:
             assert set(range(first, last + 1)) == running.returned, "a surviving link lost messages"
         assert node_pids(engine) == nodes
         assert all(state for _, state in client.statuses)
+        for process in engine.processes_of("rce_container.environment"):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                process.kill()
+        await client.wait_status(dict.fromkeys(ROBOT_TAGS, False))
+        await client.wait_status(dict.fromkeys(ROBOT_TAGS, True))
+        await until(lambda: not zombies(engine.container.pid), what="ended children are waited for")
 
 
 @pytest.mark.parametrize("runtime", RUNTIMES)

@@ -1,0 +1,146 @@
+"""The engine as services of a systemd that runs: installed, killed, reloaded, stopped."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.booted import SYSTEMD, Booted, booted
+from support.engine import until
+
+pytestmark = [
+    pytest.mark.e2e,
+    pytest.mark.needs("root", "systemd", "cgroups", "netns", "bwrap"),
+    pytest.mark.skipif(not SYSTEMD.exists(), reason="systemd is missing (Debian: systemd)"),
+    pytest.mark.timeout(400),
+]
+
+BIN = Path(sys.executable).parent
+UNITS = ("rce-master", "rce-robot", "rce-container")
+PATIENCE_S = 120.0
+
+SETTINGS = """\
+master: {bind: 127.0.0.1}
+robot: {bind: 127.0.0.1, public_host: 127.0.0.1}
+container: {bind: 127.0.0.1, runtime: namespace}
+master_host: 127.0.0.1
+"""
+NODE = {"tag": "echo", "pkg": "Test", "exe": "stringEcho.py", "name": "echo"}
+
+
+def folders_to(*places: str) -> set[str]:
+    """Folders that the service's user must be able to enter, wherever this Python is installed."""
+    return {str(folder) for place in places for folder in Path(place).parents}
+
+
+async def install(machine: Booted) -> None:
+    machine.run(
+        f"mkdir /etc/rce; cat >/etc/rce/engine.yaml; {BIN}/rce secret new /etc/rce/secret", stdin=SETTINGS
+    )
+    machine.run(f"chmod o+x {shlex.join(folders_to(sys.base_prefix, str(BIN)))}")
+    machine.run(
+        f"{BIN}/rce user add alice --admin --password-stdin --state-dir /var/lib/rce/master",
+        stdin="wonderland\n",
+    )
+    said = await machine.run_soon(f"{BIN}/rce install-service master")
+    assert "made the user rce" in said
+    roles = [machine.run_soon(f"{BIN}/rce install-service {role}") for role in ("robot", "container")]
+    assert "made /etc/systemd/system/rce-robot.service" in "".join(await asyncio.gather(*roles))
+    for unit in UNITS:
+        await until(
+            lambda unit=unit: f"{unit} ready: " in machine.journal(unit),  # type: ignore[misc]
+            timeout=PATIENCE_S,
+            what=f"{unit} is ready\n{machine.run(f'systemctl status {unit}', code=None)}",
+        )
+
+
+def main_pid(machine: Booted, unit: str) -> int:
+    return int(machine.run(f"systemctl show --value -p MainPID {unit}"))
+
+
+_ASK = """
+import json, sys, urllib.request
+method, path, body = json.load(sys.stdin)
+def call(method, path, body, headers):
+    url = "http://127.0.0.1:9000/api/v1" + path
+    data = None if body is None else json.dumps(body).encode()
+    with urllib.request.urlopen(urllib.request.Request(url, data, headers, method=method)) as reply:
+        return json.loads(reply.read() or "null")
+token = call("POST", "/login", {"userID": "alice", "password": "wonderland"}, {})["token"]
+print(json.dumps(call(method, path, body, {"Authorization": "Bearer " + token})))
+"""
+
+
+def ask(machine: Booted, method: str, path: str, body: object = None) -> Any:
+    """Ask the master's API."""
+    reply = machine.run(f"{sys.executable} -c {shlex.quote(_ASK)}", stdin=json.dumps((method, path, body)))
+    return json.loads(reply)
+
+
+def node_pid(machine: Booted) -> int:
+    """The pid of the container's node; 0 while it does not run, or the master does not know of it."""
+    (container,) = ask(machine, "GET", "/containers")["containers"]
+    pids = machine.run("pgrep -f '[s]tringEcho.py'", code=None).split()
+    return int(pids[0]) if len(pids) == 1 and container["state"] == "running" else 0
+
+
+async def test_services_survive_kills_and_reloads_and_stop_whole() -> None:
+    async with booted() as machine:
+        await install(machine)
+        ask(machine, "POST", "/containers", {"tag": "box"})
+        ask(machine, "POST", "/containers/box/nodes", NODE)
+        node = await until(lambda: node_pid(machine), timeout=PATIENCE_S, what="the node runs")
+        assert "/rce-container.service/" in machine.run(f"cat /proc/{node}/cgroup"), "it has no cgroup"
+        await asyncio.gather(check_restart(machine, "rce-master"), check_restart(machine, "rce-robot"))
+        assert await until(lambda: node_pid(machine), timeout=PATIENCE_S, what="the master knows") == node
+        await check_reload(machine)
+        assert await until(lambda: node_pid(machine), timeout=PATIENCE_S, what="it is adopted") == node
+        machine.run("kill -KILL $(systemctl show --value -p MainPID rce-container)")
+        await until(
+            lambda: node_pid(machine) not in (0, node), timeout=PATIENCE_S, what="the container is made again"
+        )
+        check_stop(machine)
+
+
+async def check_restart(machine: Booted, unit: str) -> None:
+    """Kill a program; systemd starts it again, and its log is in the journal."""
+    before = machine.journal(unit).count(" ready: ")
+    machine.run(f"kill -KILL {main_pid(machine, unit)}")
+    await until(
+        lambda: machine.journal(unit).count(" ready: ") > before, timeout=PATIENCE_S, what=f"{unit} is back"
+    )
+
+
+async def check_reload(machine: Booted) -> None:
+    """A faulty settings file is told of and changes nothing; with a sound one the program starts anew."""
+    pid = main_pid(machine, "rce-container")
+    before = machine.journal("rce-container").count(" ready: ")
+    machine.run("sed -i s/runtime:/runtimes:/ /etc/rce/engine.yaml")
+    said = await machine.run_soon("systemctl reload rce-container", code=None)
+    assert "failed" in said
+    assert "container.runtimes: is no known key; did you mean 'runtime'?" in machine.journal("rce-container")
+    machine.run("sed -i 's/runtimes: namespace/runtime: namespace, labels: [reloaded]/' /etc/rce/engine.yaml")
+    await machine.run_soon("systemctl reload rce-container")
+    await until(
+        lambda: machine.journal("rce-container").count(" ready: ") > before,
+        timeout=PATIENCE_S,
+        what="rce-container is ready again",
+    )
+    assert main_pid(machine, "rce-container") == pid
+    found = ask(machine, "GET", "/machines")["machines"]
+    assert [one["labels"] for one in found if one["labels"]] == [["reloaded"]]
+
+
+def check_stop(machine: Booted) -> None:
+    """Nothing is left: no process, no cgroup, no socket."""
+    for unit in UNITS:
+        machine.run(f"systemctl stop {unit}")
+        assert machine.run(f"systemctl show --value -p Result {unit}").strip() == "success"
+        assert machine.run(f"find /sys/fs/cgroup -path '*{unit}.service*' -name 'rce-*'") == ""
+        assert machine.run(f"ls /run/{unit}", code=2)
+    assert machine.run("pgrep -fa '[r]ce_|[r]ce-|[b]wrap|[s]tringEcho'", code=1) == ""
