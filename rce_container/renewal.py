@@ -13,9 +13,8 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import NoReturn
-
-import psutil
 
 RENEW = signal.SIGUSR1
 
@@ -48,13 +47,22 @@ def inherited_children() -> Iterator[None]:
         with contextlib.suppress(ChildProcessError):
             os.waitpid(pid, 0)
 
-    for child in psutil.Process().children():
+    for pid in _children():
         with contextlib.suppress(ProcessLookupError):
-            fd = waiting[child.pid] = os.pidfd_open(child.pid)
-            loop.add_reader(fd, collect, child.pid)
+            fd = waiting[pid] = os.pidfd_open(pid)
+            loop.add_reader(fd, collect, pid)
     try:
         yield
     finally:
         for fd in waiting.values():
             loop.remove_reader(fd)
             os.close(fd)
+
+
+def _children() -> list[int]:
+    """Return the children of this process, which has one thread yet."""
+    pid = os.getpid()
+    try:
+        return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    except OSError:  # a kernel without it: zombies stay until the program ends
+        return []
