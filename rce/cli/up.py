@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import sys
 from collections.abc import Iterable
 from typing import Annotated, Any
 
@@ -16,12 +15,27 @@ from rce.config.fields import SettingError, fields_of
 from rce.config.loading import as_document
 from rce.config.settings import LOOPBACK, EngineSettings, MasterSettings
 from rce.supervision.plan import Plan
-from rce.supervision.supervisor import Program
+from rce.supervision.program import Program
 from rce.tls.choice import WARNED_VARIABLE, plain_warning
 
 OPTIONS = SettingsOptions(
     "dev", "state_dir", "secret_file", "log_level", "log_dir", "master", "robot", "container", "tls", up=True
 )
+SHARED = (
+    "encodings.idna",
+    "logging",
+    "rce.config.handover",
+    "rce.config.logs",
+    "rce.config.secret",
+    "rce.control.channel",
+    "rce.link.hub",
+    "rce.ros.packages",
+    "rce.supervision.signals",
+    "rce.tls.choice",
+    "uvloop",
+    "websockets.asyncio.server",
+)
+"""Modules that the task sets load, and the master in part; they are in memory once."""
 ROBOT_LINK_PORT, CONTAINER_LINK_PORT = 10030, 10031
 
 
@@ -68,6 +82,7 @@ def plan(settings: EngineSettings) -> Plan:
     text = warning(settings)
     return Plan(
         programs=tuple(programs(settings)),
+        shared=SHARED,
         ready=tuple(ready),
         warnings=(f"[up] {text}",) if text else (),
         certified=certified,
@@ -113,5 +128,5 @@ def _next(port: int, offset: int) -> int:
 
 
 def _program(name: str, module: str, document: dict[str, Any], *options: str) -> Program:
-    argv = [sys.executable, "-P", "-m", module, "--settings", json.dumps(document), *options]
-    return Program(name, argv, {WARNED_VARIABLE: "1"})
+    words = ("--settings", json.dumps(document), *options)
+    return Program.of(name, module, *words, env={WARNED_VARIABLE: "1"})

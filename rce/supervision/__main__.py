@@ -11,22 +11,24 @@ from typing import TYPE_CHECKING
 import uvloop
 
 from rce.supervision.plan import Plan
+from rce.supervision.prefork import Prepared, prepare
 from rce.supervision.signals import end_signals
 from rce.supervision.supervisor import StartError, Supervisor
 from rce.tls.exceptions import CertificateError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from contextlib import AbstractAsyncContextManager
 
 
-async def run(plan: Plan) -> int:
+async def run(plan: Plan, prepared: Mapping[str, Prepared]) -> int:
     """Run an engine until SIGINT, SIGTERM or SIGHUP; returns the exit code.
 
     A second signal ends containers without waiting for their nodes. Whatever ends this, nothing is left.
     """
     task = asyncio.current_task()
     assert task is not None
-    supervisor = Supervisor(plan.programs, _say)
+    supervisor = Supervisor(plan.programs, _say, prepared)
 
     def stop() -> None:
         supervisor.hurry() if task.cancelling() else task.cancel()
@@ -69,7 +71,8 @@ def _complain(line: str) -> None:
 def main() -> int:
     """Run the plan whose file is the first argument; returns the exit code."""
     try:
-        return uvloop.run(run(Plan.take_over(int(sys.argv[1]))))
+        plan = Plan.take_over(int(sys.argv[1]))
+        return uvloop.run(run(plan, prepare(plan.programs, plan.shared)))
     except KeyboardInterrupt:  # before signals are handled: nothing runs yet
         return 128 + signal.SIGINT
 

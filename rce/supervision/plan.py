@@ -11,7 +11,8 @@ import sys
 from dataclasses import asdict, dataclass, field
 from typing import Any, NoReturn
 
-from rce.supervision.supervisor import Program
+from rce.supervision.program import Program
+from rce.supervision.title import set_title
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,6 +20,8 @@ class Plan:
     """The programs of an engine, and what to say of them."""
 
     programs: tuple[Program, ...]
+    shared: tuple[str, ...] = ()
+    """Python modules that the programs load."""
     ready: tuple[str, ...]
     """Lines to show once all are up."""
     warnings: tuple[str, ...] = ()
@@ -38,10 +41,11 @@ class Plan:
             file.write(json.dumps(asdict(self)).encode())
             file.seek(0)
             os.set_inheritable(file.fileno(), True)
-            # The command line is there for those who look for the process.
+            # The command line is there for those who look for the process, its last word for the forks' own.
+            room = "-" * max(len("".join(program.argv)) for program in self.programs)
             os.execv(  # noqa: S606 - this interpreter
                 sys.executable,
-                [sys.executable, "-P", "-m", "rce.supervision", str(file.fileno()), *sys.argv],
+                [sys.executable, "-P", "-m", "rce.supervision", str(file.fileno()), *sys.argv, room],
             )
 
     @classmethod
@@ -53,8 +57,10 @@ class Plan:
         """
         with os.fdopen(fd, "rb") as file:
             found = json.load(file)
+        set_title(sys.orig_argv[:-1], os.path.basename(sys.executable))  # noqa: PTH119 - as in titles
         return cls(
             programs=tuple(Program(**program) for program in found["programs"]),
+            shared=tuple(found["shared"]),
             ready=tuple(found["ready"]),
             warnings=tuple(found["warnings"]),
             certified=found["certified"],

@@ -10,7 +10,7 @@ import signal
 import sys
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from functools import partial
-from typing import Final
+from typing import Final, Protocol
 
 _PR_SET_PDEATHSIG: Final = 1
 _libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
@@ -19,20 +19,41 @@ STOP_TIMEOUT_S = 60.0
 """Longer than ``rce-container`` takes for containers with nodes that do not end when they are told."""
 KILL_TIMEOUT_S = 5.0
 MAX_LINE = 1 << 20
+VARIABLES: Final = {"PYTHONUNBUFFERED": "1"}
+"""Environment variables of all children, beside this program's own."""
 
 
-def _end_with(parent: int) -> None:
-    """Runs in the child: ask the kernel for a SIGTERM when the supervisor dies, however it dies."""
+def end_with(parent: int) -> None:
+    """Run in a child: ask the kernel for a SIGTERM when the supervisor dies, however it dies."""
     if _libc is not None:
         _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
         if os.getppid() != parent:  # it died before it was asked
             os.kill(os.getpid(), signal.SIGTERM)
 
 
+class Process(Protocol):
+    """A process of this one's, as :class:`asyncio.subprocess.Process` shows it."""
+
+    @property
+    def pid(self) -> int:
+        """The process id."""
+
+    @property
+    def returncode(self) -> int | None:
+        """The exit code, or None while it runs."""
+
+    @property
+    def stdout(self) -> asyncio.StreamReader | None:
+        """What it prints."""
+
+    async def wait(self) -> int:
+        """Wait for its end; return the exit code."""
+
+
 class Child:
     """A running program. Its output is read by :meth:`lines`; it ends with its supervisor."""
 
-    def __init__(self, name: str, process: asyncio.subprocess.Process) -> None:
+    def __init__(self, name: str, process: Process) -> None:
         self.name = name
         self._process = process
 
@@ -48,9 +69,9 @@ class Child:
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.STDOUT,
-            env={**os.environ, "PYTHONUNBUFFERED": "1", **(env or {})},
+            env={**os.environ, **VARIABLES, **(env or {})},
             start_new_session=True,
-            preexec_fn=partial(_end_with, os.getpid()),
+            preexec_fn=partial(end_with, os.getpid()),
             limit=MAX_LINE,
         )
         return cls(name, process)

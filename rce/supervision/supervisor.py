@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Coroutine, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 from rce.supervision.final import FinalCommand
+from rce.supervision.prefork import ForkedProcess, Prepared
 from rce.supervision.process import Child, relay
+from rce.supervision.program import Program
 
 RESTART_DELAY_S = 0.2
 RESTART_DELAY_MAX_S = 5.0
@@ -22,24 +23,24 @@ class StartError(Exception):
     """A program did not come up."""
 
 
-@dataclass(frozen=True, slots=True)
-class Program:
-    """A program to keep running. It prints a line holding ``ready:`` once it can be used."""
-
-    name: str
-    argv: Sequence[str]
-    env: Mapping[str, str] = field(default_factory=dict)
-    final: Sequence[str] = ()
-    """A command that removes what the programs leave if they are killed. It runs after the last end of all if
-    one of them did not end properly, and also when the supervisor itself is killed."""
-
-
 class Supervisor:
-    """Runs programs until it is cancelled. ``show`` gets every line they print."""
+    """Runs programs until it is cancelled.
 
-    def __init__(self, programs: Sequence[Program], show: Callable[[str], None]) -> None:
+    Args:
+        programs: In the order in which they start.
+        show: Gets every line they print.
+        prepared: Forks that are to become some of them, by their names, at their first start.
+    """
+
+    def __init__(
+        self,
+        programs: Sequence[Program],
+        show: Callable[[str], None],
+        prepared: Mapping[str, Prepared] | None = None,
+    ) -> None:
         self._programs = programs
         self._show = show
+        self._prepared = dict(prepared or {})
         self._children: dict[str, Child] = {}
         """The last process of each program, by name."""
         self._finals: dict[str, FinalCommand] = {}
@@ -110,7 +111,7 @@ class Supervisor:
             delay = min(2 * delay, RESTART_DELAY_MAX_S)
 
     async def _run_once(self, program: Program, ready: asyncio.Event) -> int:
-        child = await Child.start(program.name, program.argv, env=program.env)
+        child = await self._start(program)
         self._children[program.name] = child
         reader = asyncio.create_task(relay(child, self._show, ready))
         try:
@@ -120,6 +121,12 @@ class Supervisor:
             await asyncio.wait([reader], timeout=OUTPUT_TIMEOUT_S)
             reader.cancel()
             await asyncio.gather(reader, return_exceptions=True)
+
+    async def _start(self, program: Program) -> Child:
+        prepared = self._prepared.pop(program.name, None)
+        if prepared is None:
+            return await Child.start(program.name, program.argv, env=program.env)
+        return Child(program.name, await ForkedProcess.begin(prepared))
 
 
 async def _end(tasks: Sequence[asyncio.Task[None]]) -> None:

@@ -20,6 +20,7 @@ from collections.abc import Sequence
 
 import msgspec
 
+from rce.supervision.title import set_title, show_variables
 from rce_container.environment.messages import Boot
 from rce_container.environment.nodes.cradle import Cradle
 from rce_container.environment.process import OF_ENVIRONMENT, die_before_others, limit_oneself
@@ -37,7 +38,6 @@ from rce_container.nursery.messages import (
     encode,
 )
 from rce_container.nursery.mounts import HOME
-from rce_container.nursery.title import set_title, show_variables
 
 for _module in ("encodings.idna", "importlib.metadata", "uvloop", "yaml", "xml.etree.ElementTree"):
     with contextlib.suppress(ImportError):  # what environments and nodes would import when they need it

@@ -15,10 +15,10 @@ import time
 import msgspec
 from msgspec import Struct
 
+from rce.supervision.title import set_title, show_variables
 from rce_container.environment.process import OF_NODES, die_before_others
 from rce_container.nursery import kernel
 from rce_container.nursery.script import open_streams, run_script
-from rce_container.nursery.title import set_title, show_variables
 
 MAX_PACKET = 1 << 18
 """Bytes."""

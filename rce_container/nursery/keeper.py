@@ -13,9 +13,9 @@ from collections.abc import Mapping
 
 import msgspec
 
+from rce.supervision.title import ROOM_VARIABLE, padding
 from rce_container.exceptions import StartError
 from rce_container.nursery.messages import MAX_PACKET, Answer, Birth, Gifts, decode_answer, encode
-from rce_container.nursery.title import ROOM_VARIABLE, padding
 
 log = logging.getLogger(__name__)
 

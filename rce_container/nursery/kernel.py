@@ -38,7 +38,6 @@ class Mount(IntFlag):
 
 class _Prctl(IntEnum):
     SET_DUMPABLE = 4
-    SET_NAME = 15
     SET_SECCOMP = 22
     CAPBSET_DROP = 24
     SET_SECUREBITS = 28
@@ -103,12 +102,6 @@ def set_dumpable(dumpable: bool) -> None:
 def take_in_orphans() -> None:
     """Become the parent of what descendants leave behind."""
     _prctl(_Prctl.SET_CHILD_SUBREAPER, 1)
-
-
-def set_name(name: str) -> None:
-    """Set what the process is called in lists; 15 bytes of it are kept."""
-    text = ctypes.create_string_buffer(os.fsencode(name))
-    _prctl(_Prctl.SET_NAME, ctypes.addressof(text))
 
 
 def keep_rights_as_another_user() -> None:

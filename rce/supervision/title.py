@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import ctypes
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-
-from rce_container.nursery import kernel
+from typing import Final
 
 ROOM = 4096
 """Bytes that a program leaves in its arguments, and in its variables, for its children's."""
 ROOM_VARIABLE = "RCE_ROOM"
 
+_PR_SET_NAME: Final = 15
 _ARGUMENTS = (45, 46)
 """Fields of ``/proc/PID/stat`` after the program's name: where the memory begins and ends."""
 _VARIABLES = (47, 48)
@@ -30,7 +31,8 @@ def set_title(words: Sequence[str], name: str) -> None:
         name: The program's name; 15 bytes of it are shown.
     """
     _show(_ARGUMENTS, words)
-    kernel.set_name(name)
+    text = ctypes.create_string_buffer(os.fsencode(name))
+    ctypes.CDLL(None).prctl(_PR_SET_NAME, ctypes.c_ulong(ctypes.addressof(text)), 0, 0, 0)
 
 
 def show_variables(environ: Mapping[str, str]) -> None:
