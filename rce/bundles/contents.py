@@ -115,25 +115,32 @@ def _package(tree: Tree, texts: dict[str, bytes]) -> Package:
 
 
 def _executables(tree: Tree, package: Package) -> Iterator[str]:
-    for entry in _candidates(tree):
+    for entry in tree.entries.values():
         name = entry.parts[-1]
-        if entry.executable or (package.python == "engine" and name.endswith(".py")):
+        if entry.kind is not Kind.FILE or len(entry.parts) == 1:
+            continue
+        is_run = package.python == "engine" and name.endswith(".py") and _is_usual(entry)
+        if is_run or (entry.executable and not any(part.startswith(".") for part in entry.parts[1:-1])):
             yield name
 
 
 def _candidates(tree: Tree) -> Iterator[Entry]:
     for entry in tree.entries.values():
-        folder = "/".join(entry.parts[1:-1])
-        if entry.kind is Kind.FILE and folder in FOLDERS and len(entry.parts) > 1:
+        if entry.kind is Kind.FILE and len(entry.parts) > 1 and _is_usual(entry):
             yield entry
+
+
+def _is_usual(entry: Entry) -> bool:
+    """Tell whether a file is in a folder for nodes."""
+    return "/".join(entry.parts[1:-1]) in FOLDERS
 
 
 def _warnings(tree: Tree, package: Package, executables: tuple[str, ...], wanted: bytes) -> Iterator[str]:
     definitions = any(f"{tree.name}/{kind}" in tree.entries for kind in _DEFINITIONS)
     if not executables and not definitions:
         yield (
-            "no node can be made of it: there is no executable file in the folder itself, nor in"
-            f" {', '.join(filter(None, FOLDERS))}"
+            "no node can be made of it: there is no executable file in it, and in the folder itself,"
+            f" {', '.join(filter(None, FOLDERS))} no file that the engine's Python runs"
         )
     if package.python == "system":
         for entry in _candidates(tree):

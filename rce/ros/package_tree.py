@@ -86,7 +86,7 @@ class PackageTree:
         if began < self._good_until:
             return True
         self.checks += 1
-        is_current = all(_stamp(path) == stamp for path, stamp in found.stamps.items())
+        is_current = all(stamp_of(path) == stamp for path, stamp in found.stamps.items())
         if len(found.stamps) > SMALL:
             now = time.monotonic()
             self._good_until = now + CHECK_SHARE * (now - began)
@@ -101,7 +101,7 @@ class PackageTree:
         while level:
             below: list[str] = []
             for path in level:
-                stamp = found.stamps[path] = _stamp(path)
+                stamp = found.stamps[path] = stamp_of(path)
                 if stamp is None or stamp[:2] in seen:
                     continue
                 if len(seen) >= MAX_FOLDERS:
@@ -131,7 +131,7 @@ class PackageTree:
         for manifest in self._manifests:
             if manifest in entries and _is(entries[manifest], os.DirEntry.is_file):
                 file = os.path.join(path, manifest)  # noqa: PTH118 - thousands of times
-                stamp = found.stamps[file] = _stamp(file)
+                stamp = found.stamps[file] = stamp_of(file)
                 known = self._names.get(file)
                 name = known[1] if known is not None and known[0] == stamp else self._name_of(Path(path))
                 names[file] = stamp, name
@@ -155,7 +155,8 @@ def _is(entry: os.DirEntry[str], question: Callable[[os.DirEntry[str]], bool]) -
         return False
 
 
-def _stamp(path: str) -> Stamp | None:
+def stamp_of(path: str) -> Stamp | None:
+    """Return what tells whether a folder or file has changed; None if there is none."""
     try:
         found = os.stat(path)  # noqa: PTH116 - thousands of times
     except OSError:

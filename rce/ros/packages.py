@@ -4,8 +4,10 @@ A package is a folder with a ``package.yaml`` (ours) or a ``package.xml`` (ROS's
 of the package path (:mod:`rce.ros.package_tree`), or one directly below that holds ``msg`` or ``srv`` folders
 only, as distributions install them. Its executables are files in the folder itself or in
 ``nodes``, ``scripts``, ``bin`` or ``lib`` below it; those of a package that is installed as
-``PREFIX/share/PKG`` are also in ``PREFIX/lib/PKG``. An installed Python distribution adds nodes by entry
-points of the group ``rce.nodes``, named ``PKG:EXE``; a file of the same name goes before.
+``PREFIX/share/PKG`` are also in ``PREFIX/lib/PKG``. What is in none of these is looked for at any depth of
+the package's folder, as rosrun and roslaunch do (:mod:`rce.ros.executables`). An installed Python
+distribution adds nodes by entry points of the group ``rce.nodes``, named ``PKG:EXE``; a file of the same name
+goes before.
 
 ``package.yaml`` holds::
 
@@ -24,6 +26,7 @@ import sys
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from rce.ros.executables import ExecutableFinder, is_executable
 from rce.ros.package_tree import PackageTree
 
 if TYPE_CHECKING:
@@ -87,16 +90,22 @@ class Package(NamedTuple):
         """
         if not exe or exe.startswith("/") or "\0" in exe or ".." in PurePosixPath(exe).parts:
             raise ExecutableNotFound(f"{exe!r} is not a file inside package {self.name}")
-        candidates = [folder / exe for folder in self._folders()]
-        for file in candidates:
-            if file.is_file():
-                return self._command(file)
+        files = [folder / exe for folder in self._folders()]
+        meant = [file for file in files if os.path.isfile(file)]  # noqa: PTH113 - pathlib's question may raise
+        for file in meant:
+            if command := self._command(file):
+                return command
+        if "/" not in exe and (found := _finder.find(self.path, exe)) is not None:
+            return [str(found)]
+        if meant:
+            raise ExecutableNotFound(f"{meant[0]} may not be executed (chmod +x makes it so)")
         for name, target in _scripts(self.name):  # last, because all that is installed must be looked through
             if name == exe:
                 return [sys.executable, "-c", _call_of(target)]
         where = ", ".join(str(folder) for folder in self._folders() if folder.is_dir())
         raise ExecutableNotFound(
-            f"package {self.name} has no executable {exe!r} (looked in {where or self.path})"
+            f"package {self.name} has no executable {exe!r} (looked in {where or self.path}, and below"
+            f" {self.path} for one that may be executed)"
         )
 
     def _folders(self) -> Iterator[Path]:
@@ -106,11 +115,10 @@ class Package(NamedTuple):
             yield self.path.parent.parent / "lib" / self.name
 
     def _command(self, file: Path) -> list[str]:
+        """Return how to execute a file; empty if it may not be executed."""
         if self.python == "engine" and file.suffix == ".py":
             return [sys.executable, str(file)]
-        if not os.access(file, os.X_OK):
-            raise ExecutableNotFound(f"{file} may not be executed (chmod +x makes it so)")
-        return [str(file)]
+        return [str(file)] if is_executable(file) else []
 
 
 class PackageIndex:
@@ -200,6 +208,7 @@ def _holds_definitions(folder: Path) -> bool:
     return any(os.path.isdir(folder / kind) for kind in ("msg", "srv", "action"))  # noqa: PTH112
 
 
+_finder = ExecutableFinder()
 _trees: dict[Path, PackageTree] = {}
 MAX_TREES = 64
 """How many folders' searches are remembered."""

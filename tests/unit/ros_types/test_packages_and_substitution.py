@@ -108,6 +108,15 @@ def test_what_is_not_inside_the_package_is_refused(tmp_path: Path, exe: str) -> 
         PackageIndex([tmp_path]).find("pkg").executable(exe)
 
 
+def test_file_elsewhere_that_may_be_executed_goes_before_one_that_may_not(tmp_path: Path) -> None:
+    folder = make(tmp_path / "pkg", "package.xml", "<package><name>pkg</name></package>", nodes__n=0o644)
+    file = folder / "test" / "tools" / "n"
+    file.parent.mkdir(parents=True)
+    file.write_text("#!/bin/sh\n")
+    file.chmod(0o755)
+    assert PackageIndex([tmp_path]).find("pkg").executable("n") == [str(folder / "test" / "tools" / "n")]
+
+
 def test_a_file_that_may_not_be_executed_is_refused(tmp_path: Path) -> None:
     make(tmp_path / "pkg", nodes__n=0o644)
     with pytest.raises(ExecutableNotFound, match="chmod"):
