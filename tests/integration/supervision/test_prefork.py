@@ -28,6 +28,7 @@ def main():
     print(json.dumps({
         "pid": os.getpid(),
         "argv": sys.argv[1:],
+        "executed": sys.orig_argv,
         "shown": open("/proc/self/cmdline").read().rstrip("\\0").split("\\0"),
         "called": open("/proc/self/comm").read(),
         "environ": {name: os.environ.get(name) for name in kept},
