@@ -24,7 +24,7 @@ _SLICE = 64 << 10
 _CHECKED = 256 << 10
 """Bytes that are checked to be UTF-8 at a time."""
 _FEW = 64
-"""Characters that ``find`` looks for: where they are few, it skips thirty times as fast as ``count`` counts."""
+"""Characters that ``find`` looks for: where they are few, it is thirty times as fast as ``count``."""
 _MAX_OPENERS = 2048
 _MAX_COMMAS = 16384
 _MAX_ESCAPES = 16384
