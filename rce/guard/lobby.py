@@ -53,11 +53,12 @@ class Lobby:
         in_all: Most from everywhere.
 
     Attributes:
+        name: What comes in here.
         turned_away: How many were not let in, or had to go for others.
     """
 
     def __init__(self, name: str, *, per_address: int = PER_ADDRESS, in_all: int = IN_ALL) -> None:
-        self._name = name
+        self.name = name
         self._per_address = per_address
         self._in_all = in_all
         self._guests: dict[str, dict[Guest, None]] = {}
@@ -106,7 +107,7 @@ class Lobby:
         if address not in self._complained and address in self._guests:
             self._complained.add(address)
             count = len(self._guests[address])
-            _log.warning("%s: %d connections from %s do not say who they are", self._name, count, address)
+            _log.warning("%s: %d connections from %s do not say who they are", self.name, count, address)
 
     def _silent_at(self, address: str) -> dict[Guest, None]:
         return self._silent.get(address, {})

@@ -8,6 +8,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.protocol import State
 
 from rce.guard.lobby import address_of
+from rce.guard.plain import PlainPort
 
 if TYPE_CHECKING:
     import asyncio
@@ -19,7 +20,9 @@ class GuardedConnection(ServerConnection):
     """A connection that waits in a lobby until it is known; made by what :func:`guarded` returns."""
 
     lobby: Lobby
+    plain: PlainPort
     _guest: Guest | None = None
+    _heard = False
 
     def speak(self) -> None:
         """Take note that its handshake's request has come, so that others do not take its place any more."""
@@ -42,8 +45,14 @@ class GuardedConnection(ServerConnection):
     def data_received(self, data: bytes) -> None:
         """Drop who sends garbage, or their end, before the handshake was answered.
 
-        The library has given such a connection up then, and could not send its answer.
+        The library has given such a connection up then, and could not send its answer. TLS clients of a plain
+        port are told what they are.
         """
+        if not self._heard:
+            self._heard = True
+            if self.plain.refuses(self.transport, data, self.loop.time()):
+                self.protocol.state = State.CLOSED
+                return
         super().data_received(data)
         if self.protocol.state is State.CONNECTING and self.protocol.eof_sent:
             self._give_up()
@@ -70,4 +79,8 @@ ConnectionT = TypeVar("ConnectionT", bound=GuardedConnection)
 
 def guarded(kind: type[ConnectionT], lobby: Lobby) -> type[ConnectionT]:
     """Return the kind of connection with this lobby, for ``serve(create_connection=...)``."""
-    return type(kind.__name__, (kind,), {"lobby": lobby, "__module__": kind.__module__})
+    return type(
+        kind.__name__,
+        (kind,),
+        {"lobby": lobby, "plain": PlainPort(lobby.name), "__module__": kind.__module__},
+    )

@@ -9,6 +9,7 @@ from aiohttp import web
 from yarl import URL
 
 from rce.guard.lobby import Guest, Lobby, address_of
+from rce.guard.plain import PlainPort
 from rce.tls.gate import TlsGate
 from rce.web.faults import logger, refuse_expectations
 
@@ -70,6 +71,7 @@ class HttpServer:
         self._host = host
         self._port = port
         self._gate = None if tls is None else TlsGate("HTTPS", tls, self.lobby)
+        self._plain = PlainPort("HTTP") if tls is None else None
         self._server: asyncio.Server | None = None
         self.url = ""
 
@@ -115,7 +117,9 @@ class HttpServer:
             return
         self._guests[transport] = guest
         protocol = cast("asyncio.Protocol", self._runner.server())
-        transport.set_protocol(protocol)
+        transport.set_protocol(
+            protocol if self._plain is None else _FirstWords(self._plain, protocol, transport)
+        )
         protocol.connection_made(transport)
 
     def _forget_ended(self) -> None:
@@ -153,3 +157,21 @@ class _Arrival(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._let_in(cast("asyncio.Transport", transport))
+
+
+class _FirstWords(asyncio.Protocol):
+    """A plain connection's protocol until its first bytes, which may be those of a TLS client."""
+
+    def __init__(self, port: PlainPort, protocol: asyncio.Protocol, transport: asyncio.Transport) -> None:
+        self._port = port
+        self._protocol = protocol
+        self._transport = transport
+        self.pause_writing = protocol.pause_writing  # type: ignore[method-assign] # passed on as they are
+        self.resume_writing = protocol.resume_writing  # type: ignore[method-assign]
+        self.eof_received = protocol.eof_received  # type: ignore[method-assign]
+        self.connection_lost = protocol.connection_lost  # type: ignore[method-assign]
+
+    def data_received(self, data: bytes) -> None:
+        if not self._port.refuses(self._transport, data, asyncio.get_running_loop().time()):
+            self._transport.set_protocol(self._protocol)
+            self._protocol.data_received(data)

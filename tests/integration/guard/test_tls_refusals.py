@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import uvloop
-from support.cloud import SECRET
+from aiohttp import ClientSession, web
+from support.cloud import SECRET, running_cloud
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
@@ -16,6 +18,9 @@ from rce.tls.faults import explain_to_client
 from rce.tls.folder import CertificateFolder
 from rce.tls.identity import TlsFiles, TlsIdentity
 from rce.tls.websocket import TlsClientConnection
+from rce.web.server import HttpServer
+from rce_client.discovery import locate
+from rce_client.exceptions import UnavailableError
 
 LOOPS = {"asyncio": asyncio.new_event_loop, "uvloop": uvloop.new_event_loop}
 # libuv makes a pipe for signals with the first loop, and keeps it.
@@ -122,3 +127,50 @@ async def test_damaged_list_keeps_the_former_one(tmp_path: Path) -> None:
 
 def _three(site: Site, name: str) -> tuple[Path, Path, Path]:
     return site.folder.certificate(name), site.folder.key(name), site.folder.authority
+
+
+@pytest.fixture
+def told(caplog: pytest.LogCaptureFixture) -> Callable[[], list[str]]:
+    return lambda: [one.getMessage() for one in caplog.records if "it speaks TLS at a port" in one.message]
+
+
+@pytest.mark.parametrize("loop", LOOPS)
+def test_tls_client_at_a_plain_port_is_told(loop: str, tmp_path: Path, told: Callable[[], list[str]]) -> None:
+    """Both ends name it: the client in its error, the server in one line for each address."""
+    folder = CertificateFolder(tmp_path)
+    folder.make_authority()
+    context = TlsIdentity(TlsFiles(authority=folder.authority)).client()
+
+    async def refused(port: int) -> None:
+        with pytest.raises((InvalidHandshake, OSError)) as caught:
+            await connect(f"wss://127.0.0.1:{port}", ssl=context, proxy=None)
+        assert "the server does not speak TLS at this port; remove --tls" in str(
+            explain_to_client(caught.value)
+        )
+
+    async def run() -> None:
+        control = ControlServer(SECRET, on_hello=nothing, on_message=nothing, on_gone=nothing, port=0)
+        async with control, HttpServer(web.Application(), "127.0.0.1", 0) as http:
+            port = int(http.url.rpartition(":")[2].rstrip("/"))
+            for _ in range(3):
+                await refused(control.port)
+                await refused(port)
+            with pytest.raises(UnavailableError, match="the server does not speak TLS at this port"):
+                await locate(f"https://127.0.0.1:{port}/", "testUser", tls=context)
+            async with ClientSession() as session, session.get(http.url) as reply:
+                assert reply.status == 404  # plain clients are served as ever
+
+    with asyncio.Runner(loop_factory=LOOPS[loop]) as runner:
+        runner.run(run())
+    assert sorted(line.partition(":")[0] for line in told()) == ["HTTP", "task sets"]
+
+
+async def test_robot_in_tls_at_a_plain_port_is_told(tmp_path: Path, told: Callable[[], list[str]]) -> None:
+    folder = CertificateFolder(tmp_path)
+    folder.make_authority()
+    context = TlsIdentity(TlsFiles(authority=folder.authority)).client()
+    async with running_cloud() as cloud:
+        with pytest.raises(OSError) as caught:  # noqa: PT011 - what it means is looked at below
+            await connect(cloud.ws_url.replace("ws://", "wss://"), ssl=context, proxy=None)
+        assert "the server does not speak TLS at this port" in str(explain_to_client(caught.value))
+    assert len(told()) == 1

@@ -1,0 +1,56 @@
+"""Tell TLS clients that a port does not speak TLS, in words that their TLS library passes on as a fault."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+from rce.guard.complaints import Complaints
+from rce.guard.lobby import address_of
+
+if TYPE_CHECKING:
+    import asyncio
+
+_log = logging.getLogger(__name__)
+
+_HANDSHAKE_RECORD = 0x16
+"""First byte of a TLS client, and of no HTTP request."""
+_TEXT = b"This port does not speak TLS: use http:// or ws://\n"
+_ANSWER = (
+    b"HTTP/1.1 400 Bad Request\r\nContent-Type: text/plain\r\nConnection: close\r\n"
+    b"Content-Length: %d\r\n\r\n%b" % (len(_TEXT), _TEXT)
+)
+
+
+class PlainPort:
+    """Refuses TLS clients of a server without TLS.
+
+    Args:
+        name: What is served, for the log.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._complaints = Complaints()
+
+    def refuses(self, transport: asyncio.Transport, data: bytes, now: float) -> bool:
+        """Tell whether a connection is refused for its first bytes; if so, it is answered and closed.
+
+        Args:
+            transport: Of the connection.
+            data: Its first bytes.
+            now: Seconds that never go back.
+        """
+        if data[:1] != bytes([_HANDSHAKE_RECORD]):
+            return False
+        address = address_of(transport.get_extra_info("peername"))
+        if self._complaints.is_due(address, now):
+            _log.warning(
+                "%s: a client at %s was not taken: it speaks TLS at a port without TLS; let it use http:// or"
+                " ws://, or start this program with --tls",
+                self._name,
+                address or "this machine",
+            )
+        transport.write(_ANSWER)
+        transport.close()
+        return True
