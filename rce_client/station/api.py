@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
+MAX_CELL = 2**31 - 1
+"""Largest number of a cell that the planner's messages hold."""
+
 
 class _Model(BaseModel):
     model_config = ConfigDict(extra="forbid")
@@ -12,7 +15,7 @@ class _Model(BaseModel):
 class GoalRequest(_Model):
     """Where a robot is to go."""
 
-    cell: int | None = Field(description="Number of the goal cell; null: stop and stay.", ge=0)
+    cell: int | None = Field(description="Number of the goal cell; null: stop and stay.", ge=0, le=MAX_CELL)
 
 
 class CellRequest(_Model):

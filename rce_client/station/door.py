@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 
 from aiohttp import hdrs, web
 
@@ -99,6 +99,6 @@ def set_cookie(response: web.StreamResponse, token: str, *, secure: bool) -> Non
     response.set_cookie(COOKIE, token, httponly=True, samesite="Strict", secure=secure)
 
 
-def problem(status: int, text: str, headers: dict[str, str] | None = None) -> web.Response:
+def problem(status: int, text: str, headers: Mapping[str, str] | None = None) -> web.Response:
     """Return an answer that says what is wrong."""
     return web.json_response({"error": text}, status=status, headers=headers)

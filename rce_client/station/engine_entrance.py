@@ -13,6 +13,7 @@ from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, Self, TypedDict
 
 import aiohttp
+from aiohttp import hdrs
 from yarl import URL
 
 from rce.tls.faults import explain_to_client
@@ -32,6 +33,10 @@ LIFETIME_S = 12 * 3600.0
 """Of a login at the page."""
 MAX_KNOWN = 1000
 MAX_NOTES = 1000
+_TOLD_ON = (400, 401, 403, 429)
+"""Statuses of the master's answer to a login that its caller gets as they are."""
+_ASKED_IN_VAIN = (aiohttp.ClientError, TimeoutError, ValueError, KeyError, AttributeError, TypeError)
+"""What asking the master may end with, also if something else answers at its address."""
 _TIMEOUT = aiohttp.ClientTimeout(total=10)
 
 
@@ -115,7 +120,7 @@ class EngineEntrance:
             return known
         try:
             person = await self._ask(token)
-        except (aiohttp.ClientError, TimeoutError) as error:
+        except _ASKED_IN_VAIN as error:
             if token in self._known and known is not None and now - asked < STALE_S:
                 return known
             raise EntranceError(
@@ -139,7 +144,7 @@ class EngineEntrance:
         try:
             token = await self._log_in(body, headers)
             person = await self.who(token)
-        except (aiohttp.ClientError, TimeoutError) as error:
+        except _ASKED_IN_VAIN as error:
             raise EntranceError(503, f"the engine cannot be reached; try again ({_words(error)})") from error
         if person is None or not person.sees:
             await self.log_out(token)
@@ -177,16 +182,19 @@ class EngineEntrance:
             self._api / "login", json=body, headers=headers, **self._account.how
         ) as reply:
             answer = await reply.json()
-            if reply.status != HTTPStatus.OK:
-                raise EntranceError(reply.status, str(answer.get("error", reply.reason)))
-            return str(answer["token"])
+            if reply.status == HTTPStatus.OK:
+                return str(answer["token"])
+            said = str(answer.get("error", reply.reason))
+            if reply.status in _TOLD_ON:
+                raise EntranceError(reply.status, said, _seconds(reply.headers.get(hdrs.RETRY_AFTER, "")))
+            raise EntranceError(503, f"the engine lets no one log in now: {said}")
 
     async def _write_notes(self) -> None:
         while True:
             token, action = await self._notes.get()
             try:
                 await self._write_note(token, action)
-            except (aiohttp.ClientError, TimeoutError, EntranceError) as error:
+            except (*_ASKED_IN_VAIN, EntranceError) as error:
                 _log.warning("not in the audit log: %s %s: %s", action.name, action.subject, error)
 
     async def _write_note(self, token: str, action: Action) -> None:
@@ -212,6 +220,10 @@ class EngineEntrance:
 
 def _words(error: Exception) -> str:
     return explain_to_client(error) or str(error) or "no answer in time"
+
+
+def _seconds(text: str) -> int:
+    return int(text) if text.isascii() and text.isdecimal() and len(text) <= 5 else 0  # noqa: PLR2004 - a day
 
 
 def _bearer(token: str) -> dict[str, str]:

@@ -17,10 +17,12 @@ class EntranceError(ClientError):
 
     Attributes:
         status: The HTTP status that tells the same.
+        retry_after: Seconds after which to try again; 0 if nothing was said.
     """
 
-    def __init__(self, status: int, text: str) -> None:
+    def __init__(self, status: int, text: str, retry_after: int = 0) -> None:
         self.status = status
+        self.retry_after = retry_after
         super().__init__(text)
 
 

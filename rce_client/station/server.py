@@ -14,6 +14,7 @@ from rce.web.bodies import read_whole
 from rce.web.openapi import PREFIX, Operation, build_document
 from rce.web.origin import ServerNames
 from rce_client.station.api import (
+    MAX_CELL,
     Answer,
     CellRequest,
     FleetModel,
@@ -32,11 +33,19 @@ from rce_client.station.view import FleetView
 
 STATIC = Path(__file__).parent / "static"
 MAX_BODY = 1 << 16
+MAX_DIGITS = 20
+"""Of a cell's number; Python reads no more than 4300."""
+SHOWN = 80
+"""Characters of a wrong name that an answer repeats."""
 MIN_FRAME_S = 0.05
 """Least time between two batches of messages to one page."""
 HEARTBEAT_S = 20.0
 CHECK_S = 5.0
 """How often it is looked whether the login of an open page is still good."""
+
+_LOOKING = (401, 403, 421, 503)
+"""How a request may be refused that only looks."""
+_STEERING = (*_LOOKING, 400, 404, 408, 409, 413)
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -100,6 +109,7 @@ class Station:
                     summary="The whole fleet",
                     group="fleet",
                     reply=FleetModel,
+                    errors=_LOOKING,
                 ),
                 self.get_fleet,
             ),
@@ -113,6 +123,7 @@ class Station:
                     body=LoginRequest,
                     status=204,
                     open=True,
+                    errors=(400, 401, 403, 404, 408, 413, 421, 429, 503),
                 ),
                 self.log_in,
             ),
@@ -124,6 +135,7 @@ class Station:
                     summary="Make the token of this request worthless",
                     group="login",
                     status=204,
+                    errors=(403, 421),
                 ),
                 self.log_out,
             ),
@@ -135,6 +147,7 @@ class Station:
                     summary="Who you are, and what you may do",
                     group="fleet",
                     reply=PersonModel,
+                    errors=_LOOKING,
                 ),
                 self.get_person,
             ),
@@ -146,6 +159,7 @@ class Station:
                     summary="One robot",
                     group="fleet",
                     reply=RobotModel,
+                    errors=(*_LOOKING, 404),
                 ),
                 self.get_robot,
             ),
@@ -158,6 +172,7 @@ class Station:
                     group="fleet",
                     body=GoalRequest,
                     reply=Answer,
+                    errors=_STEERING,
                 ),
                 self.put_goal,
             ),
@@ -170,6 +185,7 @@ class Station:
                     group="fleet",
                     body=CellRequest,
                     reply=Answer,
+                    errors=_STEERING,
                 ),
                 self.put_cell,
             ),
@@ -250,8 +266,8 @@ class Station:
     async def put_cell(self, request: web.Request) -> web.StreamResponse:
         """Block or free a cell."""
         number = request.match_info["cell"]
-        if not number.isdecimal():
-            return problem(404, f"{number!r} is not the number of a cell")
+        if not number.isdecimal() or len(number) > MAX_DIGITS or int(number) > MAX_CELL:
+            return problem(404, f"{number[:SHOWN]!r} is not the number of a cell")
         refusal = self._door.may_steer(request, "block_cell", number)
         if refusal is not None:
             return refusal
@@ -304,13 +320,15 @@ async def _problems(request: web.Request, handler: Handler) -> web.StreamRespons
         faults = [f"{'.'.join(map(str, fault['loc'])) or 'body'}: {fault['msg']}" for fault in error.errors()]
         return problem(400, "; ".join(faults))
     except EntranceError as error:
-        return problem(error.status, str(error))
+        headers = {"Retry-After": str(error.retry_after)} if error.retry_after else None
+        return problem(error.status, str(error), headers)
     except PlannerAwayError as error:
         return problem(503, str(error))
     except FleetError as error:
         return problem(409, str(error))
     except web.HTTPException as error:
-        return problem(error.status, error.reason)
+        kept = {"Allow": error.headers["Allow"]} if "Allow" in error.headers else None
+        return problem(error.status, error.reason, kept)
 
 
 def _reply(model: BaseModel) -> web.Response:

@@ -8,7 +8,12 @@ import logging
 import os
 import random
 import re
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import schemathesis
+from hypothesis import HealthCheck, Phase, given, seed, settings
+from schemathesis import GenerationMode, checks
+from schemathesis.specs.openapi import checks as openapi_checks
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -16,6 +21,14 @@ if TYPE_CHECKING:
 EXAMPLES = int(os.environ.get("RCE_FUZZ_EXAMPLES", "0"))
 """More of them than in the suite, and other ones each time: ``make fuzz``."""
 SEED = random.SystemRandom().randrange(2**32) if EXAMPLES else 7
+CASES = 4
+"""Requests for each operation and mode."""
+CHECKS = [
+    checks.not_a_server_error,
+    openapi_checks.status_code_conformance,
+    openapi_checks.content_type_conformance,
+    openapi_checks.response_schema_conformance,
+]
 ANSWER_S = 60.0
 MOMENT_S = 0.05
 _STATUS = re.compile(rb"HTTP/1\.[01] (\d{3})")
@@ -248,3 +261,31 @@ class Tracebacks(logging.Handler):
             yield self
         finally:
             logging.getLogger().removeHandler(self)
+
+
+def answers_of(document: dict[str, Any], url: str, token: str) -> int:
+    """Make requests of all operations; return how many were answered as the document says."""
+    schema = schemathesis.openapi.from_dict(document)
+    headers = {"Authorization": f"Bearer {token}"}
+    answered = 0
+    for result in schema.get_all_operations():
+        operation = result.ok()
+        for mode in (GenerationMode.POSITIVE, GenerationMode.NEGATIVE):
+
+            @seed(SEED)
+            @settings(
+                max_examples=EXAMPLES // 100 or CASES,
+                deadline=None,
+                database=None,
+                phases=[Phase.generate],
+                suppress_health_check=list(HealthCheck),
+            )
+            @given(case=operation.as_strategy(generation_mode=mode))
+            def run(case: schemathesis.Case) -> None:
+                nonlocal answered
+                response = case.call(base_url=url, headers=headers, timeout=60)
+                case.validate_response(response, checks=CHECKS)
+                answered += 1
+
+            run()
+    return answered

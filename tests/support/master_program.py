@@ -80,7 +80,7 @@ async def master(folder: Path, *args: str, end: signal.Signals = signal.SIGTERM)
         )
     try:
         assert process.stdout is not None
-        line = (await asyncio.wait_for(process.stdout.readline(), 30)).decode()
+        line = (await asyncio.wait_for(process.stdout.readline(), 120)).decode()
         assert line.startswith("rce-master ready: http://127.0.0.1:"), line
         yield line.split()[-1]
     finally:
