@@ -19,8 +19,7 @@ from rce.tls.exceptions import CertificateError
 from rce_master.exceptions import MasterError
 from rce_master.master import Master, RunningMaster
 from rce_master.quotas import QuotaSettings
-from rce_master.settings import MasterSettings
-from rce_master.state.settings import StateSettings
+from rce_master.settings import MasterSettings, state_settings
 from rce_master.store import SqliteStore
 
 if TYPE_CHECKING:
@@ -72,17 +71,7 @@ def _settings(engine: EngineSettings) -> MasterSettings:
             streams=own.max_streams,
             log_reads=own.max_log_reads,
         ),
-        state=StateSettings(
-            robot_grace=own.robot_grace,
-            container_grace=own.container_grace,
-            user_share=own.user_share,
-            max_containers=own.max_containers,
-            max_packages=own.max_packages,
-            max_package_size=own.max_disk,
-            max_slots=own.max_slots,
-            max_cpu=own.max_cpu,
-            max_memory=own.max_memory,
-        ),
+        state=state_settings(engine),
     )
 
 

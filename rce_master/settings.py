@@ -15,6 +15,8 @@ from rce_master.tokens import TOKEN_LIFETIME_S
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from rce.config.settings import EngineSettings
+
 HTTP_PORT = 9000
 CONTROL_PORT = 8080
 
@@ -40,3 +42,19 @@ class MasterSettings:
     quotas: QuotaSettings = field(default_factory=QuotaSettings)
     """What one user may ask of the master at a time."""
     state: StateSettings = field(default_factory=StateSettings)
+
+
+def state_settings(engine: EngineSettings) -> StateSettings:
+    """Make the settings of the state of the engine's."""
+    own = engine.master
+    return StateSettings(
+        robot_grace=own.robot_grace,
+        container_grace=own.container_grace,
+        user_share=own.user_share,
+        max_containers=own.max_containers,
+        max_packages=own.max_packages,
+        max_package_size=own.max_disk,
+        max_slots=own.max_slots,
+        max_cpu=own.max_cpu,
+        max_memory=own.max_memory,
+    )

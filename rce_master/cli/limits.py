@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -10,11 +11,19 @@ from rich.console import Console
 from rich.table import Table
 
 from rce.protocol.quantities import write_memory
-from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
+from rce_master.cli.exceptions import CliError
+from rce_master.cli.offline import StateDir, choose, open_state
+from rce_master.exceptions import NotFound
+from rce_master.limit_values import read_limit
+from rce_master.state.commands import SetLimits
+from rce_master.state.limits import KINDS, limit_of, used_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from rce_master.cli.credentials import Credentials
+    from rce_master.state.core import State
 
 _SOURCES = {
     "user": "set for this user",
@@ -25,15 +34,22 @@ _BYTES = ("memory", "disk")
 _DEFAULT = "A number; 0: no limit; default: as for all users."
 
 
-def show(name: Annotated[str, typer.Argument(help="Default: yourself.")] = "") -> None:
+def show(
+    name: Annotated[str, typer.Argument(help="Default: yourself.")] = "", state_dir: StateDir = None
+) -> None:
     """Show a user, what they may have and what they have."""
-    run(_show(name))
+    run(_show(name, choose(state_dir)))
 
 
-async def _show(name: str) -> None:
-    login = credentials.load()
-    async with ApiClient.of(login) as client:
-        user = await client.call("GET", f"/users/{name or login.user}")
+async def _show(name: str, place: Path | Credentials) -> None:
+    if not isinstance(place, Path):
+        async with ApiClient.of(place) as client:
+            user = await client.call("GET", f"/users/{name or place.user}")
+    elif not name:
+        raise CliError("say whom to show, or log in first (rce login)")
+    else:
+        async with open_state(place) as offline:
+            user = _view(offline.state, name)
     typer.echo(
         f"{user['name']}: {user['role']} since {time.strftime('%Y-%m-%d', time.localtime(user['created']))}"
     )
@@ -60,6 +76,7 @@ def limit(
     memory: Annotated[str | None, typer.Option(help="Memory that they may ask for, such as 8G.")] = None,
     packages: Annotated[str | None, typer.Option(help="Versions of packages.")] = None,
     disk: Annotated[str | None, typer.Option(help="Files of all packages, such as 2G.")] = None,
+    state_dir: StateDir = None,
 ) -> None:
     """Change what a user may have. What is there already stays."""
     given = {
@@ -73,10 +90,27 @@ def limit(
     chosen = {kind: value for kind, value in given.items() if value is not None}
     if not chosen:
         raise typer.BadParameter("say what to change, such as --slots 16; see: rce user limit --help")
-    run(_limit(name, chosen))
+    run(_limit(name, chosen, choose(state_dir)))
 
 
-async def _limit(name: str, limits: dict[str, str]) -> None:
-    async with ApiClient.of(credentials.load()) as client:
-        user = await client.call("PATCH", f"/users/{name}/limits", limits)
+async def _limit(name: str, limits: dict[str, str], place: Path | Credentials) -> None:
+    if not isinstance(place, Path):
+        async with ApiClient.of(place) as client:
+            user = await client.call("PATCH", f"/users/{name}/limits", limits)
+    else:
+        command = SetLimits(user=name, limits={kind: read_limit(kind, limits[kind]) for kind in limits})
+        async with open_state(place) as offline:
+            await offline.do(command, "set_limits", name)
+            user = _view(offline.state, name)
     Console().print(_table(user["limits"]))
+
+
+def _view(state: State, name: str) -> dict[str, Any]:
+    """Show a user of a state as the API does."""
+    user = state.tables.users.get(name)
+    if user is None:
+        raise NotFound(f"there is no user {name!r}")
+    used = used_of(state.tables, name)
+    found = (limit_of(state.tables, state.settings, name, kind) for kind in KINDS)
+    limits = {one.kind: {"limit": one.most, "used": used[one.kind], "source": one.source} for one in found}
+    return {"name": user.name, "role": user.role.value, "created": user.created, "limits": limits}

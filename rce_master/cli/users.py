@@ -11,31 +11,22 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from rce.config.folders import default_state_dir
 from rce_master.auth import Authenticator, client_digest
 from rce_master.cli import credentials, limits
 from rce_master.cli.client import ApiClient, run
-from rce_master.cli.exceptions import CliError, NotLoggedIn
+from rce_master.cli.exceptions import CliError
+from rce_master.cli.offline import OfflineState, StateDir, choose, open_state
 from rce_master.cli.session import read_password
-from rce_master.exceptions import StoreBusy
 from rce_master.state import commands
-from rce_master.state.core import State
 from rce_master.state.records import User, UserRole
-from rce_master.store import SqliteStore
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
-
-    from rce_master.store import Store
 
 app = typer.Typer(no_args_is_help=True, help="Add, list and remove users, change passwords and limits.")
 app.command("show")(limits.show)
 app.command("limit")(limits.limit)
 
-StateDir = Annotated[
-    Path | None,
-    typer.Option(help="Work on this state folder while no master runs on it, instead of over the API."),
-]
 PasswordStdin = Annotated[bool, typer.Option(help="Read the password from standard input.")]
 
 
@@ -163,71 +154,49 @@ class _ApiDirectory:
 class _StoreDirectory:
     """Users right in the store, which is locked meanwhile."""
 
-    def __init__(self, state: State, store: Store, folder: Path) -> None:
-        self.place = f"in {folder}"
-        self._state = state
-        self._store = store
-        self._authenticator = Authenticator(state.tables)
+    def __init__(self, offline: OfflineState) -> None:
+        self.place = f"in {offline.folder}"
+        self._offline = offline
+        self._authenticator = Authenticator(offline.state.tables)
 
     async def add(self, name: str, role: str, password: str) -> None:
         hashed = await self._authenticator.hash(client_digest(password))
         user = User(name=name, role=UserRole(role), password=hashed, created=time.time())
-        await self._do(commands.AddUser(user=user))
+        await self._offline.do(commands.AddUser(user=user), "add_user", f"{name}/{role}")
 
     async def list(self) -> list[dict[str, Any]]:
         return [
             {"name": user.name, "role": user.role.value, "created": user.created}
-            for user in self._state.tables.users
+            for user in self._offline.state.tables.users
         ]
 
     async def set_password(self, name: str, password: str, old: str) -> None:
         del old  # whoever may write the folder may do everything
         hashed = await self._authenticator.hash(client_digest(password))
-        await self._do(commands.SetPassword(name=name, password=hashed))
+        await self._offline.do(commands.SetPassword(name=name, password=hashed), "set_password", name)
 
     async def set_role(self, name: str, role: str) -> None:
-        await self._do(commands.SetRole(name=name, role=UserRole(role)))
+        command = commands.SetRole(name=name, role=UserRole(role))
+        await self._offline.do(command, "set_role", f"{name}/{role}")
 
     async def remove(self, name: str) -> None:
-        await self._do(commands.RemoveUser(name=name))
+        await self._offline.do(commands.RemoveUser(name=name), "remove_user", name)
 
     def close(self) -> None:
         self._authenticator.close()
-
-    async def _do(self, command: commands.Command) -> None:
-        await self._store.save(self._state.apply(command, time.monotonic()).rows())
 
 
 @asynccontextmanager
 async def _directory(state_dir: Path | None) -> AsyncIterator[_Directory]:
     """Choose: the folder that was named, else the master where one is logged in, else the default folder."""
-    if state_dir is None:
-        try:
-            login = credentials.load()
-        except NotLoggedIn:
-            state_dir = default_state_dir()
-        else:
-            async with ApiClient.of(login) as client:
-                yield _ApiDirectory(client, login.url)
-            return
-    async with _open_store(state_dir) as directory:
-        yield directory
-
-
-@asynccontextmanager
-async def _open_store(state_dir: Path) -> AsyncIterator[_StoreDirectory]:
-    # Of `rce up`'s state folder, the master's part is a folder in it.
-    inner = state_dir / "master"
-    folder = inner if inner.is_dir() or state_dir == default_state_dir() else state_dir
-    try:
-        store = await SqliteStore.open(folder)
-    except StoreBusy as error:
-        raise CliError(f"{error}; to work over its API, log in there: rce login") from error
-    try:
-        directory = _StoreDirectory(State.load(await store.load(), time.monotonic()), store, folder)
+    place = choose(state_dir)
+    if not isinstance(place, Path):
+        async with ApiClient.of(place) as client:
+            yield _ApiDirectory(client, place.url)
+        return
+    async with open_state(place) as offline:
+        directory = _StoreDirectory(offline)
         try:
             yield directory
         finally:
             directory.close()
-    finally:
-        await store.close()

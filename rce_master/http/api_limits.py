@@ -2,37 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from rce.protocol.quantities import read_cores, read_memory
-from rce_master.exceptions import Forbidden, Invalid, NotFound
+from rce_master.exceptions import Forbidden, NotFound
 from rce_master.http import models
 from rce_master.http.routes import Call, RouteTable
 from rce_master.http.views import Views
+from rce_master.limit_values import read_limit
 from rce_master.state import commands, limits
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
 routes = RouteTable("account")
-
-_DEFAULT = "default"
-
-
-def _count(value: object) -> float:
-    if isinstance(value, str) and value.isascii() and value.isdecimal():
-        value = int(value)
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= _MOST:
-        raise ValueError(f"must be a whole number from 0 to {_MOST}, or {_DEFAULT}")
-    return value
-
-
-_MOST = 10**9
-_READERS: dict[str, Callable[[object], float]] = {
-    "cpu": read_cores,
-    "memory": read_memory,
-    "disk": read_memory,
-}
 
 
 @routes.route(
@@ -61,18 +38,9 @@ async def set_limits(call: Call) -> models.UserLimitsOut:
     """Change limits."""
     name = call.path("name")
     given = call.read(models.LimitsIn).model_dump(exclude_none=True)
-    command = commands.SetLimits(user=name, limits={kind: _read(kind, given[kind]) for kind in given})
+    command = commands.SetLimits(user=name, limits={kind: read_limit(kind, given[kind]) for kind in given})
     await call.services.realm.submit(command)
     return _shown(call, name)
-
-
-def _read(kind: str, value: object) -> float | None:
-    if value == _DEFAULT:
-        return None
-    try:
-        return _READERS.get(kind, _count)(value)
-    except ValueError as error:
-        raise Invalid(f"{kind}: {error}") from None
 
 
 def _shown(call: Call, name: str) -> models.UserLimitsOut:

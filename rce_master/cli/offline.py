@@ -1,0 +1,119 @@
+"""Work on a master's state folder while no master runs on it.
+
+What is changed is in the audit log, as what is changed over the API: who is the user of the operating system,
+and the place is ``offline``.
+"""
+
+from __future__ import annotations
+
+import os
+import pwd
+import time
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rce.config.exceptions import ConfigError
+from rce.config.folders import default_state_dir
+from rce.config.loading import load_settings
+from rce_master.audit import AuditLog
+from rce_master.cli import credentials
+from rce_master.cli.exceptions import CliError, NotLoggedIn
+from rce_master.exceptions import StoreBusy
+from rce_master.settings import state_settings
+from rce_master.state.core import State
+from rce_master.store import SqliteStore
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from rce_master.cli.credentials import Credentials
+    from rce_master.state.commands import Command
+    from rce_master.store import Store
+
+OFFLINE = "offline"
+"""The address of whoever changed something here, in the audit log."""
+
+StateDir = Annotated[
+    Path | None,
+    typer.Option(help="Work on this state folder while no master runs on it, instead of over the API."),
+]
+
+
+def choose(state_dir: Path | None) -> Path | Credentials:
+    """Choose: the folder that was named, else the master where one is logged in, else the default folder."""
+    if state_dir is not None:
+        return state_dir
+    try:
+        return credentials.load()
+    except NotLoggedIn:
+        return default_state_dir()
+
+
+class OfflineState:
+    """The state of a master that does not run. Its store is locked meanwhile.
+
+    Attributes:
+        state: What the store held, with what was changed since.
+        folder: Where it is.
+    """
+
+    def __init__(self, state: State, store: Store, audit: AuditLog, folder: Path) -> None:
+        self.state = state
+        self.folder = folder
+        self._store = store
+        self._audit = audit
+
+    async def do(self, command: Command, action: str, subject: str) -> None:
+        """Change something, keep it, and write it to the audit log.
+
+        Args:
+            command: The change.
+            action: What the audit log calls it, as for the same change over the API.
+            subject: What it is about.
+
+        Raises:
+            MasterError: The state does not allow it, or it cannot be kept.
+        """
+        await self._store.save(self.state.apply(command, time.monotonic()).rows())
+        self._audit.add(_caller(), action, subject, address=OFFLINE)
+
+
+@asynccontextmanager
+async def open_state(state_dir: Path) -> AsyncIterator[OfflineState]:
+    """Open the state in a folder: the master's own, or the engine's, in which that is a folder.
+
+    Raises:
+        CliError: A master runs on it, or the settings cannot be read.
+    """
+    inner = state_dir / "master"
+    folder = inner if inner.is_dir() or state_dir == default_state_dir() else state_dir
+    try:
+        settings = state_settings(load_settings(None))
+    except ConfigError as error:
+        raise CliError(str(error)) from error
+    try:
+        store = await SqliteStore.open(folder)
+    except StoreBusy as error:
+        raise CliError(f"{error}; to work over its API, log in there: rce login") from error
+    audit = AuditLog(folder / "audit", time.time)
+    try:
+        state = State.load(await store.load(), time.monotonic(), settings=settings)
+        yield OfflineState(state, store, audit, folder)
+    finally:
+        audit.close()
+        await store.close()
+
+
+def _caller() -> str:
+    """Return who runs this program, also through sudo."""
+    number = os.getuid()
+    through = os.environ.get("SUDO_UID", "") if number == 0 else ""
+    if through.isdecimal():
+        number = int(through)
+    try:
+        return pwd.getpwuid(number).pw_name
+    except (KeyError, OverflowError):
+        return f"uid {number}"

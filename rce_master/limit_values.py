@@ -1,0 +1,54 @@
+"""Reads what people write for a user's limits (pure)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rce.protocol.quantities import read_cores, read_memory
+from rce_master.exceptions import Invalid
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+DEFAULT = "default"
+"""As for all users."""
+_MOST = 10**9
+
+
+def read_limit(kind: str, value: object) -> float | None:
+    """Return a limit as a number; None for that of all users.
+
+    Args:
+        kind: One of :data:`rce_master.state.limits.KINDS`.
+        value: A number, or a text such as ``8G``.
+
+    Raises:
+        Invalid: It is not an amount of this kind.
+
+    Example:
+        >>> read_limit("containers", "16"), read_limit("memory", "default")
+        (16, None)
+    """
+    if value == DEFAULT:
+        return None
+    try:
+        return _READERS.get(kind, _count)(value)
+    except ValueError as error:
+        raise Invalid(f"{kind}: {error}") from None
+
+
+def _count(value: object) -> float:
+    if isinstance(value, str) and value.isascii() and value.isdecimal() and len(value) <= _DIGITS:
+        value = int(value)
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= _MOST:
+        raise ValueError(f"must be a whole number from 0 to {_MOST}, or {DEFAULT}")
+    return value
+
+
+_DIGITS = 20
+"""Python reads no more than 4300; the largest limit has fewer."""
+_READERS: dict[str, Callable[[object], float]] = {
+    "cpu": read_cores,
+    "memory": read_memory,
+    "disk": read_memory,
+}
