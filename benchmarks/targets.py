@@ -60,8 +60,24 @@ _ROUND_TRIPS = [
     for size, limit in limits.items()
 ]
 
+TLS_RATIO = {20: 1.15}
+"""Most that TLS on the robot's connection may make of a round trip's median, by bytes."""
+
+_IN_TLS = [
+    Target(
+        f"TLS on the robot's connection, {form}, {size} bytes, p50",
+        "tls",
+        _column("x plain (p50)", form=form, bytes=size),
+        limit,
+        "x plain",
+    )
+    for form in ("Converter", "Forwarder")
+    for size, limit in TLS_RATIO.items()
+]
+
 TARGETS = [
     *_ROUND_TRIPS,
+    *_IN_TLS,
     Target(
         "messages of 64 B, 32 in flight, converter",
         "rate",

@@ -16,6 +16,7 @@ import psutil
 from benchmarks.engine import BIN, RunningEngine, cpu_seconds, free_ports
 from benchmarks.figures import percentile
 from benchmarks.roundtrip import Trip, converter_trip, forwarder_trip
+from benchmarks.targets import TLS_RATIO
 from benchmarks.wire import locate, robot_at, wire_echo
 from rce.supervision.process import Child
 from rce.tls.folder import CertificateFolder
@@ -23,8 +24,6 @@ from rce.tls.folder import CertificateFolder
 SIZES = (20, 6951, 61584)
 PAIRS = 600
 WARM_UP = 50
-TARGET = {20: 1.15}
-"""Most that the median may grow, by bytes."""
 Figures = dict[tuple[str, int, str], list[float]]
 """Form, bytes and ``plain`` or ``tls`` to seconds."""
 _TRIPS = {"Converter": converter_trip, "Forwarder": forwarder_trip}
@@ -119,7 +118,7 @@ async def _weigh(
 def _row(form: str, size: int, times: Figures, costs: Figures) -> dict[str, Any]:
     plain, secured = times[form, size, "plain"], times[form, size, "tls"]
     ratio = percentile(secured, 0.5) / percentile(plain, 0.5)
-    target = TARGET.get(size)
+    target = TLS_RATIO.get(size)
     return {
         "form": form,
         "bytes": size,
