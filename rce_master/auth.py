@@ -57,8 +57,10 @@ class Authenticator:
     kept in the store, also over a restart. The key is not: a copy of the store alone helps to guess no more
     than argon2 allows.
 
-    Unknown passwords take turns by address and user, and are slowed down where they fail often
-    (:mod:`rce_master.throttle`).
+    Unknown passwords take turns by address, and there by user, and are slowed down where they fail often
+    (:mod:`rce_master.throttle`): the first login of a user waits for one check of each other user that is
+    guessed at from the same address, however many connections that is done with. A password that is set
+    while the master runs is known at once.
 
     Args:
         tables: The state's tables, to read users and marks from.
@@ -88,6 +90,8 @@ class Authenticator:
         self._workers = ThreadPoolExecutor(HASH_WORKERS, thread_name_prefix="argon2")
         self._turns = Turns(HASH_WORKERS, waiting=MAX_WAITING)
         self._checks: dict[str, _Check] = {}
+        self.checks = 0
+        """Passwords that were hashed to check them."""
         # Checked for unknown users, so that the time it takes does not tell who exists.
         self._nobody = self._hasher.hash(secrets.token_hex())
 
@@ -132,6 +136,16 @@ class Authenticator:
         except CrowdedError:
             raise TooManyLogins from None
 
+    async def know(self, name: str, stored: str, digest: str) -> None:
+        """Know a password from now on that was just set: its first use waits for no turn.
+
+        Args:
+            name: The user's name.
+            stored: What :meth:`hash` gave for it.
+            digest: SHA-256 of the password in hex.
+        """
+        await self._know(name, self._mark(name, stored, digest))
+
     def close(self) -> None:
         """Stop the worker threads."""
         for check in self._checks.values():
@@ -166,13 +180,13 @@ class Authenticator:
         self, name: str, stored: str, digest: str, address: str, delay: float
     ) -> bool | TooManyLogins:
         if delay:
-            self._throttle.delayed += 1
-            try:
+            with self._throttle.delaying(address, name):
                 await asyncio.sleep(delay)
-            finally:
-                self._throttle.delayed -= 1
+        # Names that do not exist have their turns together: inventing some gives no more of them.
+        member = name if name in self._tables.users else ""
         try:
-            async with self._turns.turn(address, name):
+            async with self._turns.turn(address, member):
+                self.checks += 1
                 right = await self._in_worker(self._compare, stored, digest)
         except CrowdedError:
             self._throttle.passed(address, name, self._clock())

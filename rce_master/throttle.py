@@ -1,15 +1,26 @@
 """Slows down who guesses passwords, by address and user (pure: the time is an argument).
 
-A check that fails costs a token of two buckets: that of the address and user, and that of the address. When a
-bucket is empty the next check has to wait for a token; only when that takes longer than anybody waits at a
-door it is refused. A check that succeeds costs nothing, so a fleet behind one address is never slowed down
-by itself, and wrong passwords from one address cost those at other addresses nothing.
+A check that fails costs a token of two buckets: that of the address and user, and that of the address.
+
+When the first is empty the next check has to wait for a token, and is refused when that takes longer than
+anybody waits at a door. When the second is empty checks wait for a moment, but are not refused: many robots
+and people share an address behind a router, and who guesses there must not keep them out.
+
+A check that succeeds costs nothing, so a fleet behind one address is never slowed down by itself, and wrong
+passwords from one address cost those at other addresses nothing.
 """
 
 from __future__ import annotations
 
+import contextlib
+from collections import Counter
+from typing import TYPE_CHECKING
+
 from rce.guard.rates import Rates
 from rce_master.exceptions import TooManyFailures
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 FREE = 10
 """Failures of a user at an address that are not slowed down."""
@@ -20,8 +31,10 @@ FREE_OF_ADDRESS = 100
 PACE_OF_ADDRESS_S = 0.5
 MAX_DELAY_S = 5.0
 """Longest that a check is put off; less than a robot endpoint waits for the master's answer."""
+MAX_ADDRESS_DELAY_S = 2.0
+"""The same where only others at the address have failed."""
 MAX_DELAYED = 256
-"""Checks that are put off at the same time."""
+"""Checks that are put off at the same time; beyond it, one of each address and user."""
 _LONGEST_NAME = 64
 
 
@@ -31,8 +44,8 @@ class FailureThrottle:
     def __init__(self) -> None:
         self._pairs = Rates(per_second=1 / PACE_S, burst=FREE)
         self._addresses = Rates(per_second=1 / PACE_OF_ADDRESS_S, burst=FREE_OF_ADDRESS)
-        self.delayed = 0
-        """Checks that are put off now; to be counted by whoever waits."""
+        self.delayed: Counter[str] = Counter()
+        """Checks that are put off now, by address and user."""
 
     def admit(self, address: str, user: str, now: float) -> float:
         """Count a check as a failure, until :meth:`passed` takes it back.
@@ -48,11 +61,31 @@ class FailureThrottle:
         Raises:
             TooManyFailures: It would have to wait too long; nothing was counted.
         """
-        delay = max(self._pairs.reserve(_pair(address, user), now), self._addresses.reserve(address, now))
-        if delay > MAX_DELAY_S or (delay and self.delayed >= MAX_DELAYED):
+        pair = _pair(address, user)
+        delay = self._pairs.reserve(pair, now)
+        if delay > MAX_DELAY_S:
+            self._pairs.give_back(pair, now)
+            raise TooManyFailures(delay)
+        others = self._addresses.reserve(address, now)
+        if others > MAX_ADDRESS_DELAY_S:
+            self._addresses.give_back(address, now)  # who is not refused must not owe more and more
+        delay = max(delay, min(others, MAX_ADDRESS_DELAY_S))
+        if delay and self.delayed.total() >= MAX_DELAYED and self.delayed[pair]:
             self.passed(address, user, now)
             raise TooManyFailures(max(1.0, delay))
         return delay
+
+    @contextlib.contextmanager
+    def delaying(self, address: str, user: str) -> Iterator[None]:
+        """Count a check among those that are put off while the context lasts."""
+        pair = _pair(address, user)
+        self.delayed[pair] += 1
+        try:
+            yield
+        finally:
+            self.delayed[pair] -= 1
+            if not self.delayed[pair]:
+                del self.delayed[pair]
 
     def passed(self, address: str, user: str, now: float) -> None:
         """Take back what :meth:`admit` counted: the check succeeded, or was not made."""

@@ -11,7 +11,6 @@ from typing import Annotated
 import typer
 import uvloop
 
-from rce.cli.program_files import from_file
 from rce.config.logs import start_logging
 from rce.ros.errors import RosError
 from rce.ros.multimaster.discovery import Discovery
@@ -22,7 +21,6 @@ from rce.ros.multimaster.settings import DiscoverySettings, local_master
 _DEFAULT = DiscoverySettings()
 
 
-@from_file("discovery", leave_out=("list",))
 def discovery(
     list_: Annotated[
         bool, typer.Option("--list", help="Print the masters that the running discovery knows, and end.")

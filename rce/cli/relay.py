@@ -11,7 +11,6 @@ from typing import Annotated
 import typer
 import uvloop
 
-from rce.cli.program_files import from_file
 from rce.config.logs import start_logging
 from rce.ros.errors import RosError
 from rce.ros.multimaster.relay.throttle import ByteThrottle, MessageThrottle, Throttle
@@ -20,7 +19,6 @@ from rce.ros.multimaster.settings import local_master
 from rce.ros.node import Node
 
 
-@from_file("relay")
 def relay(
     source: Annotated[str, typer.Argument(metavar="FROM", help="Topic to take, of any type.")],
     target: Annotated[str, typer.Argument(metavar="TO", help="Topic to publish.")],

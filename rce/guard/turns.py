@@ -2,7 +2,8 @@
 
 A crowd is what may act as one: an address, or a user. Each crowd that waits gets a turn before any gets
 another one; within a crowd the same holds for its members. When too many wait, the newest of the largest
-crowd must go. So whoever asks a thousand times waits for their own turns, and others wait for one of them.
+crowd's largest member must go. So whoever asks a thousand times waits for their own turns, and others, also
+those of the same crowd, wait for one of them.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class Turns:
             member: The same within the crowd.
 
         Raises:
-            CrowdedError: Too many wait, and this crowd is the largest.
+            CrowdedError: Too many wait, this crowd is the largest, and this member has the most of it.
         """
         if self._has_room(crowd):
             self._working[crowd] += 1
@@ -78,7 +79,7 @@ class Turns:
 
     async def _wait(self, crowd: str, member: str) -> None:
         if self.waiting >= self._most_waiting:
-            self._make_room(crowd)
+            self._make_room(crowd, member)
         turn: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._crowds.setdefault(crowd, OrderedDict()).setdefault(member, deque()).append(turn)
         try:
@@ -90,15 +91,18 @@ class Turns:
                 self._forget(crowd, member, turn)
             raise
 
-    def _make_room(self, crowd: str) -> None:
-        """Send the newest of the largest crowd away."""
+    def _make_room(self, crowd: str, member: str) -> None:
+        """Send the newest of the largest crowd's largest member away, unless that is who asks."""
         largest = max(self._crowds, key=lambda name: _size(self._crowds[name]))
-        if _size(self._crowds.get(crowd, OrderedDict())) >= _size(self._crowds[largest]):
-            raise CrowdedError
+        own = self._crowds.get(crowd, OrderedDict())
+        if _size(own) >= _size(self._crowds[largest]):
+            largest = crowd
         members = self._crowds[largest]
-        member = max(members, key=lambda name: len(members[name]))
-        turn = members[member][-1]
-        self._forget(largest, member, turn)
+        loser = max(members, key=lambda name: len(members[name]))
+        if largest == crowd and len(members.get(member, ())) >= len(members[loser]):
+            raise CrowdedError
+        turn = members[loser][-1]
+        self._forget(largest, loser, turn)
         turn.set_exception(CrowdedError())
 
     def _forget(self, crowd: str, member: str, turn: asyncio.Future[None]) -> None:

@@ -60,13 +60,15 @@ async def add_user(call: Call) -> models.UserOut:
     """Make a user."""
     body = call.read(models.UserIn)
     services = call.services
+    digest = client_digest(body.password)
     user = User(
         name=body.name,
         role=UserRole(body.role),
-        password=await services.authenticator.hash(client_digest(body.password), call.caller.name),
+        password=await services.authenticator.hash(digest, call.caller.name),
         created=services.clock(),
     )
     await services.realm.submit(commands.AddUser(user=user))
+    await services.authenticator.know(user.name, user.password, digest)
     return _views(call).user(user)
 
 
@@ -98,6 +100,7 @@ async def set_password(call: Call) -> None:
     digest = client_digest(body.password)
     hashed = await services.authenticator.hash(digest, call.caller.name)
     await services.realm.submit(commands.SetPassword(name=name, password=hashed))
+    await services.authenticator.know(name, hashed, digest)
 
 
 @routes.route(

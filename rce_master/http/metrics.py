@@ -40,9 +40,12 @@ MAX_SERIES = 50_000
 """Series of containers, nodes and interfaces in one answer; what is beyond it is counted, not listed."""
 
 
-def make_answer(tables: Tables, book: UsageBook) -> Callable[[], web.Response]:
+def make_answer(
+    tables: Tables, book: UsageBook, password_checks: Callable[[], int]
+) -> Callable[[], web.Response]:
     """Return what makes an answer to a scrape."""
     registry = make_registry(tables, book)
+    registry.register(_LoginCollector(password_checks))
     headers = {"Content-Type": CONTENT_TYPE_LATEST}
     return lambda: web.Response(body=generate_latest(registry), headers=headers)
 
@@ -56,6 +59,18 @@ def make_registry(tables: Tables, book: UsageBook) -> CollectorRegistry:
     registry.register(EngineCollector(tables, book.newest))
     registry.register(ConsumptionCollector(tables, book))
     return registry
+
+
+class _LoginCollector(Collector):
+    """What logins cost."""
+
+    def __init__(self, password_checks: Callable[[], int]) -> None:
+        self._password_checks = password_checks
+
+    def collect(self) -> Iterator[Metric]:
+        """Make all metrics."""
+        text = "Unknown passwords that were hashed to check them."
+        yield CounterMetricFamily("rce_password_checks", text, value=self._password_checks())
 
 
 class EngineCollector(Collector):

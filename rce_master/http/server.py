@@ -68,7 +68,8 @@ def _metrics(services: Services) -> Handler:
     def scraped() -> Callable[[], web.Response]:
         from rce_master.http.metrics import make_answer  # takes memory that only scraped masters spend
 
-        return make_answer(services.realm.tables, services.reconciler.book)
+        checks = services.authenticator
+        return make_answer(services.realm.tables, services.reconciler.book, lambda: checks.checks)
 
     async def handle(request: web.Request) -> web.Response:
         check_metrics(request, services)

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import signal
 from typing import TYPE_CHECKING, Any
 
 import aiohttp
+import pytest
+from argon2 import PasswordHasher
 from support.master_program import master
 
 from rce_master.auth import client_digest
+from rce_master.state.commands import AddUser
+from rce_master.state.records import User, UserRole
+from rce_master.throttle import FREE, FREE_OF_ADDRESS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from contextlib import AbstractAsyncContextManager
     from pathlib import Path
 
@@ -21,6 +27,7 @@ if TYPE_CHECKING:
     RunSite = Callable[..., AbstractAsyncContextManager[Site]]
 
 GUESSES = 40
+HASHER = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
 RIGHT = "testUser"
 HOME, BAD, ELSEWHERE = "127.0.0.1", "127.0.0.66", "127.0.0.7"
 
@@ -89,3 +96,40 @@ async def test_robots_are_counted_by_the_address_they_come_from(run_site: RunSit
         )
         assert await try_one("rob", RIGHT, "192.0.2.1") == 200
         assert set(await guesses) == {401, 429}
+
+
+async def attack(url: str, names: Iterator[str], connections: int) -> None:
+    """Guess with some connections from HOME until cancelled."""
+
+    async def go_on(number: int) -> None:
+        for name in names:
+            await log_in(url, f"guess {number}", HOME, name)
+
+    await asyncio.gather(*(go_on(number) for number in range(connections)))
+
+
+async def password_checks(url: str) -> float:
+    async with aiohttp.ClientSession() as session, session.get(f"{url}metrics") as reply:
+        lines = (await reply.text()).splitlines()
+    return float(next(line.split()[1] for line in lines if line.startswith("rce_password_checks_total")))
+
+
+@pytest.mark.parametrize("names", ["one user's", "inventions"])
+async def test_first_login_beside_an_attacker_at_the_same_address(run_site: RunSite, names: str) -> None:
+    """A user whose password the master has never seen waits for few checks, however many are tried."""
+    inventions = (f"nobody{number}" for number in itertools.count())
+    guessed = itertools.repeat("victim") if names == "one user's" else inventions
+    async with run_site(log_in=False) as site:
+        victim = User(name="victim", role=UserRole.USER, password=HASHER.hash("secret"), created=0.0)
+        await site.master.realm.submit(AddUser(user=victim))
+        attackers = asyncio.create_task(attack(site.url, guessed, 20))
+        try:
+            while await password_checks(site.url) < (FREE if names == "one user's" else FREE_OF_ADDRESS):
+                await asyncio.sleep(0.05)
+            before = await password_checks(site.url)
+            assert (await log_in(site.url, RIGHT, HOME))[0] == 200
+            assert not attackers.done()
+            assert await password_checks(site.url) - before <= 80
+        finally:
+            attackers.cancel()
+            await asyncio.wait([attackers])

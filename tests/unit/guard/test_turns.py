@@ -77,6 +77,22 @@ async def test_when_too_many_wait_the_largest_crowd_makes_room() -> None:
     assert site.begun == ["a0", "a1", "b0", "a2"]
 
 
+async def test_member_with_most_makes_room_within_its_crowd() -> None:
+    """Whoever shares an address with a flood finds room in a full queue."""
+    async with asyncio.TaskGroup() as group:
+        site = Site(Turns(1, waiting=3), group)
+        for number in range(5):
+            await site.ask(f"x{number}", "router", "x")
+        assert site.refused == ["x4"]
+        await site.ask("y0", "router", "y")
+        await asyncio.sleep(0)
+        assert site.refused == ["x4", "x3"]
+        await site.ask("x5", "router", "x")
+        assert site.refused == ["x4", "x3", "x5"]
+        await site.end_all()
+    assert site.begun == ["x0", "x1", "y0", "x2"]
+
+
 async def test_a_crowd_has_no_more_at_work_than_it_may() -> None:
     async with asyncio.TaskGroup() as group:
         site = Site(Turns(3, waiting=100, each=1), group)

@@ -15,6 +15,7 @@ from rce_master.auth import HASH_WORKERS, MAX_WAITING, Authenticator, client_dig
 from rce_master.exceptions import TooManyFailures, TooManyLogins, WrongCredentials
 from rce_master.state import commands
 from rce_master.state.records import User, UserRole
+from rce_master.throttle import MAX_ADDRESS_DELAY_S
 
 RIGHT = client_digest("right")
 CROWDS = 4
@@ -44,7 +45,7 @@ async def settle() -> None:
 class Door:
     def __init__(self) -> None:
         self.hasher = HeldHasher()
-        world = World()
+        self.world = world = World()
         for name in ("zoe", "yan"):
             user = User(name=name, role=UserRole.USER, password=self.hasher.hash(RIGHT), created=0.0)
             world.do(commands.AddUser(user=user))
@@ -114,3 +115,31 @@ async def test_wrong_passwords_that_wait_together_are_counted_all_the_same(door:
         assert door.outcomes == [TooManyFailures] * 9
         door.hasher.go.set()
     assert door.outcomes.count(WrongCredentials) == 11
+
+
+@pytest.mark.parametrize("names", ["unknown", "zoe"])
+async def test_a_flood_from_the_same_address_holds_up_a_first_login_by_few_checks(
+    door: Door, names: str
+) -> None:
+    """A fleet and its attacker behind one router: the queue is full of guesses, and of nothing else."""
+    door.hasher.go.clear()
+    async with asyncio.TaskGroup() as group:
+        for number in range(4 * MAX_WAITING):
+            name = names if names == "zoe" else f"nobody{number}"
+            group.create_task(door.log_in(name, client_digest(f"guess {number}"), "router"))
+        await settle()
+        first = group.create_task(door.auth.verify("yan", RIGHT, "router"))
+        await asyncio.sleep(MAX_ADDRESS_DELAY_S)
+        assert not first.done()
+        door.hasher.go.set()
+    assert first.result().name == "yan"
+    # After those that were begun before, and two of the others.
+    assert door.hasher.verified.index(RIGHT) <= HASH_WORKERS + 2
+
+
+async def test_password_that_was_just_set_is_known(door: Door) -> None:
+    hashed = await door.auth.hash(RIGHT)
+    door.world.do(commands.SetPassword(name="zoe", password=hashed))
+    await door.auth.know("zoe", hashed, RIGHT)
+    assert (await door.auth.verify("zoe", RIGHT, "router")).name == "zoe"
+    assert door.hasher.verified == []
