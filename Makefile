@@ -6,6 +6,9 @@ STAMP  := $(VENV)/.installed
 
 PARALLEL := -n auto --dist loadgroup --durations=25
 
+# Tests start thousands of programs; without bytecode each of them compiles all that it imports.
+export PYTHONDONTWRITEBYTECODE :=
+
 .PHONY: help install demo test test-all test-quick fuzz lint format reference bench lock clean
 
 help:

@@ -8,7 +8,7 @@ from typing import Any
 
 import uvloop
 
-from benchmarks import abuse, bridge, containers, fanout, rate, roundtrip, sandboxes, stalled, tls
+from benchmarks import abuse, bridge, containers, fanout, latched, rate, roundtrip, sandboxes, stalled, tls
 from benchmarks.engine import RunningEngine, engine
 from benchmarks.figures import plot_round_trips, save, show
 from benchmarks.targets import RATIOS
@@ -43,6 +43,10 @@ def suites(*, quick: bool) -> dict[str, tuple[str, Callable[[RunningEngine], Awa
         ),
         "bridge": ("rce-ros on a robot", lambda e: bridge.run(e, seconds=seconds)),
         "tls": ("TLS on the robot's connection", lambda e: tls.run(e, passes=passes)),
+        "latched": (
+            "A robot comes late to latched maps",
+            lambda e: latched.run(e, passes=1 if quick else 5),
+        ),
         "stalled": ("One client stops reading", lambda e: stalled.run(e, seconds=seconds)),
     }
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import sys
 import urllib.request
+from collections.abc import AsyncIterator
 from time import perf_counter
 from typing import Any
 
@@ -20,27 +22,43 @@ GOAL_P99_MS = 20.0
 GOAL_MORE_MS = 100.0
 
 
+CONTROL = f"none, {attacks.BUSY}"
+"""The control: what the probe notices of the processors' other work alone."""
+BUSY_NICE = (10, 19)
+"""Priorities of a process that converts large messages, and of one that attacks."""
+
+
 async def run(running: RunningEngine, *, seconds: float, only: tuple[str, ...] = ()) -> list[dict[str, Any]]:
-    """Measure the probe alone, then beside each kind of abuse."""
+    """Measure the probe alone, beside busy processes, then beside each kind of abuse."""
     await asyncio.to_thread(_add_user, running.url)
     rows = []
     async with robot(running.url, "probe") as probe:
         await _wire(probe)
         alone = await _probe(probe, seconds)
         rows.append(_row("none", alone, alone, running))
+        async with contextlib.AsyncExitStack() as stack:
+            for nice in BUSY_NICE:
+                await stack.enter_async_context(_attacker(attacks.BUSY, str(nice)))
+            rows.append(_row(CONTROL, await _probe(probe, seconds), alone, running))
         for kind in only or attacks.kinds():
             url = await asyncio.to_thread(_robot_url, running.url)
-            child = await Child.start(kind, [sys.executable, "-m", "benchmarks.attacks", kind, url])
-            try:
-                async for line in child.lines():
-                    if line == "ready":
-                        break
+            async with _attacker(kind, url):
                 await asyncio.sleep(1.0)
-                times = await _probe(probe, seconds)
-                rows.append(_row(kind, times, alone, running))
-            finally:
-                await child.stop()
+                rows.append(_row(kind, await _probe(probe, seconds), alone, running))
     return rows
+
+
+@contextlib.asynccontextmanager
+async def _attacker(kind: str, target: str) -> AsyncIterator[None]:
+    """Run a process of :mod:`benchmarks.attacks`."""
+    child = await Child.start(kind, [sys.executable, "-m", "benchmarks.attacks", kind, target])
+    try:
+        async for line in child.lines():
+            if line == "ready":
+                break
+        yield
+    finally:
+        await child.stop()
 
 
 def _row(kind: str, times: list[float], alone: list[float], running: RunningEngine) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
 USER = PASSWORD = "abuser"
+BUSY = "busy processes"
 STRING, IMAGE = "std_msgs/String", "sensor_msgs/Image"
 _MASK = bytes(4)
 _ID = b"0" * 32
@@ -198,6 +199,16 @@ async def attack(kind: str, url: str) -> None:
         await asyncio.sleep(0.1)
 
 
+def burn(nice: int) -> None:
+    """Use a processor at a priority until killed, without anything to do with the engine."""
+    os.nice(nice)
+    print("ready", flush=True)
+    while True:
+        pass
+
+
 if __name__ == "__main__":
+    if sys.argv[1] == BUSY:
+        burn(int(sys.argv[2]))
     os.nice(19)  # who attacks has a machine of their own
     uvloop.run(attack(sys.argv[1], sys.argv[2]))

@@ -44,13 +44,17 @@ class Steps:
         self._left: float = math.inf
         self._reader = reader
         self._read = reader.read_exact
+        self._is_at_end = reader.at_eof
         self._header: deque[bytearray] = deque(maxlen=3)
         """The last small reads: before a large payload its first bytes, its length, its mask."""
         self._payload: bytes | None = None
         self._filled = 0
         self.stopped = False
         """Whether the parser could go on."""
+        self.is_between_frames = False
+        """Whether the parser waits for a frame of which it has nothing yet."""
         reader.read_exact = self._read_exact  # type: ignore[method-assign]  # the library makes the reader
+        reader.at_eof = self._at_eof  # type: ignore[method-assign]  # as above
 
     @property
     def held(self) -> int:
@@ -68,6 +72,13 @@ class Steps:
         if payload is not None:
             self._filled = 0
         return payload
+
+    def _at_eof(self) -> Generator[None, None, bool]:
+        """Look for the end of the stream, which the parser does before each frame."""
+        self.is_between_frames = True
+        is_at_end = yield from self._is_at_end()
+        self.is_between_frames = False
+        return is_at_end
 
     def _read_exact(self, n: int) -> Generator[None, None, bytearray]:
         self._left -= 1

@@ -7,6 +7,7 @@ back. While the master is away everything goes on, except that no new robot can 
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 from typing import TYPE_CHECKING, Protocol
 
@@ -34,6 +35,8 @@ from rce.guard.budget import Ledger
 from rce.protocol.exceptions import HandshakeError
 from rce.protocol.messages import type_of
 from rce.protocol.names import EndpointId
+from rce.ros.tcpros.allocator import give_back_free_memory
+from rce_robot.memory import UnusedMemory
 from rce_robot.namespace import Namespace
 
 if TYPE_CHECKING:
@@ -115,6 +118,7 @@ class RobotTaskSet:
             in_all=settings.memory or machine_memory() // 2,
         )
         self._tasks: asyncio.TaskGroup | None = None
+        self._unused = UnusedMemory(resident_bytes())
 
     # The master's side
 
@@ -256,6 +260,7 @@ class RobotTaskSet:
         for namespace in self._namespaces.values():
             namespace.tick()
         self._ledger.refresh()
+        self._give_back_memory()
         self._channel.send(
             Usage(
                 cpu_s=cpu_seconds(),
@@ -266,6 +271,15 @@ class RobotTaskSet:
                 turned_away=self._lobby.turned_away + self._hub.lobby.turned_away,
             )
         )
+
+    def _give_back_memory(self) -> None:
+        """Keep no more of the memory of former messages than is worth it."""
+        held = self._ledger.total
+        if self._unused.is_due(resident_bytes(), held, self._ledger.growths):
+            if self._unused.idle:
+                gc.collect()  # what ended may be in cycles that hold messages; the collector counts no bytes
+            give_back_free_memory()
+            self._unused.given_back(resident_bytes(), held)
 
     async def _sync(self, specs: tuple[EndpointSpec, ...]) -> None:
         wanted = {spec.id for spec in specs}

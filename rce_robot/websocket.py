@@ -1,8 +1,10 @@
 """A WebSocket connection without a task between the network and the engine.
 
-The ``websockets`` library does the handshake, the parsing, pings and the end of a connection. Two things
+The ``websockets`` library does the handshake, the parsing, pings and the end of a connection. Three things
 are different here, because the time they take is a large part of a message's way through the engine:
 
+* A message that came as a whole in one frame is taken out of what was read without the library's parser
+  (:mod:`rce_robot.frames`).
 * A complete message is handed to the :class:`Receiver` from within ``data_received``; there is no queue
   and no task to be woken.
 * Frames are written straight to the transport: a server's frames are neither masked nor compressed, so a
@@ -16,7 +18,6 @@ from __future__ import annotations
 
 import contextlib
 import socket
-import struct
 from collections import deque
 from typing import TYPE_CHECKING, Protocol
 
@@ -25,6 +26,7 @@ from websockets.protocol import State
 
 from rce.buffers import unfilled, write_together
 from rce.guard.websocket import GuardedConnection
+from rce_robot.frames import FIN_BINARY, FIN_TEXT, JOIN_BELOW, add_frame, find_message
 from rce_robot.steps import LARGE_FRAME, Steps
 
 if TYPE_CHECKING:
@@ -47,15 +49,6 @@ JOIN_PER_STEP = 1 << 20
 
 UNSENT_LOW_WATER = 256 << 10
 """Bytes that the kernel holds for a slow robot beyond what is on its way; more would only grow stale."""
-
-_FIN_TEXT = 0x80 | Opcode.TEXT
-_FIN_BINARY = 0x80 | Opcode.BINARY
-_SHORT = struct.Struct("!BB")
-_MEDIUM = struct.Struct("!BBH")
-_TWO_BYTE_LENGTH, _EIGHT_BYTE_LENGTH = 126, 127
-_LONG = struct.Struct("!BBQ")
-_JOIN_BELOW = 16 << 10
-"""Below this many bytes a copy costs less than another buffer in the transport's queue."""
 
 
 class Receiver(Protocol):
@@ -86,6 +79,8 @@ class RobotSocket(GuardedConnection):
 
     _share: LoopShare | None = None
     _user = ""
+    _begin = 0
+    """How much of the oldest of what came has been handled."""
     receiver: Receiver | None = None
     """Gets what arrives. Set while the handshake is answered."""
 
@@ -104,19 +99,19 @@ class RobotSocket(GuardedConnection):
     def write(self, message: Outgoing) -> None:
         """Write a message. Only to be called while :attr:`writable`."""
         buffers: list[Buffer] = []
-        _add_frame(buffers, _FIN_TEXT, b"", message.text)
+        add_frame(buffers, FIN_TEXT, b"", message.text)
         for head, body in message.binaries:
-            _add_frame(buffers, _FIN_BINARY, head, body)
+            add_frame(buffers, FIN_BINARY, head, body)
         self._write(buffers)
 
     def write_binary(self, head: bytes, body: Buffer) -> None:
         """Write a message that is one binary frame. Only to be called while :attr:`writable`."""
         buffers: list[Buffer] = []
-        _add_frame(buffers, _FIN_BINARY, head, body)
+        add_frame(buffers, FIN_BINARY, head, body)
         self._write(buffers)
 
     def _write(self, buffers: list[Buffer]) -> None:
-        if len(buffers) > 1 and sum(map(len, buffers)) < _JOIN_BELOW:
+        if len(buffers) > 1 and sum(map(len, buffers)) < JOIN_BELOW:
             self.transport.write(b"".join(buffers))  # one system call, and in TLS one record
             return
         if len(buffers) > 1:
@@ -150,9 +145,12 @@ class RobotSocket(GuardedConnection):
             self._work_on()
             return True
         data = self._input.popleft() if self._input else b""
-        self._input_bytes -= len(data)
-        self._steps.allow()
-        super().data_received(data)
+        if not self._take_message(data):
+            rest = data[self._begin :] if self._begin else data
+            self._begin = 0
+            self._input_bytes -= len(rest)
+            self._steps.allow()
+            super().data_received(rest)
         if self._input or self._steps.stopped or self._work:
             return True
         self._end_of_input()
@@ -243,6 +241,28 @@ class RobotSocket(GuardedConnection):
 
     # Own
 
+    def _take_message(self, data: bytes) -> bool:
+        """Handle the next frame without the library, if it is a message; return whether it is."""
+        protocol = self.protocol
+        if not self._steps.is_between_frames or protocol.current_size is not None:
+            return False
+        if protocol.state is not State.OPEN or protocol.extensions:
+            return False
+        begin = self._begin
+        limit = protocol.max_message_size
+        found = find_message(data, begin, len(data) if limit is None else limit)
+        if found is None:
+            return False
+        opcode, message, end = found
+        self._input_bytes -= end - begin
+        if end < len(data):
+            self._input.appendleft(data)
+            self._begin = end
+        else:
+            self._begin = 0
+        self._deliver(opcode, message)
+        return True
+
     def _end_of_input(self) -> None:
         """Read on, because all that came has been handled."""
         self._waits = False
@@ -256,7 +276,7 @@ class RobotSocket(GuardedConnection):
 
     def _forget_input(self) -> None:
         self._input.clear()
-        self._input_bytes = 0
+        self._begin = self._input_bytes = 0
         if self._steps.stopped:
             self.protocol.reader.buffer.clear()
 
@@ -326,19 +346,3 @@ class RobotSocket(GuardedConnection):
     def _forget_work(self) -> None:
         self._work.clear()
         self._work_bytes = 0
-
-
-def _add_frame(buffers: list[Buffer], first: int, head: bytes, body: Buffer) -> None:
-    """Append an unmasked frame (RFC 6455, section 5.2) of the payload ``head`` + ``body``."""
-    size = len(head) + len(body)
-    if size < _TWO_BYTE_LENGTH:
-        header = _SHORT.pack(first, size)
-    elif size < 1 << 16:
-        header = _MEDIUM.pack(first, _TWO_BYTE_LENGTH, size)
-    else:
-        header = _LONG.pack(first, _EIGHT_BYTE_LENGTH, size)
-    if size < _JOIN_BELOW:
-        buffers.append(b"".join((header, head, body)))
-    else:
-        buffers.append(header + head)
-        buffers.append(body)

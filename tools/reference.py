@@ -18,8 +18,9 @@ from typing import Any
 import typer.main
 
 from rce.cli.main import GROUP, build_app
+from rce.cli.program_files import keys_of
 from rce.config.fields import Field, Section, fields_of, sections_of
-from rce.config.settings import EngineSettings
+from rce.config.settings import PROGRAM_SECTIONS, EngineSettings
 from rce_client.ros_bridge.__main__ import app as rce_ros
 from rce_container.command import app as rce_container
 from rce_master.command import app as rce_master
@@ -55,6 +56,13 @@ Times are in seconds. Memory and disk are numbers of MB, or texts such as `8G`. 
 A list's option is repeated. A file with unknown keys or values that do not fit is refused, and every fault is
 listed."""
 
+PROGRAMS_HEAD = """
+## Other programs
+
+`rce core`, `demo`, `discovery`, `relay`, `sync` and `ui` have a section each, whose settings are their
+options. `--config FILE` reads it; an environment variable (where the [options](options.md) name one) and an
+option win. The same file may hold the sections of all programs. `rce ui` takes the section `tls` too."""
+
 OPTIONS_HEAD = """\
 # Options
 
@@ -67,7 +75,37 @@ def shipped_file() -> str:
     parts = [YAML_HEAD, "\n", *_yaml(EngineSettings, "")]
     for name, section in sections_of(EngineSettings).items():
         parts += [f"\n# {_title(section)}\n{name}:\n", *_yaml(section, "  ")]
+    for name, command in _programs_with_sections():
+        parts.append(f"\n# `rce {name}`. {_first_line(command)}\n{name}:\n")
+        for key, option in keys_of(command, command.callback.leave_out).items():
+            start = "  # "
+            parts.append(
+                textwrap.fill(_help(option), WIDTH, initial_indent=start, subsequent_indent=start) + "\n"
+            )
+            parts.append(f"{start}{key}:{_example(option)}\n")
     return "".join(parts)
+
+
+def _programs_with_sections() -> Iterator[tuple[str, Any]]:
+    """Return the commands whose options are a section of the settings file."""
+    rce = _rce()
+    commands = typer.main.get_command(rce).commands  # type: ignore[attr-defined]
+    return ((name, commands[name]) for name in PROGRAM_SECTIONS)
+
+
+def _first_line(command: Any) -> str:
+    return " ".join(command.help.split())
+
+
+def _help(option: Any) -> str:
+    return " ".join((option.help or "").split()).replace("`", "")
+
+
+def _example(option: Any) -> str:
+    value = getattr(option.default, "value", option.default)
+    if value is None or callable(value) or value == "":
+        return ""
+    return f" {str(value).lower() if isinstance(value, bool) else value}"
 
 
 def settings_page() -> str:
@@ -75,16 +113,25 @@ def settings_page() -> str:
     parts = [SETTINGS_HEAD, *_settings_table("", EngineSettings, "Shared by all programs")]
     for name, section in sections_of(EngineSettings).items():
         parts += _settings_table(name, section, f"`{name}`: {_title(section)}")
+    parts.append(PROGRAMS_HEAD)
+    for name, command in _programs_with_sections():
+        parts += [
+            f"\n### `{name}`: {_first_line(command)}\n",
+            "| setting | value | option | |",
+            "|---|---|---|---|",
+        ]
+        for key, option in keys_of(command, command.callback.leave_out).items():
+            names, kind, text = _cells(option)
+            several = "list of " if option.multiple else ""
+            said = names if option.param_type_name == "option" else ""
+            parts.append(f"| `{name}.{key}` | {several}{kind or 'yes or no'} | {said} | {text} |")
     return "\n".join(parts).rstrip() + "\n"
 
 
 def options_page() -> str:
     """Return the page of all programs, their commands and options."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    commands = project["entry-points"][GROUP]
-    rce = build_app([EntryPoint(name, commands[name], GROUP) for name in sorted(commands)])
     programs = {
-        "rce": rce,
+        "rce": _rce(),
         "rce-master": rce_master,
         "rce-robot": rce_robot,
         "rce-container": rce_container,
@@ -94,6 +141,12 @@ def options_page() -> str:
     for name, app in programs.items():
         parts += _commands(name, typer.main.get_command(app))
     return "\n".join(parts).rstrip() + "\n"
+
+
+def _rce() -> typer.Typer:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    commands = project["entry-points"][GROUP]
+    return build_app([EntryPoint(name, commands[name], GROUP) for name in sorted(commands)])
 
 
 PAGES = {
@@ -165,6 +218,11 @@ def _commands(name: str, command: Any) -> Iterator[str]:
 
 
 def _option(option: Any) -> str:
+    return "| " + " | ".join(_cells(option)) + " |"
+
+
+def _cells(option: Any) -> tuple[str, str, str]:
+    """Return names, kind of value and sentence of an option or argument."""
     if option.param_type_name == "argument":
         names = f"`{option.metavar or option.name.upper()}`"
     else:
@@ -179,7 +237,7 @@ def _option(option: Any) -> str:
     shown = option.show_default and kind and default not in (None, "", ()) and not callable(default)
     unset = f" (default: {default})" if shown else ""
     text = " ".join((option.help or "").split()) + unset + variable
-    return "| " + " | ".join(cell.replace("|", r"\|") for cell in (names, kind, text)) + " |"
+    return names.replace("|", r"\|"), kind.replace("|", r"\|"), text.replace("|", r"\|")
 
 
 def _kind(annotation: Any) -> str:

@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 import uvloop
 
+from rce.cli.program_files import from_file
 from rce.ros.core import Core
 from rce.ros.core.server import DEFAULT_PORT
 from rce.ros.logfiles import log_folder
@@ -19,6 +20,7 @@ GOODBYE_S = 0.1
 """How long a core that was told to end goes on, so that whoever told it gets an answer."""
 
 
+@from_file("core")
 def core(
     port: Annotated[int, typer.Option(help="Port to listen on; 0 takes a free one.")] = DEFAULT_PORT,
     bind: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for all.")] = "127.0.0.1",

@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 import uvloop
 
+from rce.cli.program_files import from_file
 from rce.config.logs import start_logging
 from rce.ros.errors import RosError
 from rce.ros.multimaster.discovery import Discovery
@@ -21,6 +22,7 @@ from rce.ros.multimaster.settings import DiscoverySettings, local_master
 _DEFAULT = DiscoverySettings()
 
 
+@from_file("discovery", leave_out=("list",))
 def discovery(
     list_: Annotated[
         bool, typer.Option("--list", help="Print the masters that the running discovery knows, and end.")

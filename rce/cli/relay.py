@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 import uvloop
 
+from rce.cli.program_files import from_file
 from rce.config.logs import start_logging
 from rce.ros.errors import RosError
 from rce.ros.multimaster.relay.throttle import ByteThrottle, MessageThrottle, Throttle
@@ -19,6 +20,7 @@ from rce.ros.multimaster.settings import local_master
 from rce.ros.node import Node
 
 
+@from_file("relay")
 def relay(
     source: Annotated[str, typer.Argument(metavar="FROM", help="Topic to take, of any type.")],
     target: Annotated[str, typer.Argument(metavar="TO", help="Topic to publish.")],

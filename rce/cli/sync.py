@@ -14,6 +14,7 @@ import typer
 import uvloop
 import yaml
 
+from rce.cli.program_files import from_file
 from rce.config.logs import start_logging
 from rce.ros.errors import RosError
 from rce.ros.multimaster.errors import MultimasterError
@@ -28,6 +29,7 @@ def _names(help_: str, *flags: str) -> Any:
     return typer.Option(*flags, help=f"{help_} May be repeated or hold commas; * stands for anything.")
 
 
+@from_file("sync")
 def sync(
     topics: Annotated[list[str] | None, _names("Topics to take.", "--topics", "--sync-topics")] = None,
     services: Annotated[

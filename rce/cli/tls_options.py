@@ -1,11 +1,14 @@
-"""Options of TLS for programs that read no settings file."""
+"""Options of TLS for programs whose settings are their options."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from rce.config.settings import EngineSettings
 
 Tls = Annotated[bool, typer.Option("--tls", help="Serve in TLS (docs/how-to/tls.md).")]
 Certificates = Annotated[
@@ -30,3 +33,16 @@ Authority = Annotated[
         help="The engine's authority.pem, where its certificate is not of a public authority.",
     ),
 ]
+
+
+def tls_of(settings: EngineSettings) -> dict[str, Any]:
+    """Return what the settings file's section ``tls`` says, as values of these options."""
+    tls = settings.tls
+    found = {
+        "tls": tls.enabled,
+        "certificates": str(settings.certificates),
+        "certificate": tls.name,
+        "tls_cert": tls.cert and str(tls.cert),
+        "tls_key": tls.key and str(tls.key),
+    }
+    return {name: value for name, value in found.items() if value is not None}

@@ -14,7 +14,7 @@ from __future__ import annotations
 import difflib
 import ipaddress
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
@@ -183,7 +183,9 @@ def sections_of(section: type[Section]) -> Mapping[str, type[Section]]:
     return {field.name: field.type for field in struct_fields(section) if _is_section(field.type)}
 
 
-def read_section(section: type[Section], data: Any, place: str, faults: list[Fault]) -> dict[str, Any]:
+def read_section(
+    section: type[Section], data: Any, place: str, faults: list[Fault], others: Collection[str] = ()
+) -> dict[str, Any]:
     """Read those values that a document holds.
 
     Args:
@@ -191,6 +193,7 @@ def read_section(section: type[Section], data: Any, place: str, faults: list[Fau
         data: The document, as plain values.
         place: Where it stands, for faults.
         faults: Gets every fault.
+        others: Keys that are not for this reader, and are passed over.
 
     Returns:
         The values that fit; those of sections as dictionaries.
@@ -211,8 +214,8 @@ def read_section(section: type[Section], data: Any, place: str, faults: list[Fau
                 chosen[key] = fields[key].read(value)
             except SettingError as error:
                 faults.append(Fault(here + error.place, str(error)))
-        else:
-            close = difflib.get_close_matches(str(key), [*fields, *inner], 1, 0.5)
+        elif key not in others:
+            close = difflib.get_close_matches(str(key), [*fields, *inner, *others], 1, 0.5)
             faults.append(Fault(here, "is no known key" + (f"; did you mean {close[0]!r}?" if close else "")))
     return chosen
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from rce.config.documents import parse, read_file
 from rce.config.exceptions import ConfigError, Fault
 from rce.config.fields import read_section, sections_of, write_section
-from rce.config.settings import LOOPBACK, EngineSettings
+from rce.config.settings import LOOPBACK, PROGRAM_SECTIONS, EngineSettings
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -64,7 +64,7 @@ def read_document(data: Any, source: str) -> dict[str, Any]:
             source, [Fault("", "must be a mapping with the keys master, robot, container, ...")]
         )
     faults: list[Fault] = []
-    found = read_section(EngineSettings, data, "", faults)
+    found = read_section(EngineSettings, data, "", faults, PROGRAM_SECTIONS)
     if faults:
         raise ConfigError(source, list(dict.fromkeys(faults)))
     return found

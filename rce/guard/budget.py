@@ -60,6 +60,7 @@ class Ledger:
         total: Bytes held.
         shed: How often somebody had to give something up.
         failed: How many holders were ended.
+        growths: How often a holder told that it holds more.
     """
 
     def __init__(self, *, per_user: int, in_all: int) -> None:
@@ -73,6 +74,7 @@ class Ledger:
         self.total = 0
         self.shed = 0
         self.failed = 0
+        self.growths = 0
 
     def open(self, user: str, holder: Holder) -> Account:
         """Make an account for a holder."""
@@ -91,6 +93,7 @@ class Ledger:
         return self._sums.get(user, 0)
 
     def _note(self, account: Account) -> None:
+        self.growths += 1
         self._look_at(account)
         if self._settling:
             return

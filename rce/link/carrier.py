@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from rce.link.queues import OutgoingQueue
 
 
+_TURN = 1 << 20
+"""Bytes after which the delivery within a process lets the event loop do something else."""
+
+
 class CarrierHandler(Protocol):
     """Who takes what a carrier brings."""
 
@@ -109,8 +113,8 @@ class LocalCarrier(Carrier):
     """One half of a link between two endpoints of one process.
 
     Payloads are handed over as they are. Delivery is a later step of the event loop, so that interfaces which
-    answer at once cannot recurse, and takes what lay there when it began, so that two of them cannot hold the
-    loop.
+    answer at once cannot recurse. A step takes what lay there when it began, up to 1 MB or one larger
+    message, so that two of them cannot hold the loop.
     """
 
     kind = "local"
@@ -213,11 +217,16 @@ class LocalCarrier(Carrier):
     def _deliver(self) -> None:
         self._delivery = None
         assert self._handler is not None
+        budget = _TURN
         for _ in range(len(self._inbox)):
             if not self._inbox:
                 return
+            if budget <= 0:
+                break
+            frame = self._inbox.popleft()
+            budget -= len(frame.payload)
             try:
-                self._handler.frame_received(self._inbox.popleft())
+                self._handler.frame_received(frame)
             except ProtocolError as error:
                 self.close()
                 self._handler.carrier_lost(self, error)

@@ -51,7 +51,7 @@ MAX_ID = 2**32 - 1
 
 _SCRATCH_SIZE = 64 * KIB
 _DIRECT_SIZE = 16 * KIB
-"""Payloads from here on are read straight into their message."""
+"""Payloads from here on are read straight into their message, unless all of them is there already."""
 
 
 class FrameType(IntEnum):
@@ -309,8 +309,10 @@ class FrameReader:
         if length > total or total > self.max_message:
             raise ProtocolError(f"message of {total} bytes (limit {self.max_message}), {length} in one frame")
         body = self._start + HEADER_SIZE
-        if length == total and length < _DIRECT_SIZE and frame_type is not FrameType.FRAGMENT:
-            if self._end - body < length:
+        is_here = length <= self._end - body
+        is_small = length < _DIRECT_SIZE and frame_type is not FrameType.FRAGMENT
+        if length == total and (is_small or (is_here and frame_type in _CARRIERS)):
+            if not is_here:
                 return False
             self._start = body + length
             frame = Frame(frame_type, channel, call_id, flags, bytes(self._scratch[body : self._start]))

@@ -14,6 +14,7 @@ import aiohttp
 import typer
 import uvloop
 
+from rce.cli.program_files import from_file
 from rce.config.settings import Runtime
 from rce.supervision.signals import end_signals
 from rce_client.demo.exceptions import DemoError
@@ -33,6 +34,7 @@ TIMEOUT = 180.0
 T = TypeVar("T")
 
 
+@from_file("demo")
 def demo(
     mode: Annotated[
         Mode, typer.Option(help="What carries the messages: the engine, one ROS core, or one per robot.")

@@ -15,7 +15,8 @@ from urllib.parse import urlsplit
 import typer
 import uvloop
 
-from rce.cli.tls_options import Authority, CertificateName, Certificates, Tls, TlsCert, TlsKey
+from rce.cli.program_files import from_file
+from rce.cli.tls_options import Authority, CertificateName, Certificates, Tls, TlsCert, TlsKey, tls_of
 from rce.config.client import ClientConfig, load
 from rce.config.exceptions import ConfigError, Fault
 from rce.config.logs import start_logging
@@ -43,6 +44,7 @@ from rce_client.station.view import FleetView
 PORT = 9080
 
 
+@from_file("ui", shared=tls_of)
 def ui(
     config: Annotated[
         Path | None, typer.Argument(help="The operator's file: user, robotID, the planner's container.")

@@ -30,10 +30,10 @@ _log = logging.getLogger(__name__)
 class ConversionSettings:
     """How large messages are converted."""
 
-    workers: int = max(2, min(4, (os.cpu_count() or 1) - 1))
+    workers: int = max(2, min(3, (os.cpu_count() or 1) - 1))
     """Processes at most. A user has one fewer, so that there is one for others."""
-    memory: int = 768 << 20
-    """What one process may use, in bytes."""
+    memory: int = 512 << 20
+    """What one process may use while it converts, in bytes: the largest messages need about 300 MB."""
     timeout: float = 10.0
     """Seconds that one conversion may take."""
     idle: float = 10.0

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from rce.buffers import unfilled
 from rce.control.model import InterfaceSpec
 from rce.link import InterfaceError
 from rce.protocol.exceptions import ProtocolError
@@ -26,6 +27,7 @@ from rce.protocol.large import read_large
 from rce.protocol.names import InterfaceType
 from rce.protocol.weight import Address
 from rce.ros.packages import PackageIndex
+from rce.ros.tcpros.allocator import give_back_free_memory
 from rce.ros.types import TypeRegistry
 from rce_robot.conversion.jobs import HEAD, ReadText, ReadValue, Result, Show, decode_job, pack
 from rce_robot.exceptions import UnreadableError
@@ -117,10 +119,13 @@ def serve(sock: socket.socket, worker: Worker) -> None:
         del meta
         result, answer = worker.do(job, parts)
         del parts
-        for buffer in pack(result, answer):
-            sock.sendall(buffer)
+        packet = pack(result, answer)
         del answer
+        for buffer in packet:
+            sock.sendall(buffer)
+        del packet, buffer
         gc.collect()  # what an error's traceback holds is a cycle
+        give_back_free_memory()
 
 
 def _need(sock: socket.socket, size: int) -> bytes:
@@ -132,18 +137,19 @@ def _need(sock: socket.socket, size: int) -> bytes:
 
 def _receive(sock: socket.socket, size: int) -> bytes | None:
     """Read so many bytes; None if the socket ends before the first."""
-    data = bytearray(size)
-    view = memoryview(data)
+    if not size:
+        return b""
+    memory = unfilled(size)
     filled = 0
-    while filled < size:
-        count = sock.recv_into(view[filled:])
-        if count == 0:
-            if filled == 0:
-                return None
-            raise EOFError("the socket ended within a job")
-        filled += count
-    view.release()
-    return bytes(data)
+    with memory.getbuffer() as view:
+        while filled < size:
+            count = sock.recv_into(view[filled:])
+            if count == 0:
+                if filled == 0:
+                    return None
+                raise EOFError("the socket ended within a job")
+            filled += count
+    return memory.getvalue()
 
 
 def _give_way(memory: int) -> None:

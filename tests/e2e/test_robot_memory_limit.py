@@ -21,6 +21,8 @@ MB = 1 << 20
 LIMIT_MB = 64
 OVERHEAD_MB = 200
 """What the allocator keeps (128 MB), and messages in the hands of the network and of the code."""
+LEFT_MB = 64
+"""What the endpoint, with all its processes, may have more than before when nothing is held any more."""
 SERVICE, STRING = "std_srvs/SetBool", "std_msgs/String"
 
 
@@ -52,7 +54,20 @@ async def say(socket: ClientConnection, tag: str, cls: str, payload: bytes, numb
 
 
 def memory_mb(engine: Engine) -> int:
+    """What the endpoint uses, without the processes that it converts in."""
     return sum(process.memory_info().rss for process in engine.processes_of("rce-robot")) // MB
+
+
+def memory_of_all_mb(engine: Engine) -> int:
+    """The proportional share of all memory that the endpoint and its processes have."""
+    processes = {
+        child for p in engine.processes_of("rce-robot") for child in (p, *p.children(recursive=True))
+    }
+    sizes = []
+    for process in processes:
+        with contextlib.suppress(psutil.Error):
+            sizes.append(process.memory_full_info().pss)
+    return sum(sizes) // MB
 
 
 async def peak_while(engine: Engine, attack: asyncio.Task[None]) -> int:
@@ -127,6 +142,25 @@ async def halves(engine: Engine) -> None:
         writer.transport.abort()
 
 
+async def large_texts(engine: Engine) -> None:
+    """6 texts of 15 MB of escapes and many values, which are converted in processes of their own."""
+    async with robot(engine, "talks") as talks:
+        await connect_ends(
+            talks,
+            ("talks", "out", "SubscriberConverter", STRING),
+            ("talks", "in", "PublisherConverter", STRING),
+        )
+        await until(lambda: _established(engine), what="the topic is connected")
+        texts = [json.dumps({"data": "\xe4" * 2_500_000}), "[" + "1," * 1_900_000 + "1]"]
+        for number in range(6):
+            data = f'{{"iTag":"out","type":"{STRING}","msgID":"nil","msg":{texts[number % 2]}}}'
+            await talks.send(f'{{"type":"DM","data":{data}}}')
+            # An answer comes for each: the message itself, or that it is no message or one too many.
+            async with asyncio.timeout(60):
+                while json.loads(await talks.recv())["type"] not in {"DM", "ER"}:
+                    pass
+
+
 async def _wait_for_end(reader: asyncio.StreamReader) -> None:
     with contextlib.suppress(ConnectionError):
         await reader.read(-1)
@@ -141,16 +175,18 @@ def _established(engine: Engine) -> int:
     return sum(c["established"] for c in engine.get("/api/v1/connections")["connections"])
 
 
-@pytest.mark.parametrize("attack", [requests_without_answer, topics_that_nobody_reads, halves])
+@pytest.mark.parametrize("attack", [requests_without_answer, topics_that_nobody_reads, halves, large_texts])
 async def test_the_limit_holds_whatever_holds_the_messages(attack: object) -> None:
     async with running_engine(robot_options=("--user-memory", str(LIMIT_MB))) as engine:
-        before = memory_mb(engine)
+        before, all_before = memory_mb(engine), memory_of_all_mb(engine)
         assert callable(attack)
         peak = await peak_while(engine, asyncio.create_task(attack(engine)))
         print(f"before {before} MB, most {peak} MB")  # noqa: T201 - what was measured
         assert peak < before + LIMIT_MB + OVERHEAD_MB
         held = lambda: float(_gauge(engine.get("/metrics"), "rce_task_set_held_bytes"))  # noqa: E731
         await until(lambda: held() < MB, what="the gauge falls when nothing is held")
+        left = lambda: memory_of_all_mb(engine) - all_before  # noqa: E731
+        await until(lambda: left() < LEFT_MB, what=f"less than {LEFT_MB} MB are left, not {left()}")
 
 
 def _gauge(metrics: str, name: str) -> str:

@@ -76,6 +76,11 @@ async def test_restarts_a_task_set_that_died(folder: Path) -> None:
     url = f"http://127.0.0.1:{ports[0]}/"
     async with rce_up(folder, ports, "--runtime", "process") as up:
         await up.start(ready="RCE ready:")
+        manager = pid_of(folder, "rce_container")
+        assert manager is not None
+        os.kill(manager, signal.SIGUSR1)
+        await until(lambda: up.output().count("rce-container ready") > 1, what="the manager is there anew")
+        assert pid_of(folder, "rce_container") == manager
         for module in ("rce_master", "rce_robot", "rce_container"):
             old = pid_of(folder, module)
             assert old is not None

@@ -196,7 +196,7 @@ async def test_a_latched_burst_over_the_limit_does_not_end_the_link() -> None:
 
             def moved() -> bool:
                 usage = cloud.master.usage
-                if usage is None or usage.held > limit:
+                if usage is None or usage.held > limit or "testUser/testRobot" not in usage.endpoints:
                     return False
                 interfaces = usage.endpoints["testUser/testRobot"].interfaces
                 came, dropped = (
