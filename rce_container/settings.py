@@ -57,7 +57,7 @@ class ContainerSettings:
     home_bytes: int = 256 * MEGABYTE
     """Size of a container's home, which lives in memory."""
     first_uid: int = FIRST_UID
-    """As root each container runs as a user of its own, from this one on; nobody else may have them."""
+    """As root each container runs as a user of its own, from this one on; no other user may have them."""
     uids: int = UIDS
     """How many such users there are."""
     slots: int = 0

@@ -70,7 +70,10 @@ def back_up(folders: Mapping[str, Path], out: Path) -> Copy:
     """
     store = folders[MASTER] / FILE_NAME
     if not store.exists():
-        raise BackupError(f"{folders[MASTER]} is not a master's state folder: it has no {FILE_NAME}")
+        raise BackupError(
+            f"{folders[MASTER]} is not a master's state folder: it has no {FILE_NAME}; "
+            "name the folder with --state-dir or --config"
+        )
     if out.exists():
         raise BackupError(f"{out} is there already; name another file, or remove it")
     try:

@@ -33,7 +33,7 @@ def relay(
     window: Annotated[float, typer.Option(help="Seconds over which --max-bytes is averaged.")] = 1.0,
     lazy: Annotated[bool, typer.Option(help="Take messages only while they are subscribed to.")] = False,
     latch: Annotated[bool, typer.Option(help="Keep the last message for later subscribers.")] = False,
-    name: Annotated[str, typer.Option(help="Name of the node; default: one that nobody has.")] = "",
+    name: Annotated[str, typer.Option(help="Name of the node; default: a unique one.")] = "",
     master_uri: Annotated[str, typer.Option(help="The master; default: ROS_MASTER_URI.")] = "",
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what happens.")] = False,
 ) -> None:

@@ -38,7 +38,7 @@ def new(
     typer.echo(f"made {path}")
     if file is not None:
         typer.echo(f"programs find it by --secret-file {path}, or RCE_SECRET_FILE={path}")
-    typer.echo("copy it to every machine of the engine, and to nobody else")
+    typer.echo("copy it to every machine of the engine, and nowhere else")
 
 
 @app.command("rotate")

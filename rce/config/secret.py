@@ -241,7 +241,7 @@ def _read_lines(file: Path) -> list[str]:
     except (OSError, UnicodeDecodeError) as error:
         raise SecretError(f"cannot read the secret from {file}: {error}") from error
     if stat.S_ISREG(mode) and mode & (stat.S_IRWXG | stat.S_IRWXO) & ~stat.S_IRGRP:
-        raise SecretError(f"{file} can be read by everybody; run: chmod 600 {file}")
+        raise SecretError(f"{file} can be read by other users; run: chmod 600 {file}")
     lines = [line for line in text.splitlines() if line.strip()]
     return [Secret(line).reveal() for line in lines or [""]]
 

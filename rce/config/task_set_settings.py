@@ -148,7 +148,7 @@ class ContainerSettings(Section, frozen=True, kw_only=True):
     first_uid: Annotated[
         int,
         Meta(ge=1),
-        Setting("As root: the first of the user IDs that containers run as; nobody else may have them."),
+        Setting("As root: the first of the user IDs that containers run as; no other user may have them."),
     ] = 700_000
     uids: Annotated[int, Meta(ge=1), Setting("How many such user IDs there are.")] = 10_000
     log_days: Annotated[

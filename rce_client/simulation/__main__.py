@@ -30,7 +30,7 @@ def simulate(
     scene: Annotated[Path, typer.Argument(help="What stands where, JSON or YAML.")],
     report: Annotated[Path | None, typer.Option(help="File to write what truly happens to.")] = None,
     master: Annotated[
-        str, typer.Option(help="The engine whose planner blocks cells; without it, nobody does.")
+        str, typer.Option(help="The engine whose planner blocks cells; without it, no cell is blocked.")
     ] = "",
     user: Annotated[str, typer.Option(help="Whose fleet it is.")] = "testUser",
     password: Annotated[str, typer.Option(envvar="RCE_PASSWORD", help="The user's password.")] = "testUser",  # noqa: S107 - the development user's

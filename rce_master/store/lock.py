@@ -34,7 +34,7 @@ class FolderLock:
         except OSError as error:
             os.close(self._fd)
             self._fd = -1
-            raise StoreBusy(f"a master is running on the state folder {folder}") from error
+            raise StoreBusy(f"a master is running on the state folder {folder}; stop it first") from error
 
     def close(self) -> None:
         """Give it back."""
