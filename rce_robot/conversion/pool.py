@@ -72,6 +72,8 @@ class ConversionPool:
         self._running: Counter[str] = Counter()
         self._idle: dict[WorkerProcess, asyncio.TimerHandle] = {}
         self._count = 0
+        self._alive: set[WorkerProcess] = set()
+        """All whose end was not seen yet."""
         self._tasks: set[asyncio.Task[None]] = set()
         self._closed = False
         self.killed = 0
@@ -112,10 +114,11 @@ class ConversionPool:
             task.cancel()
         if self._tasks:
             await asyncio.wait(self._tasks)
-        for worker, timer in list(self._idle.items()):
+        for timer in self._idle.values():
             timer.cancel()
-            await worker.end()
         self._idle.clear()
+        for worker in list(self._alive):  # those too whose end was cut short above
+            await self._end(worker)
 
     def _withdraw(self, order: _Order) -> None:
         orders = self._waiting.get(order.user)
@@ -132,6 +135,7 @@ class ConversionPool:
                 timer.cancel()
             else:
                 worker = WorkerProcess(self._packages, self._settings.memory)
+                self._alive.add(worker)
                 self._count += 1
             self._running[order.user] += 1
             task = asyncio.get_running_loop().create_task(self._serve(worker, order))
@@ -172,7 +176,7 @@ class ConversionPool:
                 self._idle[worker] = loop.call_later(self._settings.idle, self._retire, worker)
             else:
                 self._count -= 1
-                await worker.end()
+                await self._end(worker)
             self._go_on()
 
     async def _do(self, worker: WorkerProcess, order: _Order) -> tuple[Result, list[memoryview]]:
@@ -192,6 +196,10 @@ class ConversionPool:
         """End a process that had nothing to do for a while."""
         if self._idle.pop(worker, None) is not None:
             self._count -= 1
-            task = asyncio.get_running_loop().create_task(worker.end())
+            task = asyncio.get_running_loop().create_task(self._end(worker))
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
+
+    async def _end(self, worker: WorkerProcess) -> None:
+        await worker.end()
+        self._alive.discard(worker)

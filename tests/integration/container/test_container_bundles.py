@@ -154,7 +154,7 @@ async def test_a_new_manager_goes_on_where_the_old_one_was(shop: Machine) -> Non
         nodes = (node("nav"), node("late", tag="late"))
         await shop.put(BOX, nodes=nodes, bundles=(nav, late))
         await shop.log_holds(BOX, "node", "here")
-        before = shop.node(BOX, "node").pid
+        before = (await shop.node_is(BOX, "node", NodeState.RUNNING)).pid
         await shop.node_is(BOX, "late", NodeState.WAITING)
     (shop.folder / "bundles" / "incoming" / "half").mkdir(parents=True)
     shop.library.open()
