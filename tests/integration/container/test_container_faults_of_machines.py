@@ -64,7 +64,7 @@ async def test_user_namespaces_are_forbidden(container: Program, folder: Path) -
     container.argv = [*WITHOUT_USER_NAMESPACES, *container.argv]
     await container.start(ready="runtime=process")
     words = "a normal user needs user namespaces for that; see the sysctls user.max_user_namespaces"
-    assert words in container.output()
+    assert words in container.output(), container.output()
     assert "containers are NOT isolated" in container.output()
     (inner,) = [one for one in Traces(folder).look() if one.parent == container.pid]
     os.kill(inner.pid, signal.SIGTERM)

@@ -1,4 +1,4 @@
-"""The processes that convert large messages: at the end of the pool none is left, whatever it was about to do."""
+"""The processes that convert large messages: when the pool ends, none is left, whatever it was doing."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from support.engine import until
 from rce_robot.conversion.jobs import ReadText
 from rce_robot.conversion.pool import ConversionPool, ConversionSettings
 
-JOB = ReadText(
-    i_tag="tag", type="std_msgs/String", cls="SubscriberConverter", interface_type="std_msgs/String"
-)
+STRING = "std_msgs/String"
+JOB = ReadText(i_tag="tag", type=STRING, cls="SubscriberConverter", interface_type=STRING)
 PARTS = [b'{"data":"hello"}']
 
 
