@@ -13,27 +13,11 @@ import pytest
 from support.engine import Program, free_ports, running_engine
 
 ROOT = Path(__file__).parents[2]
+ASK = ROOT / "tests" / "support" / "ask.py"
 MOST_PACKAGES = 24
 """Distributions that the base brings, its own included; pip and setuptools are not counted."""
 
 pytestmark = [pytest.mark.e2e, pytest.mark.timeout(400), pytest.mark.xdist_group("base install")]
-
-ASK = """
-import asyncio
-from rce.ros.node import Node, run
-async def main():
-    async with Node("asker", argv=[]) as node:
-        answered = asyncio.Event()
-        def heard(message):
-            print("answer:", message.data, flush=True)
-            answered.set()
-        await node.subscribe("/stringEchoResp", "std_msgs/String", heard)
-        publisher = await node.advertise("/stringEchoReq", "std_msgs/String")
-        while not answered.is_set():
-            publisher.publish(data="hello")
-            await asyncio.sleep(0.2)
-run(main())
-"""
 
 
 @pytest.fixture(scope="module")
@@ -118,9 +102,16 @@ async def test_robot_with_the_base_uses_its_container(base: Path, tmp_path: Path
         await core.start(ready="ready:", timeout=90)
         try:
             await bridge.start(ready="rce-ros ready:", timeout=120)
-            (tmp_path / "ask.py").write_text(ASK)
             asking = await asyncio.create_subprocess_exec(
-                *("timeout", "60", str(base / "python"), str(tmp_path / "ask.py")),
+                *(
+                    "timeout",
+                    "180",
+                    str(base / "python"),
+                    "-P",
+                    str(ASK),
+                    "/stringEchoReq",
+                    "/stringEchoResp",
+                ),
                 env=env,
                 stdout=asyncio.subprocess.PIPE,
             )

@@ -16,6 +16,7 @@ from support.engine import Program, free_ports
 from support.rootfs import image_of
 
 ROOT = Path(__file__).parents[2]
+ASK = ROOT / "tests" / "support" / "ask.py"
 BIN = Path(sys.executable).parent
 PATIENCE_S = 300.0
 
@@ -29,23 +30,6 @@ _LIMITS = (
     "--ulimit=nofile=1024:1024",
     "--ulimit=nproc=4096:4096",
 )  # podman's own may be above what is allowed
-
-ASK = """
-import asyncio
-from rce.ros.node import Node, run
-async def main():
-    async with Node("asker", argv=[]) as node:
-        answered = asyncio.Event()
-        def heard(message):
-            print("answer:", message.data, flush=True)
-            answered.set()
-        await node.subscribe("/stringEchoResp", "std_msgs/String", heard)
-        publisher = await node.advertise("/stringEchoReq", "std_msgs/String")
-        while not answered.is_set():
-            publisher.publish(data="hello")
-            await asyncio.sleep(0.2)
-run(main())
-"""
 
 
 def podman(*arguments: str) -> str:
@@ -149,7 +133,9 @@ async def test_robot_image_works_with_engine_image(images: dict[str, str], tmp_p
         await engine.start(ready="RCE ready:", timeout=PATIENCE_S)
         await robot.start(ready="rce-ros ready:", timeout=PATIENCE_S)
         asking = await asyncio.create_subprocess_exec(
-            *("timeout", "100", sys.executable, "-c", ASK), env=env, stdout=asyncio.subprocess.PIPE
+            *("timeout", "180", sys.executable, "-P", str(ASK), "/stringEchoReq", "/stringEchoResp"),
+            env=env,
+            stdout=asyncio.subprocess.PIPE,
         )
         output, _ = await asking.communicate()
         assert output.decode().strip() == "answer: hello", robot.output()

@@ -21,26 +21,10 @@ from support.networks import NetworkMachine, network
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("root", "netns"), pytest.mark.timeout(300)]
 
 PAGE = Path(__file__).parents[2] / "docs/how-to/several-machines.md"
+ASK = Path(__file__).parents[1] / "support" / "ask.py"
 MACHINES = ("master", "robots", "containers", "robot")
 PATIENCE_S = 120.0
 PASSWORD = "a password of alice"
-
-ASK = """
-import asyncio
-from rce.ros.node import Node, run
-async def main():
-    async with Node("asker", argv=[]) as node:
-        answered = asyncio.Event()
-        def heard(message):
-            print("answer:", message.data, flush=True)
-            answered.set()
-        await node.subscribe("/answer", "std_msgs/String", heard)
-        publisher = await node.advertise("/request", "std_msgs/String")
-        while not answered.is_set():
-            publisher.publish(data="hello")
-            await asyncio.sleep(0.2)
-run(main())
-"""
 
 
 class Machine:
@@ -136,8 +120,7 @@ async def test_how_to_for_several_machines(folder: Path) -> None:
             (robot.home / "robot.config").write_text(config)
             await robot.serve(stack, "rce core", "ready:")
             await robot.serve(stack, page["robot"][0].strip(), "rce-ros ready: ")
-            (robot.home / "ask.py").write_text(ASK)
-            assert "answer: hello" in await robot.run("timeout 60 python ask.py")
+            assert "answer: hello" in await robot.run(f"timeout 180 python -P {ASK} /request /answer")
             sockets = subprocess.run(
                 [*places[1].prefix, "ss", "-tnH", "state", "established"],
                 capture_output=True,
