@@ -15,7 +15,7 @@ import pytest
 from support.engine import Engine, running_engine, until
 from websockets.asyncio.client import ClientConnection, connect
 
-pytestmark = [pytest.mark.e2e, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.e2e, pytest.mark.timeout(480)]
 
 MB = 1 << 20
 LIMIT_MB = 64
