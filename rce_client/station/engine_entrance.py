@@ -33,8 +33,8 @@ LIFETIME_S = 12 * 3600.0
 """Of a login at the page."""
 MAX_KNOWN = 1000
 MAX_NOTES = 1000
-_TOLD_ON = (400, 401, 403, 429)
-"""Statuses of the master's answer to a login that its caller gets as they are."""
+_TOLD_ON = {400: 400, 401: 401, 403: 403, 422: 400, 429: 429}
+"""Statuses of the master's answer to a login that its caller is told, and by which."""
 _ASKED_IN_VAIN = (aiohttp.ClientError, TimeoutError, ValueError, KeyError, AttributeError, TypeError)
 """What asking the master may end with, also if something else answers at its address."""
 _TIMEOUT = aiohttp.ClientTimeout(total=10)
@@ -186,7 +186,9 @@ class EngineEntrance:
                 return str(answer["token"])
             said = str(answer.get("error", reply.reason))
             if reply.status in _TOLD_ON:
-                raise EntranceError(reply.status, said, _seconds(reply.headers.get(hdrs.RETRY_AFTER, "")))
+                raise EntranceError(
+                    _TOLD_ON[reply.status], said, _seconds(reply.headers.get(hdrs.RETRY_AFTER, ""))
+                )
             raise EntranceError(503, f"the engine lets no one log in now: {said}")
 
     async def _write_notes(self) -> None:
