@@ -123,7 +123,8 @@ class TlsGate:
             raise
 
     def _complain(self, address: str, why: str) -> None:
-        if self._complaints.is_due(address, asyncio.get_running_loop().time()):
+        # Each reason for itself: one that was told must not hide another.
+        if self._complaints.is_due(f"{address} {why}", asyncio.get_running_loop().time()):
             _log.warning("%s: a client at %s was not taken: %s", self._name, address or "this machine", why)
 
 
