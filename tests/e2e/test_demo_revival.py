@@ -25,7 +25,7 @@ def kill(demo: Demo, *words: str) -> None:
     """Kill the one program of the demo whose command line holds all words."""
     found = []
     for child in psutil.Process(demo.process.pid).children():
-        with contextlib.suppress(psutil.ZombieProcess):
+        with contextlib.suppress(psutil.NoSuchProcess):
             line = " ".join(child.cmdline())
             found += [child] if all(word in line for word in words) else []
     assert len(found) == 1
