@@ -20,9 +20,9 @@ _ROLES = {
     "rce_master": SERVER,
     "rce_robot": SERVER,
     "rce_container": SERVER,
-    "rce_client.station": FLEET,
-    "rce_client.simulation": FLEET,
-    "rce_client.demo": ALL,
+    "rce_fleet.station": FLEET,
+    "rce_fleet.drivers": FLEET,
+    "rce_fleet.demo": ALL,
 }
 
 

@@ -36,7 +36,6 @@ from rce.protocol.messages import (
 )
 from rce.protocol.names import InterfaceType
 from rce.protocol.quantities import read_bandwidth, read_cores, read_memory
-from rce.tls.identity import client_contexts
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -260,18 +259,10 @@ class ClientConfig(Strict):
         """The interfaces of the robot itself."""
         return tuple(item for item in self.interfaces if item.endpoint == self.robot)
 
-    def tls(self, authority: Path | None = None) -> Context | None:
-        """Return what gives the TLS settings for each connection to the engine; None for the system's.
-
-        An authority that is replaced is used from the next connection on.
-
-        Args:
-            authority: In place of the file's.
-
-        Raises:
-            CertificateError: The authority cannot be used.
-        """
-        return client_contexts(authority or (Path(self.authority).expanduser() if self.authority else None))
+    @property
+    def authority_file(self) -> Path | None:
+        """The certificate of the authority to trust; None for the system's authorities."""
+        return Path(self.authority).expanduser() if self.authority else None
 
     def setup(self) -> list[Request]:
         """Return the requests that make everything, in the order in which they must be sent."""

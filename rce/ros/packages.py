@@ -5,9 +5,12 @@ of the package path (:mod:`rce.ros.package_tree`), or one directly below that ho
 only, as distributions install them. Its executables are files in the folder itself or in
 ``nodes``, ``scripts``, ``bin`` or ``lib`` below it; those of a package that is installed as
 ``PREFIX/share/PKG`` are also in ``PREFIX/lib/PKG``. What is in none of these is looked for at any depth of
-the package's folder, as rosrun and roslaunch do (:mod:`rce.ros.executables`). An installed Python
-distribution adds nodes by entry points of the group ``rce.nodes``, named ``PKG:EXE``; a file of the same name
-goes before.
+the package's folder, as rosrun and roslaunch do (:mod:`rce.ros.executables`).
+
+An installed Python distribution adds packages and nodes by entry points; what is on the path goes before:
+
+* group ``rce.packages``: named after a package; the value is the Python package whose folder it is.
+* group ``rce.nodes``: named ``PKG:EXE``; the value is a function, or a module that is run as a script.
 
 ``package.yaml`` holds::
 
@@ -23,6 +26,8 @@ import os
 import re
 import reprlib
 import sys
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -32,8 +37,11 @@ from rce.ros.package_tree import PackageTree
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-ENTRY_POINTS = "rce.nodes"
+NODE_ENTRY_POINTS = "rce.nodes"
 """Entry point group by which Python distributions add nodes."""
+
+PACKAGE_ENTRY_POINTS = "rce.packages"
+"""Entry point group by which Python distributions add packages."""
 
 PATH_VARIABLES = ("RCE_PACKAGE_PATH", "ROS_PACKAGE_PATH")
 """Environment variables that hold package paths, the more important first."""
@@ -101,7 +109,7 @@ class Package(NamedTuple):
             raise ExecutableNotFound(f"{meant[0]} may not be executed (chmod +x makes it so)")
         for name, target in _scripts(self.name):  # last, because all that is installed must be looked through
             if name == exe:
-                return [sys.executable, "-c", _call_of(target)]
+                return [sys.executable, *_arguments_of(target)]
         where = ", ".join(str(folder) for folder in self._folders() if folder.is_dir())
         raise ExecutableNotFound(
             f"package {self.name} has no executable {exe!r} (looked in {where or self.path}, and below"
@@ -159,18 +167,31 @@ class PackageIndex:
         raise PackageNotFound(f"no package {name!r} on the package path ({self.describe_path()}){hint}")
 
     def locate(self, name: str) -> Path | None:
-        """Return the folder of a package, None if there is none on the path."""
+        """Return the folder of a package, None if there is none on the path and no distribution has it.
+
+        Raises:
+            BadPackage: A distribution names a folder that does not exist.
+        """
         if _NAME.fullmatch(name) is None:
             return None
         for root in self.path:
             found = _find_below(root, name)
             if found is not None:
                 return found
-        return None
+        target = _distributed().get(name)
+        return None if target is None else _folder_of(target)
 
     def describe_path(self) -> str:
         """Return the path as text for errors."""
         return os.pathsep.join(map(str, self.path)) or "empty"
+
+
+def distributed_folders() -> list[Path]:
+    """Return the folders of the Python packages that add packages or nodes by entry points."""
+    targets = [*_distributed().values(), *(target for _, _, target in _distributed_nodes())]
+    names = sorted({target.partition(":")[0].partition(".")[0] for target in targets})
+    specs = [spec for name in names if (spec := find_spec(name)) is not None]
+    return [Path(folder) for spec in specs for folder in spec.submodule_search_locations or ()]
 
 
 def installed_shares() -> list[Path]:
@@ -306,22 +327,40 @@ def _parse_xml(manifest: Path, text: bytes, name: str) -> Package:
     return Package(declared, manifest.parent, description, version=(root.findtext("version") or "").strip())
 
 
-def _scripts(package: str) -> tuple[tuple[str, str], ...]:
-    """Read the executables of a package that are Python functions: name and ``module:function``."""
+@cache
+def _distributed() -> Mapping[str, str]:
+    """Read which packages Python distributions add: name to Python package."""
     from importlib.metadata import entry_points
 
-    points = ((*point.name.partition(":"), point.value) for point in entry_points(group=ENTRY_POINTS))
-    return tuple((exe, target) for owner, _, exe, target in points if owner == package)
+    return {point.name: point.value for point in entry_points(group=PACKAGE_ENTRY_POINTS)}
 
 
-def _call_of(target: str) -> str:
+def _scripts(package: str) -> tuple[tuple[str, str], ...]:
+    """Read the executables that Python distributions add to a package: name and ``module[:function]``."""
+    return tuple((exe, target) for owner, exe, target in _distributed_nodes() if owner == package)
+
+
+@cache
+def _distributed_nodes() -> tuple[tuple[str, str, str], ...]:
+    from importlib.metadata import entry_points
+
+    points = ((*point.name.partition(":"), point.value) for point in entry_points(group=NODE_ENTRY_POINTS))
+    return tuple((owner, exe, target) for owner, _, exe, target in points)
+
+
+def _arguments_of(target: str) -> list[str]:
+    """Return what Python is given to run an entry point."""
     module, _, function = target.partition(":")
-    return f"import importlib, sys; sys.exit(importlib.import_module({module!r}).{function or 'main'}())"
+    if not function:
+        return [str(_file_of(target))]
+    return ["-c", f"import importlib, sys; sys.exit(importlib.import_module({module!r}).{function}())"]
 
 
 def _folder_of(target: str) -> Path:
-    from importlib.util import find_spec
+    return _file_of(target).parent
 
+
+def _file_of(target: str) -> Path:
     module = target.partition(":")[0]
     try:
         spec = find_spec(module)
@@ -329,4 +368,4 @@ def _folder_of(target: str) -> Path:
         raise BadPackage(f"entry point {target}: {error}") from error
     if spec is None or spec.origin is None or not spec.has_location:
         raise BadPackage(f"entry point {target}: there is no file of a module {module}")
-    return Path(spec.origin).parent
+    return Path(spec.origin)

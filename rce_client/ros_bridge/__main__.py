@@ -23,6 +23,7 @@ from rce.ros.errors import RosError
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce.tls.exceptions import CertificateError
+from rce.tls.identity import client_contexts
 from rce_client.connection import CONNECTING, Connection, State
 from rce_client.exceptions import ClientError
 from rce_client.reminder import Reminder
@@ -74,7 +75,8 @@ def bridge(
         print(summary(read, plan))  # noqa: T201
         return
     try:
-        uvloop.run(run(read, plan, types, ros_master_uri, read.tls(authority)))
+        tls = client_contexts(authority or read.authority_file)
+        uvloop.run(run(read, plan, types, ros_master_uri, tls))
     except (ClientError, RosError, CertificateError) as error:
         print(f"rce-ros: {error}", file=sys.stderr)  # noqa: T201
         raise typer.Exit(FAILED) from error

@@ -20,6 +20,7 @@ import threading
 from collections.abc import Iterable
 from pathlib import Path
 
+from rce.ros.packages import distributed_folders
 from rce_container.environment.logs.files import ENVIRONMENT_LOG, segment_path
 from rce_container.environment.messages import Boot
 from rce_container.exceptions import ContainerError, RuntimeUnavailableError, StartError
@@ -226,16 +227,21 @@ def _make_filter() -> tuple[bytes, str]:
 
 def interpreter_paths() -> list[Path]:
     """All that the engine's Python needs to be seen inside, as paths of the machine."""
-    root = source_root()
     wanted = [Path(sys.prefix), Path(sys.base_prefix), Path(sys.base_exec_prefix)]
     wanted.append(Path(sys.executable).resolve().parents[1])
-    return [*wanted, *(path.resolve() for path in wanted), root / "rce", root / "rce_container"]
+    return [*wanted, *(path.resolve() for path in wanted), *_python_packages()]
 
 
 def _compile() -> None:
     """Have the modules compiled here: inside nothing can be written, and every container would do it anew."""
-    for package in ("rce", "rce_container"):
-        compileall.compile_dir(source_root() / package, quiet=2)
+    for folder in _python_packages():
+        compileall.compile_dir(folder, quiet=2)
+
+
+def _python_packages() -> list[Path]:
+    """The engine's and those that hold nodes; in a checkout they are outside of the interpreter's folders."""
+    root = source_root()
+    return [root / "rce", root / "rce_container", *distributed_folders()]
 
 
 def _mounts(order: Order) -> list[str]:

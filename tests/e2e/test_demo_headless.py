@@ -14,10 +14,10 @@ import pytest
 from support.demo import clean_folder, environment, run_headless, running_demo
 from support.engine import engine_processes, until
 
-from rce_client.demo.exceptions import StationAwayError
-from rce_client.demo.floor import draw
-from rce_client.demo.station import StationApi
-from rce_client.simulation.report import read_report
+from rce_fleet.demo.exceptions import StationAwayError
+from rce_fleet.demo.floor import draw
+from rce_fleet.demo.station import StationApi
+from rce_fleet.drivers.report import read_report
 
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("pymunk")]
 
@@ -103,7 +103,7 @@ async def test_a_run_that_is_too_short_says_so() -> None:
 
 async def test_a_program_that_dies_ends_the_demo_and_is_named() -> None:
     async with running_demo("--robots", 1, "--runtime", "process", "--no-auto") as demo:
-        (world,) = [p for p in engine_processes(demo.folder) if "rce_client.simulation" in p.cmdline()]
+        (world,) = [p for p in engine_processes(demo.folder) if "rce_fleet.drivers" in p.cmdline()]
         world.kill()
         assert await asyncio.wait_for(demo.process.wait(), 40) == 1
         assert "world was ended by SIGKILL" in demo.output()
@@ -124,7 +124,7 @@ async def test_a_taken_port_is_named_with_its_option() -> None:
 async def test_sigterm_ends_a_demo_that_is_still_starting() -> None:
     with clean_folder() as folder:
         process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "rce_client.demo", "--headless", "--robots", "1"),
+            *(sys.executable, "-m", "rce_fleet.demo", "--headless", "--robots", "1"),
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.STDOUT,
             env=environment(folder),

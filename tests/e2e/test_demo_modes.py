@@ -17,9 +17,9 @@ from support.engine import engine_processes, until
 from support.ports import free_port
 
 from rce.ros.xmlrpc import RpcClient
-from rce_client.demo.exceptions import StationError
-from rce_client.demo.floor import draw
-from rce_client.demo.station import StationApi
+from rce_fleet.demo.exceptions import StationError
+from rce_fleet.demo.floor import draw
+from rce_fleet.demo.station import StationApi
 
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("pymunk")]
 

@@ -12,9 +12,9 @@ import pytest
 from playwright.async_api import Page, async_playwright
 from support.demo import Demo, running_demo
 
-from rce.fleet.scenario import midway_cell
-from rce_client.demo.floor import FLOOR
-from rce_client.simulation.report import read_report
+from rce_fleet.demo.floor import FLOOR
+from rce_fleet.drivers.report import read_report
+from rce_fleet.planning.scenario import midway_cell
 
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("chromium", "pymunk")]
 

@@ -12,8 +12,8 @@ import pytest
 from support.demo import running_demo
 from support.engine import until
 
-from rce_client.demo.exceptions import StationError
-from rce_client.demo.station import StationApi
+from rce_fleet.demo.exceptions import StationError
+from rce_fleet.demo.station import StationApi
 
 if TYPE_CHECKING:
     from support.demo import Demo
@@ -54,13 +54,13 @@ async def test_killed_bridge_and_station_come_back_and_a_killed_world_is_named()
         taken = {one.cell for one in fleet.robots} | set(fleet.blocked)
         cells = [cell for cell in range(fleet.map.rows * fleet.map.columns) if cell not in taken]
         kill(demo, "rce_client.ros_bridge", f"{robot.id.lower()}.config")
-        kill(demo, "rce_client.station")
+        kill(demo, "rce_fleet.station")
         await until(
             lambda: demo.output().count("was ended by SIGKILL; it is started again") == 2,
             timeout=30,
             what="the demo tells what it starts again",
         )
         await reaches(station, robot.id, cells[0])
-        kill(demo, "rce_client.simulation")
+        kill(demo, "rce_fleet.drivers")
         assert await asyncio.wait_for(demo.process.wait(), 60) == 1
         assert "rce demo: world was ended by SIGKILL" in demo.output()

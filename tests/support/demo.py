@@ -15,7 +15,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from rce_client.demo.ports import Ports, option_of
+from rce_fleet.demo.ports import Ports, option_of
 from support.engine import engine_processes, until
 from support.leaks import sweep_cgroups
 from support.ports import free_ports
@@ -60,7 +60,7 @@ async def run_headless(*options: object, timeout: float) -> tuple[int, dict[str,
     with clean_folder() as folder:
         report = folder / "report.json"
         process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "rce_client.demo", "--headless", *port_options()[1]),
+            *(sys.executable, "-m", "rce_fleet.demo", "--headless", *port_options()[1]),
             *(*map(str, options), "--report", str(report), "--timeout", str(timeout)),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.PIPE,
@@ -108,7 +108,7 @@ async def running_demo(*options: object) -> AsyncIterator[Demo]:
         log = Path(tempfile.mktemp(prefix="rce-demo-log-", dir="/tmp"))
         with log.open("wb") as output:
             process = await asyncio.create_subprocess_exec(
-                *(sys.executable, "-m", "rce_client.demo"),
+                *(sys.executable, "-m", "rce_fleet.demo"),
                 *given,
                 *map(str, options),
                 stdin=asyncio.subprocess.DEVNULL,

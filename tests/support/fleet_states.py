@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from rce_client.simulation.report import Contacts, RobotTruth, WorldReport
-from rce_client.station.api import FleetModel, MapModel, RobotModel
+from rce_fleet.drivers.report import Contacts, RobotTruth, WorldReport
+from rce_fleet.station.api import FleetModel, MapModel, RobotModel
 
 
 def robot(name: str, **fields: Any) -> RobotModel:

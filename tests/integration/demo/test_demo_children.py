@@ -12,9 +12,9 @@ from typing import Any
 import psutil
 import pytest
 
-from rce_client.demo import children as children_module
-from rce_client.demo.children import Children
-from rce_client.demo.exceptions import ChildDiedError, DemoError, NotReadyError
+from rce_fleet.demo import children as children_module
+from rce_fleet.demo.children import Children
+from rce_fleet.demo.exceptions import ChildDiedError, DemoError, NotReadyError
 
 TALKER = "import time\nprint('talker ready: 42')\ntime.sleep(600)"
 DEAF = "import signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\nprint('up')\ntime.sleep(600)"

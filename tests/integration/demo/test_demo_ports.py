@@ -7,8 +7,8 @@ from dataclasses import astuple, replace
 
 import pytest
 
-from rce_client.demo.exceptions import PortTakenError
-from rce_client.demo.ports import ANY, QUIET, Ports, option_of
+from rce_fleet.demo.exceptions import PortTakenError
+from rce_fleet.demo.ports import ANY, QUIET, Ports, option_of
 
 
 def test_free_ports_are_all_different_and_free() -> None:

@@ -11,9 +11,9 @@ from aiohttp import web
 from aiohttp.test_utils import TestServer
 from support.fleet_states import fleet, robot
 
-from rce_client.demo.counters import Counters, read_counters
-from rce_client.demo.exceptions import DemoError, StationAwayError, WishRefusedError
-from rce_client.demo.station import StationApi
+from rce_fleet.demo.counters import Counters, read_counters
+from rce_fleet.demo.exceptions import DemoError, StationAwayError, WishRefusedError
+from rce_fleet.demo.station import StationApi
 
 FLEET = fleet(robot("Robot1", cell=3), blocked=[5])
 

@@ -9,16 +9,16 @@ from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rce.fleet.grid import GridMap
-from rce.fleet.scenario import Scenario, make_scenario, midway_cell
-from rce.fleet.simulation.boxes import BoxKeeper
-from rce.fleet.simulation.world import World
 from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
-from rce_client.simulation.robot_driver import RobotDriver
-from rce_client.simulation.runner import run_world
+from rce_fleet.drivers.robot_driver import RobotDriver
+from rce_fleet.drivers.runner import run_world
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.scenario import Scenario, make_scenario, midway_cell
+from rce_fleet.simulation.boxes import BoxKeeper
+from rce_fleet.simulation.world import World
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

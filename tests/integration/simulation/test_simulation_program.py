@@ -13,8 +13,8 @@ from support.engine import Program, until
 from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.tf import TransformListener
-from rce_client.simulation.report import read_report
-from rce_client.simulation.scene import RobotStart, Scene
+from rce_fleet.drivers.report import read_report
+from rce_fleet.drivers.scene import RobotStart, Scene
 
 pytestmark = pytest.mark.needs("pymunk")
 
@@ -29,7 +29,7 @@ def uri_of(program: Program, robot: str) -> str:
 async def test_each_robot_is_a_graph_of_its_own_and_drives_to_goals(tmp_path: Path) -> None:
     (tmp_path / "scene.json").write_text(SCENE.model_dump_json())
     report = tmp_path / "world.json"
-    argv = [sys.executable, "-m", "rce_client.simulation", str(tmp_path / "scene.json")]
+    argv = [sys.executable, "-m", "rce_fleet.drivers", str(tmp_path / "scene.json")]
     program = Program("simulation", [*argv, "--report", str(report)], dict(os.environ), tmp_path)
     await program.start(ready="simulation ready:")
     try:
@@ -64,7 +64,7 @@ async def test_each_robot_is_a_graph_of_its_own_and_drives_to_goals(tmp_path: Pa
 
 async def test_robots_that_share_a_graph_have_namespaces_and_frames_of_their_own(tmp_path: Path) -> None:
     (tmp_path / "scene.json").write_text(SCENE.model_dump_json())
-    argv = [sys.executable, "-m", "rce_client.simulation", str(tmp_path / "scene.json")]
+    argv = [sys.executable, "-m", "rce_fleet.drivers", str(tmp_path / "scene.json")]
     async with Core(port=0) as core:
         program = Program("simulation", [*argv, "--core", core.uri], dict(os.environ), tmp_path)
         await program.start(ready="simulation ready:")
@@ -88,7 +88,7 @@ async def test_robots_that_share_a_graph_have_namespaces_and_frames_of_their_own
 async def test_the_planners_cells_get_boxes_from_its_graph(tmp_path: Path) -> None:
     (tmp_path / "scene.json").write_text(SCENE.model_dump_json())
     report = tmp_path / "world.json"
-    argv = [sys.executable, "-m", "rce_client.simulation", str(tmp_path / "scene.json")]
+    argv = [sys.executable, "-m", "rce_fleet.drivers", str(tmp_path / "scene.json")]
     async with Core(port=0) as core, Node("p", argv=(), master_uri=core.uri, signals=False) as node:
         cells = await node.advertise("/fleet/blockedCells", "std_msgs/Int32MultiArray", latch=True)
         cells.publish(data=[20])
@@ -109,7 +109,7 @@ async def test_the_planners_cells_get_boxes_from_its_graph(tmp_path: Path) -> No
 async def test_a_bad_scene_ends_the_program(tmp_path: Path) -> None:
     (tmp_path / "scene.json").write_text('{"rows": 0}')
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "rce_client.simulation", str(tmp_path / "scene.json")),
+        *(sys.executable, "-m", "rce_fleet.drivers", str(tmp_path / "scene.json")),
         stderr=asyncio.subprocess.PIPE,
     )
     _, said = await process.communicate()

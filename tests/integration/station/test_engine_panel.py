@@ -11,11 +11,11 @@ import pytest
 from aiohttp import web
 from aiohttp.test_utils import TestServer
 
-from rce_client.station.engine_watch import EngineWatch
-from rce_client.station.fleet_link import FleetLink
-from rce_client.station.live import Broadcast
-from rce_client.station.server import Station
-from rce_client.station.view import FleetView
+from rce_fleet.station.engine_watch import EngineWatch
+from rce_fleet.station.fleet_link import FleetLink
+from rce_fleet.station.live import Broadcast
+from rce_fleet.station.server import Station
+from rce_fleet.station.view import FleetView
 
 MB = 1 << 20
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

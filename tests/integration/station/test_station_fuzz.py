@@ -6,11 +6,11 @@ import pytest
 from support.fuzzing import Tracebacks, exchange, requests
 
 from rce.web.server import HttpServer
-from rce_client.station.fleet_link import FleetLink
-from rce_client.station.live import Broadcast
-from rce_client.station.persons import SharedToken
-from rce_client.station.server import Station
-from rce_client.station.view import FleetView
+from rce_fleet.station.fleet_link import FleetLink
+from rce_fleet.station.live import Broadcast
+from rce_fleet.station.persons import SharedToken
+from rce_fleet.station.server import Station
+from rce_fleet.station.view import FleetView
 
 COUNT = 300
 PATHS = [

@@ -14,11 +14,11 @@ from aiohttp.test_utils import TestServer
 from support.engine import until
 from support.master_program import master
 
-from rce_client.station import server as station_server
-from rce_client.station.engine_entrance import FRESH_S, EngineAccount, EngineEntrance
-from rce_client.station.live import Broadcast
-from rce_client.station.server import Station
-from rce_client.station.view import FleetView
+from rce_fleet.station import server as station_server
+from rce_fleet.station.engine_entrance import FRESH_S, EngineAccount, EngineEntrance
+from rce_fleet.station.live import Broadcast
+from rce_fleet.station.server import Station
+from rce_fleet.station.view import FleetView
 
 pytestmark = pytest.mark.timeout(180)
 

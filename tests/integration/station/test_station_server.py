@@ -8,11 +8,11 @@ from collections.abc import AsyncIterator
 import pytest
 from aiohttp.test_utils import TestClient, TestServer
 
-from rce_client.station.fleet_link import FleetError, FleetLink, PlannerAwayError
-from rce_client.station.live import Broadcast
-from rce_client.station.persons import SharedToken
-from rce_client.station.server import Station
-from rce_client.station.view import FleetView
+from rce_fleet.station.fleet_link import FleetError, FleetLink, PlannerAwayError
+from rce_fleet.station.live import Broadcast
+from rce_fleet.station.persons import SharedToken
+from rce_fleet.station.server import Station
+from rce_fleet.station.view import FleetView
 
 
 class RecordingFleet(FleetLink):

@@ -8,7 +8,7 @@ import pytest
 
 from rce.config.client import ClientConfig, load, loads
 from rce.protocol.names import Role
-from rce_client.fleet_config import Account, as_text, fleet_config, robot_config
+from rce_fleet.wiring import Account, as_text, fleet_config, robot_config
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 

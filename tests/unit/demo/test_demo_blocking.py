@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from support.fleet_states import fleet, robot
 
-from rce.fleet.grid import GridMap
-from rce_client.demo.blocking import EFFECT_TIMEOUT, REPLAN_TIMEOUT, MidwayBlock, Step
+from rce_fleet.demo.blocking import EFFECT_TIMEOUT, REPLAN_TIMEOUT, MidwayBlock, Step
+from rce_fleet.planning.grid import GridMap
 
 GRID = GridMap(rows=4, columns=4)
 ROW = [0, 1, 2, 3]

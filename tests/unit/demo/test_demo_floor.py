@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from rce.fleet.dijkstra import shortest_path
-from rce_client.demo.exceptions import DemoError
-from rce_client.demo.floor import FLOOR, LONG_WAY, draw
+from rce_fleet.demo.exceptions import DemoError
+from rce_fleet.demo.floor import FLOOR, LONG_WAY, draw
+from rce_fleet.planning.dijkstra import shortest_path
 
 MAP = "type octile\nheight 2\nwidth 3\nmap\n...\n.@.\n"
 SCEN = "version 1\n0\tm.map\t3\t2\t0\t0\t2\t1\t3\n0\tm.map\t3\t2\t2\t0\t0\t1\t3\n"

@@ -8,13 +8,13 @@ from typing import Any
 import pytest
 from support.fleet_states import fleet, robot, truth
 
-from rce.fleet.grid import GridMap
-from rce.fleet.scenario import Scenario
-from rce_client.demo import mission as mission_module
-from rce_client.demo.exceptions import StationAwayError, WishRefusedError
-from rce_client.demo.mission import Mission
-from rce_client.simulation.report import WorldReport
-from rce_client.station.api import FleetModel
+from rce_fleet.demo import mission as mission_module
+from rce_fleet.demo.exceptions import StationAwayError, WishRefusedError
+from rce_fleet.demo.mission import Mission
+from rce_fleet.drivers.report import WorldReport
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.scenario import Scenario
+from rce_fleet.station.api import FleetModel
 
 SCENARIO = Scenario(
     grid=GridMap(rows=4, columns=4),

@@ -6,13 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from rce.config.client import loads
-from rce_client.demo.bus import received
-from rce_client.demo.floor import draw
-from rce_client.demo.machine import node_names, planner_argv, world_argv
-from rce_client.demo.multi import PLANNER, sync_argv
-from rce_client.demo.play import Play
-from rce_client.demo.ports import Ports
-from rce_client.fleet_config import as_text, fleet_config
+from rce_fleet.demo.bus import received
+from rce_fleet.demo.floor import draw
+from rce_fleet.demo.machine import node_names, planner_argv, world_argv
+from rce_fleet.demo.multi import PLANNER, sync_argv
+from rce_fleet.demo.play import Play
+from rce_fleet.demo.ports import Ports
+from rce_fleet.wiring import as_text, fleet_config
 
 PLAY = Play(draw(3, 0), 0, Ports(), Path("/folder"))
 

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 from support.fleet_states import truth
 
-from rce_client.demo.counters import Counters
-from rce_client.demo.floor import draw
-from rce_client.demo.mission import Mission
-from rce_client.demo.result import Result
+from rce_fleet.demo.counters import Counters
+from rce_fleet.demo.floor import draw
+from rce_fleet.demo.mission import Mission
+from rce_fleet.demo.result import Result
 
 SCENARIO = draw(2, 0)
 ROBOTS = dict(zip(SCENARIO.robots, SCENARIO.goals, strict=True))

@@ -6,7 +6,7 @@ from random import Random
 
 from support.fleet_states import fleet, robot
 
-from rce_client.demo.roaming import REST, Roamer
+from rce_fleet.demo.roaming import REST, Roamer
 
 
 def test_a_robot_without_a_goal_gets_one_that_is_free() -> None:

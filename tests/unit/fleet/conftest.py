@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rce.fleet.coordination.events import (
+from rce_fleet.coordination.events import (
     BlockedChanged,
     Event,
     GoalSet,
@@ -23,14 +23,14 @@ from rce.fleet.coordination.events import (
     SendCells,
     Tick,
 )
-from rce.fleet.coordination.snapshot import RobotState
-from rce.fleet.move_client import ClientReport, GoalState, MoveClient, SendGoal, SendStop
+from rce_fleet.coordination.move_client import ClientReport, GoalState, MoveClient, SendGoal, SendStop
+from rce_fleet.coordination.snapshot import RobotState
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rce.fleet.coordination.planner import FleetPlanner
-    from rce.fleet.grid import GridMap
+    from rce_fleet.coordination.planner import FleetPlanner
+    from rce_fleet.planning.grid import GridMap
 
 RADIUS = 0.22
 STEP = 0.1

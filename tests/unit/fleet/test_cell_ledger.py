@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from rce.fleet.coordination.ledger import CellLedger
-from rce.fleet.exceptions import InvariantError
+from rce_fleet.coordination.ledger import CellLedger
+from rce_fleet.exceptions import InvariantError
 
 
 def ledger_of(**places: int) -> CellLedger:

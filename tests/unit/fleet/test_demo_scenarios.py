@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rce.fleet.dijkstra import shortest_path
-from rce.fleet.exceptions import ScenarioError
-from rce.fleet.grid import GridMap
-from rce.fleet.scenario import given_scenario, make_scenario, midway_cell, solvable
+from rce_fleet.exceptions import ScenarioError
+from rce_fleet.planning.dijkstra import shortest_path
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.scenario import given_scenario, make_scenario, midway_cell, solvable
 
 
 @settings(max_examples=80, deadline=None)

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from rce.fleet.coordination.events import (
+from rce_fleet.coordination.events import (
     BlockedChanged,
     CellBlocked,
     CellFreed,
@@ -19,12 +19,12 @@ from rce.fleet.coordination.events import (
     SendCells,
     Tick,
 )
-from rce.fleet.coordination.planner import FleetPlanner
-from rce.fleet.coordination.robot import TRANSITIONS, Cause, Phase, RobotRecord
-from rce.fleet.coordination.snapshot import RobotSnapshot, RobotState
-from rce.fleet.exceptions import TransitionError
-from rce.fleet.grid import GridMap
-from rce.fleet.move_client import ClientReport, ClientState
+from rce_fleet.coordination.move_client import ClientReport, ClientState
+from rce_fleet.coordination.planner import FleetPlanner
+from rce_fleet.coordination.robot import TRANSITIONS, Cause, Phase, RobotRecord
+from rce_fleet.coordination.snapshot import RobotSnapshot, RobotState
+from rce_fleet.exceptions import TransitionError
+from rce_fleet.planning.grid import GridMap
 
 
 def robot(fleet: Any, number: int = 1) -> RobotSnapshot:

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rce.fleet.coordination.events import CellBlocked
-from rce.fleet.coordination.planner import FleetPlanner
-from rce.fleet.grid import GridMap
-from rce.fleet.movingai import read_map, read_scenario
+from rce_fleet.coordination.events import CellBlocked
+from rce_fleet.coordination.planner import FleetPlanner
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.movingai import read_map, read_scenario
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce.fleet.dijkstra import distances, shortest_path
-from rce.fleet.exceptions import MapError
-from rce.fleet.grid import GridMap
-from rce.fleet.movingai import parse_map, parse_scenario, read_map, read_scenario
-from rce.fleet.occupancy import FREE, OCCUPIED, occupancy
+from rce_fleet.exceptions import MapError
+from rce_fleet.navigation.occupancy import FREE, OCCUPIED, occupancy
+from rce_fleet.planning.dijkstra import distances, shortest_path
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.movingai import parse_map, parse_scenario, read_map, read_scenario
 
 if TYPE_CHECKING:
     from pathlib import Path

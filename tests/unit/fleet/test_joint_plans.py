@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rce.fleet.grid import GridMap
-from rce.fleet.lacam import JointPlan, plan
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.lacam import JointPlan, plan
 
 
 def check(grid: GridMap, joint: JointPlan, starts: list[int]) -> None:

@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from rce.fleet.grid import GridMap
-from rce.fleet.move_client import (
+from rce_fleet.coordination.move_client import (
     QUIET_TIME,
     REPEAT_AFTER,
     ClientReport,
@@ -18,7 +17,8 @@ from rce.fleet.move_client import (
     SendGoal,
     SendStop,
 )
-from rce.fleet.revisions import numbered_array, revision_of
+from rce_fleet.coordination.revisions import numbered_array, revision_of
+from rce_fleet.planning.grid import GridMap
 
 
 @pytest.fixture

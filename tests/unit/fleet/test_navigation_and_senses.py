@@ -11,16 +11,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rce.fleet.angles import quaternion_z, wrap, yaw_of
-from rce.fleet.exceptions import OccupiedError
-from rce.fleet.grid import GridMap
-from rce.fleet.move_client import GoalState
-from rce.fleet.navigation import DriveLimits, Navigator, Pose, Twist
-from rce.fleet.simulation.boxes import BoxKeeper
-from rce.fleet.simulation.lidar import LidarSpec, cast
-from rce.fleet.simulation.move_base import SimulatedMoveBase
-from rce.fleet.simulation.obstacles import blocked_cell, cells_ahead, clear_ahead, hit_points
-from rce.fleet.simulation.world import World, WorldSpec
+from rce_fleet.coordination.move_client import GoalState
+from rce_fleet.exceptions import OccupiedError
+from rce_fleet.navigation.angles import quaternion_z, wrap, yaw_of
+from rce_fleet.navigation.navigation import DriveLimits, Navigator, Pose, Twist
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.simulation.boxes import BoxKeeper
+from rce_fleet.simulation.lidar import LidarSpec, cast
+from rce_fleet.simulation.move_base import SimulatedMoveBase
+from rce_fleet.simulation.obstacles import blocked_cell, cells_ahead, clear_ahead, hit_points
+from rce_fleet.simulation.world import World, WorldSpec
 
 NOTHING = np.empty((0, 2))
 

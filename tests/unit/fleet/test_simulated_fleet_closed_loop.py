@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from rce.fleet.coordination.events import (
+from rce_fleet.coordination.events import (
     BlockedChanged,
     CellBlocked,
     Event,
@@ -20,15 +20,15 @@ from rce.fleet.coordination.events import (
     SendCells,
     Tick,
 )
-from rce.fleet.coordination.planner import FleetPlanner
-from rce.fleet.coordination.snapshot import RobotState
-from rce.fleet.grid import GridMap
-from rce.fleet.move_client import MoveClient, SendGoal, SendStop
-from rce.fleet.movingai import read_map, read_scenario
-from rce.fleet.scenario import Scenario, given_scenario, make_scenario, midway_cell
-from rce.fleet.simulation.move_base import SimulatedMoveBase
-from rce.fleet.simulation.obstacles import hit_points
-from rce.fleet.simulation.world import World
+from rce_fleet.coordination.move_client import MoveClient, SendGoal, SendStop
+from rce_fleet.coordination.planner import FleetPlanner
+from rce_fleet.coordination.snapshot import RobotState
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.movingai import read_map, read_scenario
+from rce_fleet.planning.scenario import Scenario, given_scenario, make_scenario, midway_cell
+from rce_fleet.simulation.move_base import SimulatedMoveBase
+from rce_fleet.simulation.obstacles import hit_points
+from rce_fleet.simulation.world import World
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -1,13 +1,16 @@
 """Packages on a path, their executables, and what is substituted in arguments."""
 
+import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 
 import pytest
 
+from rce.ros import packages
 from rce.ros.packages import BadPackage, ExecutableNotFound, PackageIndex, PackageNotFound
 from rce.ros.substitution import SubstitutionError, split_arguments, substitute
 
@@ -134,16 +137,62 @@ def test_installed_packages_have_programs_in_lib(tmp_path: Path) -> None:
     assert index.find("tools").executable("relay") == [str(programs / "relay")]
 
 
-def test_distributions_add_nodes_by_entry_points(monkeypatch: pytest.MonkeyPatch) -> None:
-    points = EntryPoints([EntryPoint("Clock:now.py", "time:time_ns", "rce.nodes")])
-    monkeypatch.setattr("importlib.metadata.entry_points", points.select)
+@pytest.fixture
+def distributed(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
+    """Lets installed distributions have the entry points that a test gives."""
+
+    def forget() -> None:
+        packages._distributed.cache_clear()
+        packages._distributed_nodes.cache_clear()
+
+    def have(*points: tuple[str, str, str]) -> None:
+        found = EntryPoints(EntryPoint(name, value, group) for group, name, value in points)
+        monkeypatch.setattr("importlib.metadata.entry_points", found.select)
+        forget()
+
+    yield have
+    forget()
+
+
+def test_distributions_add_nodes_that_are_functions(distributed: Callable[..., None]) -> None:
+    distributed(("rce.nodes", "Clock:now.py", "time:time_ns"))
     with pytest.raises(BadPackage, match="no file of a module time"):  # `time` is built in and has no folder
         PackageIndex([]).find("Clock")
-    points = EntryPoints([EntryPoint("Json:tool", "json.tool:main", "rce.nodes")])
-    monkeypatch.setattr("importlib.metadata.entry_points", points.select)
+    distributed(("rce.nodes", "Json:tool", "json.tool:main"))
     argv = PackageIndex([]).find("Json").executable("tool")
     done = subprocess.run(argv, input='{"a": 1}', capture_output=True, text=True, check=True)
     assert done.stdout == '{\n    "a": 1\n}\n'
+
+
+def test_distributions_add_packages_with_nodes_that_are_scripts(distributed: Callable[..., None]) -> None:
+    distributed(
+        ("rce.packages", "shop", "json"),
+        ("rce.nodes", "shop:tool.py", "json.tool"),
+        ("rce.packages", "bad", "no.x"),
+    )
+    found = PackageIndex([]).find("shop")
+    assert found.path == Path(json.__file__).parent
+    script = Path(json.__file__).parent / "tool.py"
+    assert found.executable("tool.py") == [sys.executable, str(script)]
+    with pytest.raises(BadPackage, match=r"entry point no\.x"):
+        PackageIndex([]).find("bad")
+
+
+def test_packages_on_the_path_go_before_those_of_distributions(
+    distributed: Callable[..., None], tmp_path: Path
+) -> None:
+    distributed(("rce.packages", "shop", "json"))
+    folder = make(tmp_path / "shop")
+    assert PackageIndex([tmp_path]).find("shop").path == folder
+
+
+def test_the_fleet_is_such_a_package() -> None:
+    found = PackageIndex([]).find("fleet")
+    assert [Path(found.executable(exe)[-1]).name for exe in ("fleet_planner.py", "move_client.py")] == [
+        "fleet_planner.py",
+        "move_client.py",
+    ]
+    assert (found.path / "msg" / "FleetState.msg").is_file()
 
 
 def test_find_and_env_are_substituted(tmp_path: Path) -> None:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from rce.fleet.grid import GridMap
-from rce.fleet.navigation import Twist
-from rce.fleet.simulation.world import World
-from rce_client.simulation.report import look_at, read_report, write_report
+from rce_fleet.drivers.report import look_at, read_report, write_report
+from rce_fleet.navigation.navigation import Twist
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.simulation.world import World
 
 
 def test_a_report_says_what_is_and_was(tmp_path: Path) -> None:

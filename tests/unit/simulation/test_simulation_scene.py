@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from rce.config.exceptions import ConfigError
-from rce.fleet.grid import GridMap
-from rce.fleet.scenario import make_scenario
-from rce_client.simulation.scene import load_scene, scene_of
+from rce_fleet.drivers.scene import load_scene, scene_of
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.scenario import make_scenario
 
 ROBOT = {"id": "Robot1", "cell": 3}
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from rce.config.resources import examples_dir
 from rce.ros.packages import PackageIndex
 from rce.ros.types import Time, TypeRegistry
-from rce_client.station.graph_watch import graph_state
-from rce_client.station.ros_wire import plain
-from rce_client.station.view import FleetView
+from rce_fleet.station.graph_watch import graph_state
+from rce_fleet.station.ros_wire import plain
+from rce_fleet.station.view import FleetView
 
-STATE = TypeRegistry(PackageIndex([examples_dir()])).message("fleet/FleetState")
+STATE = TypeRegistry(PackageIndex([])).message("fleet/FleetState")
 
 
 def test_a_state_has_the_form_that_the_view_takes() -> None:

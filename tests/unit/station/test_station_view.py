@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from rce_client.station.live import MAX_EVENTS, Broadcast
-from rce_client.station.view import FleetView
+from rce_fleet.station.live import MAX_EVENTS, Broadcast
+from rce_fleet.station.view import FleetView
 
 
 def robot(name: str, **changes: Any) -> dict[str, Any]:

@@ -6,9 +6,9 @@ from typing import Any
 
 from rce.config.client import loads
 from rce.protocol.messages import ConfigureComponents, RemoveNode
-from rce_client.fleet_config import as_text, fleet_config
-from rce_client.station.respawn import repairs
-from rce_client.station.wishes import CellWish, GoalWish, Wishes
+from rce_fleet.station.respawn import repairs
+from rce_fleet.station.wishes import CellWish, GoalWish, Wishes
+from rce_fleet.wiring import as_text, fleet_config
 
 CONFIG = loads(as_text(fleet_config()))
 

@@ -1,0 +1,65 @@
+"""What a move client says on the topic that its lists come by, for graphs that share no other. Pure.
+
+An answer is a ``std_msgs/Int32MultiArray`` with three parts, one for each dimension: the list's cells; the
+last cell reached and the one driven to, -1 for none; and cells that the robot has found blocked. The label of
+the first is ``answer=17 driving``: the list's number, and what the move client does. Lists have other labels.
+"""
+
+from __future__ import annotations
+
+from itertools import accumulate, pairwise
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from rce_fleet.coordination.move_client import ClientReport, ClientState
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+_MARK = "answer="
+_NONE = -1
+
+
+class Answer(NamedTuple):
+    """What a move client says."""
+
+    report: ClientReport
+    blocked: tuple[int, ...] = ()
+    """Cells that the robot has found blocked."""
+
+
+def is_answer(labels: Sequence[str]) -> bool:
+    """Tell by the labels of an array's dimensions whether it is an answer, no list."""
+    return bool(labels) and labels[0].startswith(_MARK)
+
+
+def answer_array(answer: Answer) -> dict[str, Any]:
+    """The fields of a ``std_msgs/Int32MultiArray`` that holds an answer."""
+    report = answer.report
+    progress = [_NONE if cell is None else cell for cell in (report.reached, report.target)]
+    parts = {
+        f"{_MARK}{report.revision} {report.state.value}": list(report.cells),
+        "reached and target": progress,
+        "blocked": list(answer.blocked),
+    }
+    dimensions = [{"label": label, "size": len(part), "stride": len(part)} for label, part in parts.items()]
+    return {"layout": {"dim": dimensions}, "data": [cell for part in parts.values() for cell in part]}
+
+
+def read_answer(labels: Sequence[str], sizes: Sequence[int], data: Sequence[int]) -> Answer:
+    """Read an answer.
+
+    Args:
+        labels: Of the array's dimensions.
+        sizes: Of the array's dimensions.
+        data: The array's numbers.
+
+    Raises:
+        ValueError: It has another form.
+    """
+    if not is_answer(labels) or len(sizes) != 3 or sizes[1] != 2 or sum(sizes) != len(data):  # noqa: PLR2004
+        raise ValueError(f"no answer of a move client: {list(labels)}, {list(sizes)}, {len(data)} numbers")
+    revision, _, state = labels[0].removeprefix(_MARK).partition(" ")
+    ends = accumulate(sizes, initial=0)
+    cells, progress, blocked = (tuple(data[begin:end]) for begin, end in pairwise(ends))
+    reached, target = (None if cell == _NONE else cell for cell in progress)
+    return Answer(ClientReport(int(revision), ClientState(state), cells, reached, target), blocked)

@@ -1,0 +1,325 @@
+"""The core of ``move_client``: a list of cells becomes one navigation goal after the other.
+
+It keeps the robot moving smoothly by sending the farthest cell that lies straight ahead on the list, and
+replaces that goal while the robot drives when a longer list comes. It never sends a goal that is not on
+the list, and all cells between two goals are on it. Messages may get lost or come twice: a goal is sent
+again until the robot's ``move_base`` lists it, a cancellation until the goal is over.
+
+Pure: events and the time go in, instructions come out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from math import atan2
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rce_fleet.planning.grid import GridMap
+
+REPEAT_AFTER = 1.0
+"""Seconds after which a goal or cancellation that had no effect is sent again."""
+
+QUIET_TIME = 1.0
+"""Seconds without any goal under way after which a robot is taken to have none."""
+
+
+class ClientState(Enum):
+    """What a move client does."""
+
+    IDLE = "idle"
+    """No goal is under way; the list is driven to its end or empty."""
+    DRIVING = "driving"
+    """A goal of the list is under way."""
+    CANCELLING = "cancelling"
+    """A goal may still be under way and is being stopped."""
+    FAILED = "failed"
+    """The robot gave up a goal; its list was dropped."""
+
+
+_TRANSITIONS: dict[ClientState, frozenset[ClientState]] = {
+    ClientState.IDLE: frozenset({ClientState.DRIVING}),
+    ClientState.DRIVING: frozenset({ClientState.IDLE, ClientState.CANCELLING, ClientState.FAILED}),
+    ClientState.CANCELLING: frozenset({ClientState.IDLE}),
+    ClientState.FAILED: frozenset({ClientState.IDLE}),
+}
+
+
+class GoalState(Enum):
+    """How a navigation goal stands; the numbers are those of ``actionlib_msgs/GoalStatus``."""
+
+    PENDING = 0
+    ACTIVE = 1
+    PREEMPTED = 2
+    SUCCEEDED = 3
+    ABORTED = 4
+    REJECTED = 5
+    PREEMPTING = 6
+    RECALLING = 7
+    RECALLED = 8
+    LOST = 9
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing more will happen to the goal."""
+        return self not in _UNDER_WAY
+
+
+_UNDER_WAY = frozenset({GoalState.PENDING, GoalState.ACTIVE, GoalState.PREEMPTING, GoalState.RECALLING})
+
+
+@dataclass(frozen=True, slots=True)
+class SendGoal:
+    """Give the robot a navigation goal. A goal sent again has the same id and stamp.
+
+    Attributes:
+        id: Names the goal.
+        stamp: When it was made, seconds; a cancellation with a later stamp also stops it.
+        cell: Where to go.
+        heading: Direction of travel, radians.
+    """
+
+    id: str
+    stamp: float
+    cell: int
+    heading: float
+
+
+@dataclass(frozen=True, slots=True)
+class SendStop:
+    """Cancel every goal made up to ``stamp`` (seconds), also those that arrive later."""
+
+    stamp: float
+
+
+@dataclass(frozen=True, slots=True)
+class ClientReport:
+    """Progress of a move client, the acknowledgement for the planner.
+
+    Attributes:
+        revision: Of the last list accepted; 0 before the first.
+        state: What the client does.
+        cells: The list accepted; empty after a cancellation.
+        reached: The last cell of the list that was reached.
+        target: The cell that the robot is sent to.
+    """
+
+    revision: int = 0
+    state: ClientState = ClientState.CANCELLING
+    cells: tuple[int, ...] = ()
+    reached: int | None = None
+    target: int | None = None
+
+
+Instruction = SendGoal | SendStop | ClientReport
+
+
+@dataclass(slots=True)
+class MoveClient:
+    """Turns lists of cells into navigation goals.
+
+    It begins in ``CANCELLING``: a goal of an earlier life of this client may be under way, and only the
+    robot can tell that there is none.
+
+    Args:
+        grid: Size and place of the cells.
+        name: Goals are named after it; two clients of one robot must differ.
+        started: Time of the start, seconds; makes goal ids unlike those of an earlier life.
+    """
+
+    grid: GridMap
+    name: str
+    started: float
+    _report: ClientReport = field(default_factory=ClientReport)
+    _heading: float = 0.0
+    _goal: SendGoal | None = None
+    _step: int | None = None
+    _sent_at: float = float("-inf")
+    _quiet_since: float | None = None
+    _count: int = 0
+
+    @property
+    def report(self) -> ClientReport:
+        """The current progress."""
+        return self._report
+
+    def take_cells(self, revision: int | None, cells: list[int], now: float) -> list[Instruction]:
+        """Accept a list of cells, unless a newer one is known.
+
+        Args:
+            revision: Grows from list to list; ``None`` if the sender does not number them.
+            cells: Beginning with the cell that the robot is in; empty to stop it.
+            now: Time, seconds.
+
+        Raises:
+            ValueError: The list leaves the map or is no path; nothing was changed.
+        """
+        known = self._report
+        if revision is None:
+            if tuple(cells) == known.cells:
+                return []
+            revision = known.revision + 1
+        if revision <= known.revision:
+            return []
+        if any(cell not in self.grid for cell in cells) or not self.grid.is_path(cells):
+            raise ValueError(f"{cells} is no path on the map")
+        if not cells:
+            return self._drop(revision, now)
+        return self._follow(revision, tuple(cells), now)
+
+    def cancel(self, now: float) -> list[Instruction]:
+        """Drop the list and stop the robot."""
+        return self._drop(self._report.revision, now)
+
+    def take_goal_states(self, states: dict[str, GoalState], now: float) -> list[Instruction]:
+        """Take the robot's list of goals, the finished ones that it remembers included."""
+        if self._report.state is ClientState.CANCELLING:
+            return self._await_stop(states, now)
+        if self._goal is None:
+            return []
+        state = states.get(self._goal.id)
+        if state is None and now - self._sent_at >= REPEAT_AFTER:
+            self._sent_at = now
+            return [self._goal]
+        return self._finished(state, now) if state is not None and state.over else []
+
+    def take_result(self, goal_id: str, state: GoalState, now: float) -> list[Instruction]:
+        """Take the end of a goal. Ends of goals that were replaced mean nothing."""
+        if self._goal is None or goal_id != self._goal.id or not state.over:
+            return []
+        if self._report.state is ClientState.CANCELLING:
+            return self._stopped(now)
+        return self._finished(state, now)
+
+    def tick(self, now: float) -> list[Instruction]:
+        """Send a cancellation that had no effect again; call it a few times a second."""
+        if self._report.state is ClientState.CANCELLING and now - self._sent_at >= REPEAT_AFTER:
+            self._sent_at = now
+            return [SendStop(now)]
+        return []
+
+    # -- lists ----------------------------------------------------------------------------------
+
+    def _drop(self, revision: int, now: float) -> list[Instruction]:
+        self._update(revision=revision, cells=(), reached=None)
+        if self._report.state is ClientState.DRIVING:
+            return [*self._stop(now), self._report]
+        if self._report.state is ClientState.FAILED:
+            self._become(ClientState.IDLE)
+        return [self._report]
+
+    def _follow(self, revision: int, cells: tuple[int, ...], now: float) -> list[Instruction]:
+        before = self._report
+        if before.state is ClientState.FAILED:
+            self._become(ClientState.IDLE)
+        reached = before.reached if before.reached in cells else None
+        self._update(revision=revision, cells=cells, reached=reached)
+        if before.state is ClientState.DRIVING and before.target not in cells:
+            self._update(reached=None)
+            return [*self._stop(now), self._report]
+        return [*self._proceed(now), self._report]
+
+    def _proceed(self, now: float) -> list[Instruction]:
+        """Send the next goal, or a farther one in place of the present one."""
+        report = self._report
+        if report.state is ClientState.CANCELLING:
+            return []
+        index = self._next_index()
+        if index is None:
+            if report.state is ClientState.DRIVING:
+                self._become(ClientState.IDLE)
+                self._update(target=None)
+            self._goal = None
+            return []
+        cell = report.cells[index]
+        if report.state is ClientState.DRIVING and cell == report.target:
+            return []
+        if report.state is ClientState.IDLE:
+            self._become(ClientState.DRIVING)
+        self._heading = self._heading_to(index)
+        self._step = cell - report.cells[index - 1] if index else None
+        self._update(target=cell)
+        self._count += 1
+        self._goal = SendGoal(f"{self.name}-{self.started:.3f}-{self._count}", now, cell, self._heading)
+        self._sent_at = now
+        return [self._goal]
+
+    def _next_index(self) -> int | None:
+        """Index of the farthest cell straight ahead; ``None`` at the end of the list.
+
+        The first cell of a list is driven to by itself, since where the robot comes from is unknown then.
+        """
+        cells, target, reached = self._report.cells, self._report.target, self._report.reached
+        if self._report.state is ClientState.DRIVING and target in cells:
+            index, step = cells.index(target), self._step
+        elif reached in cells:
+            index = cells.index(reached) + 1
+            if index == len(cells):
+                return None
+            step = cells[index] - cells[index - 1]
+        else:
+            return 0 if cells else None
+        while step is not None and index + 1 < len(cells) and cells[index + 1] - cells[index] == step:
+            index += 1
+        return index
+
+    def _heading_to(self, index: int) -> float:
+        """Direction of travel at a cell of the list; towards the second cell at the first."""
+        cells = self._report.cells
+        if len(cells) == 1:
+            return self._heading
+        before, after = (cells[index - 1], cells[index]) if index else (cells[0], cells[1])
+        (x, y), (to_x, to_y) = self.grid.centre(before), self.grid.centre(after)
+        return atan2(to_y - y, to_x - x)
+
+    # -- goals ----------------------------------------------------------------------------------
+
+    def _finished(self, state: GoalState, now: float) -> list[Instruction]:
+        self._goal = None
+        if state is not GoalState.SUCCEEDED:
+            self._become(ClientState.FAILED)
+            self._update(cells=(), reached=None, target=None)
+            return [self._report]
+        self._update(reached=self._report.target)
+        self._become(ClientState.IDLE)
+        self._update(target=None)
+        return [*self._proceed(now), self._report]
+
+    def _stop(self, now: float) -> list[Instruction]:
+        self._become(ClientState.CANCELLING)
+        self._update(target=None)
+        self._sent_at = now
+        return [SendStop(now)]
+
+    def _await_stop(self, states: dict[str, GoalState], now: float) -> list[Instruction]:
+        """See whether everything is over.
+
+        The goal of this client must be listed so. Of what was lost or is of an earlier life nothing can be
+        known, except that nothing has been under way for a while: what comes later the stop's stamp catches.
+        """
+        if self._sent_at == float("-inf"):
+            return self.tick(now)
+        if any(not state.over for state in states.values()):
+            self._quiet_since = None
+            return []
+        if self._goal is not None and self._goal.id in states:
+            return self._stopped(now)
+        if self._quiet_since is None:
+            self._quiet_since = now
+        return self._stopped(now) if now - self._quiet_since >= QUIET_TIME else []
+
+    def _stopped(self, now: float) -> list[Instruction]:
+        self._goal = self._quiet_since = None
+        self._become(ClientState.IDLE)
+        return [*self._proceed(now), self._report]
+
+    # -- books ----------------------------------------------------------------------------------
+
+    def _become(self, state: ClientState) -> None:
+        if state not in _TRANSITIONS[self._report.state]:
+            raise AssertionError(f"{self._report.state.value} cannot become {state.value}")
+        self._update(state=state)
+
+    def _update(self, **changes: Any) -> None:
+        self._report = replace(self._report, **changes)

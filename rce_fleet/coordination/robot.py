@@ -1,0 +1,134 @@
+"""What the planner knows of one robot, and the robot's life cycle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from math import hypot, inf
+from typing import TYPE_CHECKING
+
+from rce_fleet.coordination.move_client import ClientReport, ClientState
+from rce_fleet.exceptions import TransitionError
+
+if TYPE_CHECKING:
+    from rce_fleet.coordination.settings import FleetSettings
+
+
+class Phase(Enum):
+    """Where a robot is in its life."""
+
+    HOLDING = "holding"
+    """It is told to stand still, and gets a cell once it does. Every robot begins here."""
+    ACTIVE = "active"
+    """It has a cell, takes part in plans and is granted cells."""
+    SILENT = "silent"
+    """It or its move client is not heard. Its cells stay its own: it may stand in any of them."""
+
+
+class Cause(Enum):
+    """What moves a robot from phase to phase."""
+
+    SETTLED = "settled"
+    HELD = "held"
+    LOST = "lost"
+    HEARD = "heard"
+
+
+TRANSITIONS: dict[tuple[Phase, Cause], Phase] = {
+    (Phase.HOLDING, Cause.SETTLED): Phase.ACTIVE,
+    (Phase.HOLDING, Cause.HELD): Phase.HOLDING,
+    (Phase.HOLDING, Cause.LOST): Phase.SILENT,
+    (Phase.ACTIVE, Cause.HELD): Phase.HOLDING,
+    (Phase.ACTIVE, Cause.LOST): Phase.SILENT,
+    (Phase.SILENT, Cause.HEARD): Phase.HOLDING,
+}
+"""The life cycle; any other cause in a phase is an error."""
+
+
+@dataclass(slots=True)
+class RobotRecord:
+    """One robot.
+
+    Attributes:
+        id: Name of the robot, for example ``Robot1``.
+        revision: Number of the last list of cells sent.
+        phase: Where it is in its life.
+        x, y, yaw: Last pose, metres and radians; not a number before the first.
+        posed_at: When the last pose came; at first, when the robot was first heard.
+        report: What its move client said last.
+        reported_at: When that came, likewise.
+        obeyed_at: When its move client first said that it follows the last list and is at its end.
+        goal: Where it was sent, a cell.
+        rest: Where it returns to when it has nowhere to go.
+        unreachable: Whether there is no way to its goal.
+        centred: Whether it has been at the centre of its cell since it was placed there.
+        replans: How often it lost its path because a cell of it was blocked.
+        held_at: When it was last told to stand still.
+        sent_at: When it was last sent a message.
+        reason: Why it is not active, for people.
+    """
+
+    id: str
+    revision: int
+    phase: Phase = Phase.HOLDING
+    x: float = float("nan")
+    y: float = float("nan")
+    yaw: float = float("nan")
+    posed_at: float = -inf
+    report: ClientReport | None = None
+    reported_at: float = -inf
+    obeyed_at: float = inf
+    goal: int | None = None
+    rest: int | None = None
+    unreachable: bool = False
+    centred: bool = False
+    replans: int = 0
+    held_at: float = -inf
+    sent_at: float = -inf
+    reason: str = "new"
+    _anchor: tuple[float, float] = (inf, inf)
+    _anchored_at: float = inf
+
+    def change(self, cause: Cause) -> None:
+        """Go to the next phase.
+
+        Raises:
+            TransitionError: The cause does not belong to the phase.
+        """
+        phase = TRANSITIONS.get((self.phase, cause))
+        if phase is None:
+            raise TransitionError(f"{self.id} is {self.phase.value} and cannot be {cause.value}")
+        self.phase = phase
+
+    def see(self, x: float, y: float, yaw: float, now: float, settings: FleetSettings) -> None:
+        """Take a pose."""
+        self.x, self.y, self.yaw, self.posed_at = x, y, yaw, now
+        if hypot(x - self._anchor[0], y - self._anchor[1]) > settings.still_distance:
+            self._anchor, self._anchored_at = (x, y), now
+
+    def still_since(self) -> float:
+        """Since when the poses seen have stayed in one place."""
+        return self._anchored_at
+
+    def heard(self, now: float, settings: FleetSettings) -> bool:
+        """Whether both the robot and its move client were heard lately."""
+        return now - min(self.posed_at, self.reported_at) <= settings.silence_timeout
+
+    def take(self, report: ClientReport, now: float) -> None:
+        """Take what the move client says."""
+        self.report, self.reported_at = report, now
+        if report.revision != self.revision or report.state not in (ClientState.IDLE, ClientState.FAILED):
+            self.obeyed_at = inf
+        elif self.obeyed_at == inf:
+            self.obeyed_at = now
+
+    def next_revision(self) -> int:
+        """Number of the next list of cells."""
+        self.revision += 1
+        self.obeyed_at = inf
+        return self.revision
+
+    def stands(self, settings: FleetSettings) -> bool:
+        """Whether it was told to stand still, has done so, and was seen to."""
+        still_for = self.posed_at - self._anchored_at
+        return still_for >= settings.settle_time and self.posed_at >= self.obeyed_at

@@ -1,0 +1,41 @@
+"""The numbers that the planner works with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class FleetSettings:
+    """Sizes in metres, times in seconds.
+
+    Attributes:
+        robot_radius: Radius of the robots' hulls.
+        clearance: How much a hull is taken to be wider than it is, for errors of the pose.
+        arrival_tolerance: A robot this near to a cell's centre has arrived there. Must leave the hull inside
+            of the cell.
+        corridor: How far a robot may be beside its path and still be on it.
+        still_distance: A robot that stays within this distance stands still ...
+        settle_time: ... after this time.
+        ahead: How many cells beyond its own a robot is granted at most.
+        silence_timeout: A robot that has not been heard for this time is lost.
+        hold_timeout: The others wait this long for a robot that shall stop.
+        repeat_after: A message without effect is sent again after this time.
+        stall_timeout: A robot that has somewhere to go and stands still this long is stopped and sent anew.
+        seed: Breaks ties in plans.
+        effort: Work spent on one plan, see :func:`rce_fleet.planning.lacam.plan`.
+    """
+
+    robot_radius: float = 0.22
+    clearance: float = 0.03
+    arrival_tolerance: float = 0.15
+    corridor: float = 0.25
+    still_distance: float = 0.05
+    settle_time: float = 0.35
+    ahead: int = 4
+    silence_timeout: float = 3.0
+    hold_timeout: float = 6.0
+    repeat_after: float = 1.0
+    stall_timeout: float = 8.0
+    seed: int = 0
+    effort: int = 20_000

@@ -1,0 +1,71 @@
+"""Where every robot shall end up: at its goal, or somewhere out of the way."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rce_fleet.planning.grid import GridMap
+
+
+@dataclass(frozen=True, slots=True)
+class Targets:
+    """One target a robot, all different.
+
+    Attributes:
+        cells: Target of every robot.
+        unreachable: Robots whose goal cannot be reached; their target is a place to wait.
+    """
+
+    cells: dict[str, int]
+    unreachable: frozenset[str]
+
+
+def assign_targets(
+    grid: GridMap, starts: Mapping[str, int], goals: Mapping[str, int], rests: Mapping[str, int]
+) -> Targets:
+    """Give every robot a target.
+
+    Robots with a goal that can be reached get it. The others get their place of rest, or if that is blocked
+    or somebody's target, the nearest free cell that is not.
+
+    Args:
+        grid: The map. Robots may stand in blocked cells; nobody can enter one.
+        starts: Where the robots are.
+        goals: Where some of them are sent, all different.
+        rests: Where those rest that have no goal; the start by default.
+    """
+    cells: dict[str, int] = {}
+    unreachable = set()
+    for robot, goal in goals.items():
+        if goal not in grid.blocked and goal in grid.reachable(starts[robot]):
+            cells[robot] = goal
+        else:
+            unreachable.add(robot)
+    taken = set(cells.values())
+    for robot, start in starts.items():
+        if robot not in cells:
+            rest = start if robot in unreachable else rests.get(robot, start)
+            cells[robot] = _refuge(grid, start, rest, taken)
+            taken.add(cells[robot])
+    return Targets(cells, frozenset(unreachable))
+
+
+def _refuge(grid: GridMap, start: int, rest: int, taken: set[int]) -> int:
+    """The place of rest, or else the free cell nearest to it that can be reached and is nobody's target."""
+    within = grid.reachable(start)
+    seen = {rest}
+    queue = deque(seen)
+    while queue:
+        cell = queue.popleft()
+        if cell in within and cell not in taken and cell not in grid.blocked:
+            return cell
+        for other in grid.around(cell):
+            if other not in seen:
+                seen.add(other)
+                queue.append(other)
+    return start

@@ -1,0 +1,87 @@
+"""The simulation as a program: ``python -m rce_fleet.drivers SCENE.json --report FILE``."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import signal
+from pathlib import Path
+from typing import Annotated
+
+import typer
+import uvloop
+
+from rce.config.exceptions import ConfigError
+from rce.config.logs import start_logging
+from rce.ros.types import TypeRegistry
+from rce_client.exceptions import RefusedError
+from rce_fleet.drivers.account import Account
+from rce_fleet.drivers.block_watch import BlockWatch
+from rce_fleet.drivers.cell_watch import CellWatch, GraphCellWatch
+from rce_fleet.drivers.cores import Cores
+from rce_fleet.drivers.program import Simulation
+from rce_fleet.drivers.scene import load_scene
+
+BAD_SCENE = 2
+FAILED = 1
+
+
+def simulate(
+    scene: Annotated[Path, typer.Argument(help="What stands where, JSON or YAML.")],
+    report: Annotated[Path | None, typer.Option(help="File to write what truly happens to.")] = None,
+    master: Annotated[
+        str, typer.Option(help="The engine whose planner blocks cells; without it, no cell is blocked.")
+    ] = "",
+    user: Annotated[str, typer.Option(help="Whose fleet it is.")] = "testUser",
+    password: Annotated[str, typer.Option(envvar="RCE_PASSWORD", help="The user's password.")] = "testUser",  # noqa: S107 - the development user's
+    robot_id: Annotated[str, typer.Option(help="The robotID by which the world comes.")] = "world",
+    container: Annotated[str, typer.Option(help="Tag of the planner's container.")] = "cTag_fleet",
+    planner_core: Annotated[
+        str,
+        typer.Option(help="In place of --master: the ROS master of a planner that runs without the engine."),
+    ] = "",
+    core: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="ROS master that robots join in their namespaces: URI or ROBOT=URI; may be repeated."
+        ),
+    ] = None,
+) -> None:
+    """Simulate robots in a world, in real time; each is a ROS graph of its own unless --core names one."""
+    start_logging(logging.WARNING)
+    types = TypeRegistry()
+    watch: CellWatch | None = None
+    if planner_core:
+        watch = GraphCellWatch(planner_core, types)
+    elif master:
+        watch = BlockWatch(Account(master, user, password, robot_id), container)
+    cores = Cores.read(core or ())
+    try:
+        simulation = Simulation(load_scene(scene), types, typer.echo, report=report, watch=watch, cores=cores)
+    except ConfigError as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(BAD_SCENE) from None
+    try:
+        uvloop.run(_until_signal(simulation))
+    except* RefusedError as group:
+        typer.echo(f"simulation: the engine refused the world: {group.exceptions[0]}", err=True)
+        raise typer.Exit(FAILED) from None
+
+
+async def _until_signal(simulation: Simulation) -> None:
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop.set)
+    await simulation.run(stop)
+
+
+def main() -> None:
+    """Run the program."""
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app.command()(simulate)
+    app()
+
+
+if __name__ == "__main__":
+    main()

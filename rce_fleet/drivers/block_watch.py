@@ -1,0 +1,78 @@
+"""The world's connection to the engine: cells that the planner blocks come through its container."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+from rce_client.connection import Connection
+from rce_fleet.drivers.cell_watch import CELLS, TOPIC, cells_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rce_fleet.drivers.account import Account
+
+OWN_TAG = "blockedCells"
+JOIN_TIMEOUT = 3.0
+"""Seconds after which the interface is asked for again."""
+LOOK_EVERY = 1.0
+"""Seconds between two looks whether it is still joined."""
+
+
+class BlockWatch:
+    """Hears the planner's blocked cells, for as long as it runs.
+
+    The planner's container may come later than the world, or go and come back: the wire is asked for until
+    it is there, and again when it is gone.
+
+    Args:
+        account: Whose fleet it is, and where.
+        container: Tag of the planner's container.
+    """
+
+    def __init__(self, account: Account, container: str) -> None:
+        self._account = account
+        self._container = container
+        self.joined = asyncio.Event()
+        """Set once the wire was there."""
+
+    async def run(self, follow: Callable[[list[int]], None]) -> None:
+        """Watch until cancelled, then take back the interface.
+
+        Args:
+            follow: Called with all cells that are blocked now, whenever they change.
+
+        Raises:
+            RefusedError: The engine does not take this client.
+        """
+        account = self._account
+
+        def take(message: dict[str, Any]) -> None:
+            follow(cells_of(message["data"]))
+
+        connection = Connection(
+            account.url, account.user, account.password, account.robot, on_error=lambda _: None
+        )
+        async with connection:
+            try:
+                await connection.subscriber(OWN_TAG, CELLS, take)
+                while True:
+                    if not connection.active.get(OWN_TAG, False):
+                        await self._join(connection)
+                        self.joined.set()
+                    await asyncio.sleep(LOOK_EVERY)
+            finally:
+                if connection.connected:
+                    await connection.remove_all()
+
+    async def _join(self, connection: Connection) -> None:
+        tag = f"{OWN_TAG}_{connection.robot_id}"
+        while True:
+            await connection.add_interface(self._container, tag, "SubscriberInterface", CELLS, addr=TOPIC)
+            await connection.connect(f"{connection.robot_id}/{OWN_TAG}", f"{self._container}/{tag}")
+            try:
+                await connection.wait_active(OWN_TAG, timeout=JOIN_TIMEOUT)
+            except TimeoutError:
+                continue
+            return

@@ -1,0 +1,1 @@
+"""From cells to motion: angles, the controller of one robot, occupancy grids. Pure."""

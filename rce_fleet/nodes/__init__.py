@@ -1,0 +1,1 @@
+"""The fleet's ROS nodes: they carry messages to the coordination and from it."""

@@ -1,0 +1,304 @@
+"""Steers a fleet: gives every robot cells of the map to drive on, so that no two ever claim the same one.
+
+A robot is whatever publishes ``/NAME/amcl_pose`` and has a move client. The work is done by
+:mod:`rce_fleet.coordination`; this node carries messages to it and from it. ``share/README.md`` lists
+topics and parameters.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from rce.ros.errors import MasterError
+from rce.ros.node import Node, run
+from rce.ros.node.master import MasterClient
+from rce.ros.types import Time
+from rce.ros.xmlrpc import RpcClient
+from rce_fleet.coordination.answers import is_answer, read_answer
+from rce_fleet.coordination.events import (
+    BlockedChanged,
+    CellBlocked,
+    CellFreed,
+    Event,
+    GoalSet,
+    Instruction,
+    ObstacleSeen,
+    PoseSeen,
+    Reply,
+    ReportSeen,
+    RobotRemoved,
+    SendCancel,
+    SendCells,
+    StateChanged,
+    Tick,
+)
+from rce_fleet.coordination.move_client import ClientReport, ClientState
+from rce_fleet.coordination.planner import FleetPlanner
+from rce_fleet.coordination.revisions import numbered_array
+from rce_fleet.coordination.settings import FleetSettings
+from rce_fleet.navigation.angles import yaw_of
+from rce_fleet.navigation.occupancy import occupancy
+from rce_fleet.nodes.parameters import make_grid
+
+if TYPE_CHECKING:
+    from rce.ros.node import Publisher
+    from rce.ros.types import Message
+
+TICK = 0.1
+"""Seconds between two looks at the clock; the state is published at most as often."""
+LOOK_AROUND = 0.5
+"""Seconds between two looks for new robots."""
+POSE = "geometry_msgs/PoseWithCovarianceStamped"
+ROBOT_TOPIC = re.compile(r"/([A-Za-z][A-Za-z0-9_]*)/amcl_pose")
+MAP_FRAME = "map"
+
+
+class PlannerNode:
+    """The planner in a ROS graph.
+
+    Args:
+        node: Running node.
+        planner: The planner.
+        takes_answers: Move clients answer on ``goalNodesList`` instead of topics of their own.
+    """
+
+    def __init__(self, node: Node, planner: FleetPlanner, *, takes_answers: bool = False) -> None:
+        self._node = node
+        self._takes_answers = takes_answers
+        self._planner = planner
+        self._cells: dict[str, Publisher] = {}
+        self._cancels: dict[str, Publisher] = {}
+        self._state_changed = True
+        self._started = Time.now()
+        self._state: Publisher
+        self._blocked: Publisher
+        self._map: Publisher
+
+    async def run(self, blocked: list[int]) -> None:
+        """Steer until the node is told to stop.
+
+        Args:
+            blocked: Cells that are blocked from the beginning, and can be freed.
+        """
+        node = self._node
+        self._state = await node.advertise("/fleet/state", "fleet/FleetState", latch=True)
+        self._blocked = await node.advertise("/fleet/blockedCells", "std_msgs/Int32MultiArray", latch=True)
+        self._map = await node.advertise("/map", "nav_msgs/OccupancyGrid", latch=True)
+        self._publish_blocked(())
+        for cell in blocked:
+            self._handle(CellBlocked(cell))
+        await node.advertise_service("/fleet/set_goal", "fleet/SetGoal", self._set_goal)
+        await node.advertise_service("/fleet/block_cell", "fleet/BlockCell", self._block_cell)
+        await node.advertise_service("/fleet/remove_robot", "fleet/RemoveRobot", self._remove_robot)
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._look_around())
+            tasks.create_task(self._keep_time())
+
+    # -- what comes in ------------------------------------------------------------------------------
+
+    async def _look_around(self) -> None:
+        """Take in every robot whose pose is published."""
+        async with RpcClient() as rpc:
+            master = MasterClient(self._node.master_uri, self._node.name, self._node.uri, rpc)
+            while True:
+                try:
+                    for topic, _ in await master.call("getPublishedTopics", ""):
+                        found = ROBOT_TOPIC.fullmatch(topic)
+                        if found is not None and found[1] not in self._cells:
+                            await self._join(found[1])
+                except MasterError as error:
+                    self._node.log.warning("cannot look for robots: %s", error)
+                if not await self._node.sleep(LOOK_AROUND):
+                    return
+
+    async def _join(self, robot: str) -> None:
+        node = self._node
+        self._cells[robot] = await node.advertise(f"/{robot}/goalNodesList", "std_msgs/Int32MultiArray")
+        self._cancels[robot] = await node.advertise(f"/{robot}/cancelGoal", "std_msgs/Bool")
+        if self._takes_answers:
+            await node.subscribe(
+                f"/{robot}/goalNodesList",
+                "std_msgs/Int32MultiArray",
+                lambda message: self._take_answer(robot, message),
+            )
+        else:
+            await self._hear_apart(robot)
+        # Who watches the planner cannot hear what other interfaces of its container publish.
+        seen = await node.advertise(f"/fleet/poses/{robot}", POSE, latch=True)
+
+        def take(message: Message) -> None:
+            self._take(_pose(robot, message))
+            seen.publish(message)
+
+        await node.subscribe(f"/{robot}/amcl_pose", POSE, take)
+        node.log.info("%s is here", robot)
+
+    async def _hear_apart(self, robot: str) -> None:
+        """Hear a move client and its robot on a topic for each."""
+        await self._node.subscribe(
+            f"/{robot}/moveClient/status",
+            "fleet/MoveStatus",
+            lambda message: self._take(ReportSeen(robot, _report(message))),
+        )
+        await self._node.subscribe(
+            f"/{robot}/blockedCells",
+            "std_msgs/Int32MultiArray",
+            lambda message: self._take(ObstacleSeen(robot, tuple(message.data))),
+        )
+
+    def _take_answer(self, robot: str, message: Message) -> None:
+        """Take what a move client says; the planner's own lists come back here too."""
+        dimensions = message.layout.dim
+        labels = [dimension.label for dimension in dimensions]
+        if not is_answer(labels):
+            return
+        try:
+            report, blocked = read_answer(labels, [dimension.size for dimension in dimensions], message.data)
+        except ValueError as error:
+            self._node.log.warning("%s: %s", robot, error)
+            return
+        self._take(ReportSeen(robot, report))
+        if blocked:
+            self._take(ObstacleSeen(robot, blocked))
+
+    async def _keep_time(self) -> None:
+        while await self._node.sleep(TICK):
+            self._handle(Tick())
+            if self._state_changed:
+                self._state_changed = False
+                self._publish_state()
+
+    def _set_goal(self, request: Message) -> dict[str, Any]:
+        return self._ask(GoalSet(request.robot, None if request.cell < 0 else request.cell))
+
+    def _block_cell(self, request: Message) -> dict[str, Any]:
+        return self._ask(CellBlocked(request.cell) if request.blocked else CellFreed(request.cell))
+
+    def _remove_robot(self, request: Message) -> dict[str, Any]:
+        return self._ask(RobotRemoved(request.robot))
+
+    # -- what goes out ------------------------------------------------------------------------------
+
+    def _ask(self, event: Event) -> dict[str, Any]:
+        """Give a request to the planner; the fields of the response."""
+        reply = next(done for done in self._handle(event) if isinstance(done, Reply))
+        self._node.log.info("%s", reply.message)
+        return {"ok": reply.ok, "message": reply.message}
+
+    def _take(self, event: Event) -> None:
+        """Give an event to the planner."""
+        self._handle(event)
+
+    def _handle(self, event: Event) -> list[Instruction]:
+        """Give an event to the planner and do what it says."""
+        instructions = self._planner.handle(event, time.monotonic())
+        for instruction in instructions:
+            match instruction:
+                case SendCells(robot, revision, cells):
+                    self._cells[robot].publish(numbered_array(cells, revision))
+                case SendCancel(robot):
+                    self._cancels[robot].publish(data=True)
+                case BlockedChanged(cells):
+                    self._publish_blocked(cells)
+                case StateChanged():
+                    self._state_changed = True
+        return instructions
+
+    def _publish_blocked(self, cells: tuple[int, ...]) -> None:
+        self._blocked.publish(data=list(cells))
+        picture = occupancy(self._planner.books.grid, cells)
+        x, y = picture.origin
+        stamp = Time.now()
+        self._map.publish(
+            header={"stamp": stamp, "frame_id": MAP_FRAME},
+            info={
+                "map_load_time": stamp,
+                "resolution": picture.resolution,
+                "width": picture.width,
+                "height": picture.height,
+                "origin": {"position": {"x": x, "y": y}, "orientation": {"w": 1.0}},
+            },
+            data=picture.data.tolist(),
+        )
+
+    def _publish_state(self) -> None:
+        grid, snapshot = self._planner.books.grid, self._planner.snapshot()
+        walls = sorted(grid.blocked)
+        self._state.publish(
+            started=self._started,
+            rows=grid.rows,
+            columns=grid.columns,
+            cell_size=grid.cell_size,
+            origin_x=grid.origin[0],
+            origin_y=grid.origin[1],
+            blocked=sorted({*walls, *snapshot.blocked}),
+            pending=list(snapshot.pending),
+            walls=walls,
+            robots=[
+                {
+                    "id": robot.id,
+                    "state": robot.state.value,
+                    "reason": robot.reason,
+                    "cell": _or_none(robot.cell),
+                    "goal": _or_none(robot.goal),
+                    "plan": list(robot.plan),
+                    "granted": list(robot.granted),
+                    "replans": robot.replans,
+                }
+                for robot in snapshot.robots
+            ],
+        )
+
+
+def _or_none(cell: int | None) -> int:
+    """A cell as messages say it: -1 for none."""
+    return -1 if cell is None else cell
+
+
+def _pose(robot: str, message: Message) -> PoseSeen:
+    pose = message.pose.pose
+    turn = pose.orientation
+    return PoseSeen(robot, pose.position.x, pose.position.y, yaw_of(turn.x, turn.y, turn.z, turn.w))
+
+
+def _report(message: Message) -> ClientReport:
+    return ClientReport(
+        revision=message.revision,
+        state=ClientState(message.state),
+        cells=tuple(message.cells),
+        reached=None if message.reached < 0 else message.reached,
+        target=None if message.target < 0 else message.target,
+    )
+
+
+async def read_parameters(node: Node) -> dict[str, Any]:
+    """The parameters of the namespace ``/fleet``, and over them the node's private ones."""
+    values: dict[str, Any] = {}
+    for namespace in ("/fleet", "~"):
+        found = await node.get_param(namespace, {})
+        if isinstance(found, Mapping):
+            values.update(found)
+    return values
+
+
+async def main() -> None:
+    """Steer a fleet until the node is told to stop."""
+    async with Node("fleet_planner") as node:
+        values = await read_parameters(node)
+        settings = FleetSettings(
+            robot_radius=float(values.get("robot_radius", FleetSettings().robot_radius)),
+            seed=int(values.get("seed", 0)),
+        )
+        planner = FleetPlanner(make_grid(values), settings)
+        takes_answers = bool(values.get("answers", False))
+        await PlannerNode(node, planner, takes_answers=takes_answers).run(
+            [int(cell) for cell in values.get("blocked", [])]
+        )
+
+
+if __name__ == "__main__":
+    run(main())

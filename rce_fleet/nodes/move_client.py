@@ -1,0 +1,178 @@
+"""Sends a robot along the cells that it was granted, goal by goal. Runs in the robot's namespace.
+
+The work is done by :mod:`rce_fleet.coordination.move_client`; this node carries messages to it and from it.
+``share/README.md`` lists the topics.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from rce.ros.node import Node, run
+from rce.ros.types import Time
+from rce_fleet.coordination.answers import Answer, answer_array, is_answer
+from rce_fleet.coordination.move_client import (
+    ClientReport,
+    GoalState,
+    Instruction,
+    MoveClient,
+    SendGoal,
+    SendStop,
+)
+from rce_fleet.coordination.revisions import revision_of
+from rce_fleet.navigation.angles import quaternion_z
+from rce_fleet.nodes.parameters import make_grid
+from rce_fleet.planning.grid import GridMap
+
+if TYPE_CHECKING:
+    from rce.ros.node import Publisher
+    from rce.ros.types import Message
+
+TICK = 0.25
+"""Seconds between two looks at the clock."""
+REPORT_EVERY = 0.5
+"""Seconds after which the progress is published again."""
+MAP_FRAME = "map"
+
+
+class MoveClientNode:
+    """A move client in a ROS graph.
+
+    Args:
+        node: Running node, in the robot's namespace.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._client: MoveClient | None = None
+        self._reported_at = 0.0
+        self._goals: Publisher
+        self._stops: Publisher
+        self._reports: Publisher
+        self._answers = False
+
+    async def run(self) -> None:
+        """Send the robot along until the node is told to stop."""
+        node = self._node
+        self._goals = await node.advertise("move_base/goal", "move_base_msgs/MoveBaseActionGoal")
+        self._stops = await node.advertise("move_base/cancel", "actionlib_msgs/GoalID")
+        values = await node.get_param("~", {})
+        self._answers = bool(values.get("answers", False))
+        if "rows" in values or "map" in values:
+            self._take_grid(make_grid(values))
+        else:
+            await node.subscribe("/map", "nav_msgs/OccupancyGrid", self._take_map)
+        if self._answers:
+            self._reports = await node.advertise("goalNodesList", "std_msgs/Int32MultiArray")
+            await node.subscribe("blockedCells", "std_msgs/Int32MultiArray", self._take_blocked)
+        else:
+            self._reports = await node.advertise("moveClient/status", "fleet/MoveStatus")
+        await node.subscribe("goalNodesList", "std_msgs/Int32MultiArray", self._take_cells)
+        await node.subscribe("cancelGoal", "std_msgs/Bool", self._take_cancel)
+        await node.subscribe("move_base/status", "actionlib_msgs/GoalStatusArray", self._take_states)
+        await node.subscribe("move_base/result", "move_base_msgs/MoveBaseActionResult", self._take_result)
+        while await node.sleep(TICK):
+            if self._client is None:
+                continue
+            now = time.time()
+            self._do(self._client.tick(now))
+            if now - self._reported_at >= REPORT_EVERY:
+                self._do([self._client.report])
+
+    # -- what comes in ------------------------------------------------------------------------------
+
+    def _take_map(self, message: Message) -> None:
+        """Learn size and place of the cells: one pixel of the map is one cell."""
+        info = message.info
+        grid = GridMap(
+            rows=info.height,
+            columns=info.width,
+            cell_size=info.resolution,
+            origin=(info.origin.position.x, info.origin.position.y),
+        )
+        self._take_grid(grid)
+
+    def _take_grid(self, grid: GridMap) -> None:
+        if self._client is None:
+            self._client = MoveClient(grid, self._node.namespace.strip("/"), time.time())
+
+    def _take_blocked(self, message: Message) -> None:
+        if self._client is not None:
+            self._report(self._client.report, blocked=tuple(message.data))
+
+    def _take_cells(self, message: Message) -> None:
+        labels = [dimension.label for dimension in message.layout.dim]
+        if self._client is None or is_answer(labels):
+            return
+        revision = revision_of(labels)
+        try:
+            self._do(self._client.take_cells(revision, list(message.data), time.time()))
+        except ValueError as error:
+            self._node.log.warning("refused a list of cells: %s", error)
+
+    def _take_cancel(self, message: Message) -> None:
+        if self._client is not None and message.data:
+            self._do(self._client.cancel(time.time()))
+
+    def _take_states(self, message: Message) -> None:
+        if self._client is not None:
+            states = {entry.goal_id.id: GoalState(entry.status) for entry in message.status_list}
+            self._do(self._client.take_goal_states(states, time.time()))
+
+    def _take_result(self, message: Message) -> None:
+        if self._client is not None:
+            status = message.status
+            self._do(self._client.take_result(status.goal_id.id, GoalState(status.status), time.time()))
+
+    # -- what goes out ------------------------------------------------------------------------------
+
+    def _do(self, instructions: list[Instruction]) -> None:
+        for instruction in instructions:
+            match instruction:
+                case SendGoal():
+                    self._send_goal(instruction)
+                case SendStop(stamp):
+                    self._stops.publish(stamp=Time.from_sec(stamp), id="")
+                case ClientReport():
+                    self._report(instruction)
+
+    def _send_goal(self, goal: SendGoal) -> None:
+        assert self._client is not None
+        x, y = self._client.grid.centre(goal.cell)
+        z, w = quaternion_z(goal.heading)
+        stamp = Time.from_sec(goal.stamp)
+        header = {"stamp": stamp, "frame_id": MAP_FRAME}
+        self._goals.publish(
+            header=header,
+            goal_id={"stamp": stamp, "id": goal.id},
+            goal={
+                "target_pose": {
+                    "header": header,
+                    "pose": {"position": {"x": x, "y": y}, "orientation": {"z": z, "w": w}},
+                },
+            },
+        )
+
+    def _report(self, report: ClientReport, blocked: tuple[int, ...] = ()) -> None:
+        self._reported_at = time.time()
+        if self._answers:
+            self._reports.publish(answer_array(Answer(report, blocked)))
+            return
+        self._reports.publish(
+            revision=report.revision,
+            state=report.state.value,
+            cells=list(report.cells),
+            reached=-1 if report.reached is None else report.reached,
+            target=-1 if report.target is None else report.target,
+        )
+
+
+async def main() -> None:
+    """Send a robot along until the node is told to stop."""
+    async with Node("move_client") as node:
+        await MoveClientNode(node).run()
+
+
+if __name__ == "__main__":
+    run(main())

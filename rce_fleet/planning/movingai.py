@@ -1,0 +1,130 @@
+"""Reader of the MovingAI benchmark formats, ``.map`` and ``.scen``.
+
+Format: https://movingai.com/benchmarks/formats.html. The origin is the top left corner, x grows to the
+right and y downwards, which is column and row of :class:`~rce_fleet.planning.grid.GridMap`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rce_fleet.exceptions import MapError
+from rce_fleet.planning.grid import GridMap
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_FREE = frozenset(".GS")
+_BLOCKED = frozenset("@OTW")
+_SCEN_FIELDS = 9
+MAX_CELLS = 4_000_000
+"""Largest map that is read: a header must not make the reader fill the memory."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScenarioRow:
+    """One row of a ``.scen`` file: where a robot starts and where it shall go, as cells."""
+
+    start: int
+    goal: int
+
+
+def parse_map(text: str, *, cell_size: float = 1.0) -> GridMap:
+    """Read a ``.map`` file's text.
+
+    Raises:
+        MapError: The text is no such map.
+    """
+    lines = text.splitlines()
+    rows, columns, first = _header(lines)
+    body = lines[first : first + rows]
+    if len(body) < rows:
+        raise MapError(f"the map has {len(body)} of {rows} rows", line=len(lines))
+    blocked: set[int] = set()
+    for row, line in enumerate(body):
+        if len(line) != columns:
+            raise MapError(f"{len(line)} cells in a row of {columns}", line=first + row + 1)
+        for column, character in enumerate(line):
+            if character in _BLOCKED:
+                blocked.add(row * columns + column)
+            elif character not in _FREE:
+                raise MapError(f"unknown cell {character!r}", line=first + row + 1)
+    return GridMap(rows, columns, cell_size, blocked=frozenset(blocked))
+
+
+def _header(lines: list[str]) -> tuple[int, int, int]:
+    """Rows, columns and the index of the first line of cells."""
+    sizes: dict[str, int] = {}
+    for index, line in enumerate(lines):
+        key, _, value = line.strip().partition(" ")
+        if key == "map":
+            break
+        if key in ("height", "width"):
+            if not value.strip().isdecimal():
+                raise MapError(f"{key} is no number: {value!r}", line=index + 1)
+            sizes[key] = int(value)
+        elif key != "type":
+            raise MapError(f"unknown header line {line!r}", line=index + 1)
+    else:
+        raise MapError("no line 'map' before the cells")
+    rows, columns = sizes.get("height", 0), sizes.get("width", 0)
+    if not 0 < rows * columns <= MAX_CELLS:
+        raise MapError(f"the size {columns} x {rows} is not within 1 .. {MAX_CELLS} cells")
+    return rows, columns, index + 1
+
+
+def parse_scenario(text: str, grid: GridMap, *, limit: int | None = None) -> list[ScenarioRow]:
+    """Read the first ``limit`` rows (by default all) of a ``.scen`` file's text for the map ``grid``.
+
+    Raises:
+        MapError: A row is malformed, for a map of another size, or starts or ends in a blocked cell.
+    """
+    lines = text.splitlines()
+    if not lines or not lines[0].startswith("version"):
+        raise MapError("no line 'version' at the beginning", line=1)
+    rows: list[ScenarioRow] = []
+    for number, line in enumerate(lines[1:], start=2):
+        if limit is not None and len(rows) >= limit:
+            break
+        if line.strip():
+            rows.append(_scenario_row(line, number, grid))
+    return rows
+
+
+def _scenario_row(line: str, number: int, grid: GridMap) -> ScenarioRow:
+    fields = line.split()
+    if len(fields) != _SCEN_FIELDS:
+        raise MapError(f"{len(fields)} fields in a row of {_SCEN_FIELDS}", line=number)
+    try:
+        width, height, start_x, start_y, goal_x, goal_y = (int(field) for field in fields[2:8])
+    except ValueError as error:
+        raise MapError(str(error), line=number) from error
+    if (width, height) != (grid.columns, grid.rows):
+        raise MapError(f"the row is for a map of {width} x {height}", line=number)
+    for x, y in ((start_x, start_y), (goal_x, goal_y)):
+        if not (0 <= x < width and 0 <= y < height) or grid.cell(y, x) in grid.blocked:
+            raise MapError(f"({x}, {y}) is no free cell of the map", line=number)
+    return ScenarioRow(grid.cell(start_y, start_x), grid.cell(goal_y, goal_x))
+
+
+def read_map(path: Path, *, cell_size: float = 1.0) -> GridMap:
+    """Read a ``.map`` file.
+
+    Raises:
+        MapError: It is no such map.
+        OSError: It cannot be opened.
+    """
+    return parse_map(_text(path), cell_size=cell_size)
+
+
+def read_scenario(path: Path, grid: GridMap, *, limit: int | None = None) -> list[ScenarioRow]:
+    """Read a ``.scen`` file; see :func:`parse_scenario`."""
+    return parse_scenario(_text(path), grid, limit=limit)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="ascii")
+    except UnicodeDecodeError as error:
+        raise MapError(f"{path} is no ASCII text") from error

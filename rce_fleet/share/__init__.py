@@ -1,0 +1,1 @@
+"""The ROS package ``fleet``: its messages and services; its nodes are :mod:`rce_fleet.nodes`."""

@@ -1,0 +1,152 @@
+"""The simulated robot's ``move_base``: takes goals, drives to them, stops before obstacles.
+
+It behaves like an actionlib server: a new goal replaces the current one, a cancellation names a goal or a
+time, and goals that were made before that time are recalled even if they arrive later.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rce_fleet.coordination.move_client import GoalState
+from rce_fleet.navigation.navigation import DriveLimits, Navigator, Pose, Twist
+from rce_fleet.simulation.obstacles import blocked_cell, clear_ahead
+
+if TYPE_CHECKING:
+    from rce_fleet.planning.grid import GridMap
+    from rce_fleet.simulation.lidar import Floats
+
+REMEMBER = 5.0
+"""Seconds for which a finished goal is still listed."""
+SIGHT = 1.2
+"""How far ahead a robot looks for blocked cells, metres."""
+MARGIN = 0.15
+"""Width of a cell's rim in which hits may belong to a neighbour, metres."""
+PATIENCE = 3.0
+"""Seconds that a robot waits before an obstacle that it cannot place before it gives up."""
+
+
+@dataclass(slots=True)
+class Goal:
+    """A navigation goal: its id, when it was made (seconds), where (metres), and how it stands."""
+
+    id: str
+    stamp: float
+    place: tuple[float, float]
+    state: GoalState = GoalState.ACTIVE
+    ended_at: float = 0.0
+
+
+class SimulatedMoveBase:
+    """Drives one robot.
+
+    Args:
+        grid: The map.
+        radius: Of the robot's hull, metres.
+        limits: What the robot can do.
+
+    Attributes:
+        blocked: Cells that the robot found blocked on the way to its last goal.
+    """
+
+    def __init__(self, grid: GridMap, radius: float, limits: DriveLimits | None = None) -> None:
+        self.blocked: tuple[int, ...] = ()
+        self._grid = grid
+        self._radius = radius
+        self._navigator = Navigator(limits)
+        self._goals: dict[str, Goal] = {}
+        self._current: Goal | None = None
+        self._ending: GoalState | None = None
+        self._ended: list[Goal] = []
+        self._recalled_until = float("-inf")
+        self._stuck_for = 0.0
+        self._now = 0.0
+
+    @property
+    def goals(self) -> list[Goal]:
+        """The goals that are listed: the current one, and those ended lately."""
+        return list(self._goals.values())
+
+    def take_ended(self) -> list[Goal]:
+        """Goals that have ended since the last call."""
+        ended, self._ended = self._ended, []
+        return ended
+
+    def accept(self, goal_id: str, stamp: float, x: float, y: float) -> None:
+        """Take a goal; one that is known already changes nothing."""
+        if goal_id in self._goals:
+            return
+        goal = self._goals[goal_id] = Goal(goal_id, stamp, (x, y))
+        if stamp <= self._recalled_until:
+            self._end(goal, GoalState.RECALLED)
+            return
+        if self._current is not None:
+            self._end(self._current, GoalState.PREEMPTED)
+        self._current, self._ending = goal, None
+        self.blocked = ()
+        self._stuck_for = 0.0
+        self._navigator.follow([goal.place])
+
+    def cancel(self, goal_id: str, stamp: float) -> None:
+        """Stop goals: the one named, those made up to ``stamp``, and all if neither is given."""
+        if stamp:
+            self._recalled_until = max(self._recalled_until, stamp)
+        goal = self._current
+        if goal is None or goal.state is not GoalState.ACTIVE:
+            return
+        if goal.id == goal_id or goal.stamp <= stamp or (not goal_id and not stamp):
+            goal.state = GoalState.PREEMPTING
+            self._brake(GoalState.PREEMPTED)
+
+    def update(self, now: float, pose: Pose, points: Floats) -> Twist:
+        """Decide the speeds until the next update.
+
+        Args:
+            now: Time, seconds.
+            pose: Where the robot takes itself to be.
+            points: What its lidar hit last, shape (N, 2), metres in the map.
+        """
+        dt, self._now = max(now - self._now, 0.0) if self._now else 0.0, now
+        goal = self._current
+        if goal is not None and self._ending is None:
+            cell = blocked_cell(self._grid, points, pose, goal.place, sight=SIGHT, margin=MARGIN)
+            if cell is not None:
+                self.blocked = (cell,)
+                self._brake(GoalState.ABORTED)
+        clear = clear_ahead(points, pose, self._radius) if len(points) else np.inf
+        twist = self._navigator.update(pose, dt, clear)
+        self._judge(dt)
+        self._forget(now)
+        return twist
+
+    def _judge(self, dt: float) -> None:
+        """End the goal if it is time to."""
+        goal = self._current
+        if goal is None:
+            return
+        if self._navigator.done:
+            self._end(goal, self._ending or GoalState.SUCCEEDED)
+        elif self._navigator.standing:
+            self._stuck_for += dt
+            if self._stuck_for > PATIENCE:
+                self._brake(GoalState.ABORTED)
+        else:
+            self._stuck_for = 0.0
+
+    def _brake(self, ending: GoalState) -> None:
+        self._ending = ending
+        self._navigator.stop()
+
+    def _end(self, goal: Goal, state: GoalState) -> None:
+        goal.state, goal.ended_at = state, self._now
+        self._ended.append(goal)
+        if goal is self._current:
+            self._current = self._ending = None
+
+    def _forget(self, now: float) -> None:
+        for goal in [goal for goal in self._goals.values() if goal.state.over]:
+            if now - goal.ended_at > REMEMBER:
+                del self._goals[goal.id]

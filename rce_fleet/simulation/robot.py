@@ -1,0 +1,96 @@
+"""A simulated differential-drive robot."""
+
+from __future__ import annotations
+
+from math import cos, hypot, sin
+from typing import TYPE_CHECKING
+
+import pymunk
+
+from rce_fleet.navigation.angles import wrap
+from rce_fleet.navigation.navigation import Pose, Twist
+from rce_fleet.simulation.noise import NoiseSpec, Odometry, PoseEstimate
+
+if TYPE_CHECKING:
+    import numpy as np
+
+_MASS = 20.0
+
+
+class SimulatedRobot:
+    """A disc that goes forward and turns. Made by :meth:`rce_fleet.simulation.world.World.add_robot`.
+
+    Attributes:
+        id: Name of the robot.
+        radius: Radius of the hull, metres.
+        distance: Way driven so far, metres.
+        rng: Source of its errors.
+        body: Its body in the space.
+        shape: Its hull in the space.
+    """
+
+    def __init__(
+        self, robot: str, pose: Pose, radius: float, noise: NoiseSpec, rng: np.random.Generator
+    ) -> None:
+        self.id = robot
+        self.radius = radius
+        self.distance = 0.0
+        self.rng = rng
+        self.body = pymunk.Body(_MASS, pymunk.moment_for_circle(_MASS, 0.0, radius))
+        self.body.position = (pose.x, pose.y)
+        self.body.angle = pose.yaw
+        self.shape = pymunk.Circle(self.body, radius)
+        self._command = Twist()
+        self._before = self.pose
+        self._estimate = PoseEstimate(noise, rng)
+        self._odometry = Odometry(noise, rng)
+
+    # -- senses -----------------------------------------------------------------------------------
+
+    @property
+    def pose(self) -> Pose:
+        """Where it truly is."""
+        x, y = self.body.position
+        return Pose(x, y, wrap(self.body.angle))
+
+    @property
+    def estimate(self) -> Pose:
+        """Where it takes itself to be."""
+        return self._estimate.of(self.pose)
+
+    @property
+    def covariance(self) -> tuple[float, float, float]:
+        """Variances of the estimate: x, y (square metres) and yaw (square radians)."""
+        return self._estimate.covariance
+
+    @property
+    def odometry(self) -> Pose:
+        """Where its wheels take it to be, from where it started."""
+        return self._odometry.pose
+
+    @property
+    def twist(self) -> Twist:
+        """How it truly moves."""
+        vx, vy = self.body.velocity
+        yaw = self.body.angle
+        return Twist(vx * cos(yaw) + vy * sin(yaw), self.body.angular_velocity)
+
+    # -- motion -----------------------------------------------------------------------------------
+
+    def drive(self, twist: Twist) -> None:
+        """Set the speeds that the wheels keep from now on."""
+        self._command = twist
+
+    def push(self) -> None:
+        """Hand the wheels' speeds to the body, before a step of the world."""
+        yaw = self.body.angle
+        self.body.velocity = (self._command.speed * cos(yaw), self._command.speed * sin(yaw))
+        self.body.angular_velocity = self._command.turn_rate
+        self._before = self.pose
+
+    def settle(self, dt: float) -> None:
+        """Count what a step of the world of ``dt`` seconds did."""
+        after = self.pose
+        self.distance += hypot(after.x - self._before.x, after.y - self._before.y)
+        self._odometry.update(self._before, after)
+        self._estimate.update(dt)

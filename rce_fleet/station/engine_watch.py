@@ -1,0 +1,147 @@
+"""Watches the engine over the master's REST API, for the page."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Any
+
+import aiohttp
+from yarl import URL
+
+from rce.tls.faults import explain_to_client
+from rce.web.client import session_connector
+from rce_fleet.station.engine_entrance import Secure
+
+if TYPE_CHECKING:
+    from rce.tls.identity import Context
+
+_log = logging.getLogger(__name__)
+
+POLL_S = 1.0
+TIMEOUT = aiohttp.ClientTimeout(total=5)
+
+
+class EngineWatch:
+    """Reads containers with what they use, nodes and connections of the operator's user again and again.
+
+    Args:
+        master: URL of the master.
+        user: User ID.
+        password: The user's password.
+        tls: Gives the TLS settings for each connection; the system's if None.
+        on_state: Called with the engine's state whenever it changed; ``{"error": text}`` if out of reach.
+    """
+
+    def __init__(
+        self,
+        master: str,
+        user: str,
+        password: str,
+        *,
+        tls: Context | None = None,
+        on_state: Callable[[dict[str, Any]], None],
+    ) -> None:
+        self._tls = tls
+        self._api = URL(master) / "api/v1"
+        self._login = {"userID": user, "password": password, "label": "operator station"}
+        self._on_state = on_state
+        self._token = ""
+        self._last: dict[str, Any] = {}
+
+    @property
+    def _how(self) -> Secure:
+        return Secure(ssl=True if self._tls is None else self._tls(), allow_redirects=False)
+
+    async def run(self) -> None:
+        """Watch until cancelled; then give the token back."""
+        connector = session_connector(None)
+        async with aiohttp.ClientSession(
+            timeout=TIMEOUT, raise_for_status=True, connector=connector
+        ) as session:
+            try:
+                await self._watch(session)
+            finally:
+                await self._log_out(session)
+
+    async def _watch(self, session: aiohttp.ClientSession) -> None:
+        while True:
+            try:
+                state = await self._read(session)
+            except aiohttp.ClientResponseError as error:
+                if error.status == HTTPStatus.UNAUTHORIZED:
+                    self._token = ""
+                state = {"error": f"the master says {error.status}: {error.message}"}
+            except (aiohttp.ClientError, TimeoutError) as error:
+                state = {"error": f"the master cannot be reached: {explain_to_client(error) or error}"}
+            if state != self._last:
+                self._last = state
+                self._on_state(state)
+            await asyncio.sleep(POLL_S)
+
+    async def _log_out(self, session: aiohttp.ClientSession) -> None:
+        if not self._token:
+            return
+        headers = {"Authorization": f"Bearer {self._token}"}
+        try:
+            async with session.delete(self._api / "login", headers=headers, **self._how):
+                self._token = ""
+        except (aiohttp.ClientError, TimeoutError) as error:
+            _log.info("the token of this station was not given back, it expires by itself: %s", error)
+
+    async def _read(self, session: aiohttp.ClientSession) -> dict[str, Any]:
+        if not self._token:
+            async with session.post(self._api / "login", json=self._login, **self._how) as reply:
+                self._token = (await reply.json())["token"]
+        containers, nodes, connections = [
+            (await self._get(session, kind))[kind] for kind in ("containers", "nodes", "connections")
+        ]
+        usage = await self._get(session, "usage")
+        used = {container["id"]: container for container in usage["containers"]}
+        return {
+            "containers": [
+                {
+                    **{key: container[key] for key in ("tag", "state", "machine", "detail", "moving_to")},
+                    **_used(used.get(container["id"])),
+                    "nodes": [
+                        {key: node[key] for key in ("tag", "state", "detail")}
+                        for node in nodes
+                        if node["container"] == container["tag"]
+                    ],
+                }
+                for container in containers
+            ],
+            "connections": [
+                {key: connection[key] for key in ("tag_a", "tag_b", "established")}
+                for connection in connections
+            ],
+            # Administrators see these, others none.
+            "machines": [{key: machine[key] for key in _MACHINE} for machine in usage["machines"]],
+        }
+
+    async def _get(self, session: aiohttp.ClientSession, kind: str) -> dict[str, Any]:
+        headers = {"Authorization": f"Bearer {self._token}"}
+        async with session.get(
+            self._api / kind,
+            headers=headers,
+            params={"user": self._login["userID"]},
+            **self._how,
+        ) as reply:
+            found: dict[str, Any] = await reply.json()
+            return found
+
+
+_MACHINE = (
+    *("machine", "process", "connected", "draining", "containers"),
+    *("slots", "promised_slots", "cores", "promised_cores", "memory", "promised_memory", "advice"),
+)
+_SHOWN = ("cpu", "cpu_limit", "memory", "memory_limit", "restarts", "oom_kills")
+
+
+def _used(usage: dict[str, Any] | None) -> dict[str, Any]:
+    """What a container uses, and what could be better; without either before the first report."""
+    if usage is None or not usage["memory"]:
+        return {"usage": None, "advice": []}
+    return {"usage": {key: usage[key] for key in _SHOWN}, "advice": usage["advice"]}

@@ -1,0 +1,123 @@
+"""The station's way to the planner through the engine."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from rce.config.client import ClientConfig
+from rce.protocol.messages import Request
+from rce.tls.identity import Context
+from rce_client.connection import Connection, State
+from rce_client.ends import ServiceClient
+from rce_client.exceptions import CallError, ClientError
+from rce_fleet.station.fleet_link import (
+    BLOCK_CELL,
+    CALL_TIMEOUT_S,
+    POSE,
+    SET_GOAL,
+    STATE,
+    STATE_TOPIC,
+    Ask,
+    Listener,
+    PlannerAwayError,
+    PlannerWire,
+    pose_topic,
+)
+from rce_fleet.station.respawn import repairs
+
+_SERVICES = (("setGoal", SET_GOAL), ("blockCell", BLOCK_CELL))
+
+
+class EngineWire(PlannerWire):
+    """A connection to the fleet's container. Starts the container's nodes again when they ended.
+
+    Args:
+        config: The operator's configuration; its first container is the planner's.
+        tls: Gives the TLS settings for each connection; the system's if None.
+    """
+
+    def __init__(self, config: ClientConfig, tls: Context | None = None) -> None:
+        if not config.containers:
+            raise ValueError("containers: the fleet's configuration names no container for the planner")
+        super().__init__("the planner's container is not ready yet")
+        self._config = config
+        self._tls = tls
+        self._container = config.containers[0].tag
+        self._repairs: asyncio.Queue[Request] = asyncio.Queue()
+        self._listener: Listener
+
+    async def run(self, listener: Listener, ready: Callable[[], Awaitable[None]]) -> None:
+        """Make the planner's container, wire it, and keep taking what comes until cancelled."""
+        self._listener = listener
+        config = self._config
+        async with Connection(
+            config.url,
+            config.user,
+            config.password.get_secret_value(),
+            config.robot,
+            tls=self._tls,
+            on_error=lambda text: listener.take_event(text, "bad"),
+            on_state=self._on_state,
+        ) as connection:
+            try:
+                for request in config.setup():
+                    await connection.request(request)
+                await self._join_planner(connection)
+                await ready()
+                async with asyncio.TaskGroup() as group:
+                    group.create_task(self._follow_robots(connection))
+                    group.create_task(self._repair(connection))
+            finally:
+                await connection.remove_all()
+
+    def on_engine(self, state: dict[str, Any]) -> None:
+        """Take the engine's state; nodes that ended are started again."""
+        for request in repairs(self._config, state):
+            self._repairs.put_nowait(request)
+
+    async def _join_planner(self, connection: Connection) -> None:
+        await connection.subscriber("fleetState", STATE, self._listener.take_state)
+        await self._join(connection, "fleetState", "SubscriberInterface", STATE, STATE_TOPIC)
+        for tag, service in _SERVICES:
+            self._asks[service] = _asking(await connection.service_client(tag, service.cls))
+            await self._join(connection, tag, "ServiceClientInterface", service.cls, service.name)
+        for tag in ("fleetState", *(tag for tag, _ in _SERVICES)):
+            await connection.wait_active(tag)
+
+    async def _follow_robots(self, connection: Connection) -> None:
+        while True:
+            await self._follow(connection, await self._new_robots.get())
+
+    async def _repair(self, connection: Connection) -> None:
+        while True:
+            await connection.request(await self._repairs.get())
+
+    async def _follow(self, connection: Connection, robot: str) -> None:
+        """Wire a robot's pose to the station."""
+        tag, listener = f"pose{robot}", self._listener
+        await connection.subscriber(tag, POSE, lambda message: listener.take_pose(robot, message))
+        await self._join(connection, tag, "SubscriberInterface", POSE, pose_topic(robot))
+
+    async def _join(self, connection: Connection, tag: str, kind: str, cls: str, address: str) -> None:
+        await connection.add_interface(self._container, tag, kind, cls, addr=address)
+        await connection.connect(f"{connection.robot_id}/{tag}", f"{self._container}/{tag}")
+
+    def _on_state(self, state: State, words: str) -> None:
+        if state is State.LOST:
+            self._listener.take_event(f"connection to the engine lost: {words}", "bad")
+        elif state is State.RESTORED:
+            self._listener.take_event("connection to the engine is back", "good")
+
+
+def _asking(client: ServiceClient[dict[str, Any]]) -> Ask:
+    async def ask(request: dict[str, Any]) -> dict[str, Any]:
+        try:
+            return await client(request, timeout=CALL_TIMEOUT_S)
+        except CallError as error:
+            raise PlannerAwayError(f"the planner did not answer: {error}") from error
+        except ClientError as error:
+            raise PlannerAwayError(f"the engine cannot be reached: {error}") from error
+
+    return ask

@@ -1,0 +1,36 @@
+"""Starts the operator's nodes again when they ended: a fleet without its planner stands still. Pure."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rce.config.client import ClientConfig
+from rce.protocol.messages import ConfigureComponents, RemoveNode, Request
+
+_ENDED = frozenset({"failed", "exited"})
+_UP = frozenset({"running", "degraded"})
+
+
+def repairs(config: ClientConfig, engine: dict[str, Any]) -> list[Request]:
+    """What is to be asked of the engine so that all nodes of ``config`` run.
+
+    A node that ended is removed; once the engine has forgotten it, it is added again.
+
+    Args:
+        config: The operator's configuration.
+        engine: The engine's state, as :class:`~rce_fleet.station.engine_watch.EngineWatch` says it.
+    """
+    requests: list[Request] = []
+    for container in engine.get("containers", ()):
+        if container["state"] not in _UP:
+            continue
+        states = {node["tag"]: node["state"] for node in container["nodes"]}
+        for node in config.nodes:
+            if node.container != container["tag"]:
+                continue
+            if node.tag not in states:
+                requests.append(ConfigureComponents(add_nodes=(node.message(),)))
+            elif states[node.tag] in _ENDED:
+                remove = RemoveNode(container_tag=node.container, node_tag=node.tag)
+                requests.append(ConfigureComponents(remove_nodes=(remove,)))
+    return requests

@@ -1,0 +1,94 @@
+"""The station's way to the planner in the planner's own ROS graph, without the engine."""
+
+from __future__ import annotations
+
+import asyncio
+from array import array
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from rce.ros.errors import RosError, ServiceError
+from rce.ros.node import Node, ServiceClient
+from rce.ros.types import Duration, Message, Time, TypeRegistry
+from rce_fleet.station.fleet_link import (
+    BLOCK_CELL,
+    CALL_TIMEOUT_S,
+    POSE,
+    SET_GOAL,
+    STATE,
+    STATE_TOPIC,
+    Ask,
+    Listener,
+    PlannerAwayError,
+    PlannerWire,
+    pose_topic,
+)
+
+NODE = "operator_station"
+
+
+class RosWire(PlannerWire):
+    """A node beside the planner.
+
+    Args:
+        master_uri: The ROS master of the planner's graph, which need not be up yet.
+        types: Where message types come from.
+    """
+
+    def __init__(self, master_uri: str, types: TypeRegistry) -> None:
+        super().__init__("the ROS master cannot be reached yet")
+        self._node = Node(
+            NODE, argv=(), master_uri=master_uri, types=types, signals=False, master_timeout=None
+        )
+        self._heard = asyncio.Event()
+
+    async def run(self, listener: Listener, ready: Callable[[], Awaitable[None]]) -> None:
+        """Be part of the graph, and keep taking what comes until cancelled."""
+
+        def take_state(message: Message) -> None:
+            listener.take_state(plain(message))
+            self._heard.set()
+
+        async with self._node as node:
+            for service in (SET_GOAL, BLOCK_CELL):
+                self._asks[service] = _asking(node.service_client(service.name, service.cls))
+            await node.subscribe(STATE_TOPIC, STATE, take_state)
+            await self._heard.wait()
+            await ready()
+            while True:
+                await self._follow(listener, await self._new_robots.get())
+
+    async def _follow(self, listener: Listener, robot: str) -> None:
+        await self._node.subscribe(
+            pose_topic(robot), POSE, lambda message: listener.take_pose(robot, plain(message))
+        )
+
+
+def _asking(client: ServiceClient) -> Ask:
+    async def ask(request: dict[str, Any]) -> dict[str, Any]:
+        try:
+            return plain(await client(request, timeout=CALL_TIMEOUT_S))
+        except ServiceError as error:
+            raise PlannerAwayError(f"the planner did not answer: {error}") from error
+        except RosError as error:
+            raise PlannerAwayError(f"the planner's ROS graph cannot be reached: {error}") from error
+
+    return ask
+
+
+def plain(message: Message) -> dict[str, Any]:
+    """A message as dictionaries and lists; times are texts that differ when the times do."""
+    names: tuple[str, ...] = message.__class__.__slots__
+    return {name: _plain(getattr(message, name)) for name in names}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Message):
+        return plain(value)
+    if isinstance(value, array):
+        return value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [_plain(element) for element in value]
+    if isinstance(value, (Time, Duration)):
+        return f"{value.secs}.{value.nsecs:09}"
+    return value

@@ -1,0 +1,335 @@
+"""The station's HTTP server: the page, its live socket, and the API for an ERP."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+from aiohttp import WSCloseCode, WSMsgType, hdrs, web
+from pydantic import BaseModel, ValidationError
+
+from rce.web.bodies import read_whole
+from rce.web.openapi import PREFIX, Operation, build_document
+from rce.web.origin import ServerNames
+from rce_fleet.station.api import (
+    MAX_CELL,
+    Answer,
+    CellRequest,
+    FleetModel,
+    GoalRequest,
+    LoginRequest,
+    MapModel,
+    PersonModel,
+    Problem,
+    RobotModel,
+)
+from rce_fleet.station.door import COOKIE, PERSON, Door, problem, set_cookie, shown_token
+from rce_fleet.station.fleet_link import FleetError, FleetLink, PlannerAwayError
+from rce_fleet.station.live import Broadcast, Page
+from rce_fleet.station.persons import Entrance, EntranceError, SharedToken
+from rce_fleet.station.view import FleetView
+
+STATIC = Path(__file__).parent / "static"
+MAX_BODY = 1 << 16
+MAX_DIGITS = 20
+"""Of a cell's number; Python reads no more than 4300."""
+SHOWN = 80
+"""Characters of a wrong name that an answer repeats."""
+MIN_FRAME_S = 0.05
+"""Least time between two batches of messages to one page."""
+HEARTBEAT_S = 20.0
+CHECK_S = 5.0
+"""How often it is looked whether the login of an open page is still good."""
+
+_LOOKING = (401, 403, 421, 503)
+"""How a request may be refused that only looks."""
+_STEERING = (*_LOOKING, 400, 404, 408, 409, 413)
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+class Station:
+    """Handlers of all routes.
+
+    Args:
+        view: What is known of the fleet.
+        fleet: Carries wishes to the planner.
+        pages: The open pages.
+        entrance: Says who somebody is; anybody may do everything if None.
+        names: By which the station may be asked for.
+    """
+
+    def __init__(
+        self,
+        view: FleetView,
+        fleet: FleetLink,
+        pages: Broadcast,
+        *,
+        entrance: Entrance | None = None,
+        names: ServerNames | None = None,
+    ) -> None:
+        self._view = view
+        self._fleet = fleet
+        self._pages = pages
+        self._entrance = entrance or SharedToken()
+        self._door = Door(self._entrance, names or ServerNames())
+
+    def make_app(self) -> web.Application:
+        """Build the application."""
+        app = web.Application(middlewares=[_problems, self._door.guard], client_max_size=MAX_BODY)
+        for known, handler in self._operations():
+            app.router.add_route(known.method, PREFIX + known.path, handler)
+        document = build_document(
+            [known for known, _ in self._operations()],
+            title="RCE operator station",
+            description="Steers a fleet of robots: goals and blocked cells. For an ERP and for the page.",
+            error=Problem,
+        )
+
+        async def describe(request: web.Request) -> web.StreamResponse:
+            del request
+            return web.json_response(document)
+
+        app.router.add_get(f"{PREFIX}/openapi.json", describe)
+        app.router.add_get(f"{PREFIX}/live", self.live)
+        app.router.add_get("/login", self.login_page)
+        app.router.add_get("/", self.page)
+        app.router.add_static("/static", STATIC)
+        return app
+
+    def _operations(self) -> list[tuple[Operation, Handler]]:
+        return [
+            (
+                Operation(
+                    name="get_fleet",
+                    method="GET",
+                    path="/fleet",
+                    summary="The whole fleet",
+                    group="fleet",
+                    reply=FleetModel,
+                    errors=_LOOKING,
+                ),
+                self.get_fleet,
+            ),
+            (
+                Operation(
+                    name="log_in",
+                    method="POST",
+                    path="/login",
+                    summary="Log in as a user of the engine; the token comes as a cookie",
+                    group="login",
+                    body=LoginRequest,
+                    status=204,
+                    open=True,
+                    errors=(400, 401, 403, 404, 408, 413, 421, 429, 503),
+                ),
+                self.log_in,
+            ),
+            (
+                Operation(
+                    name="log_out",
+                    method="DELETE",
+                    path="/login",
+                    summary="Make the token of this request worthless",
+                    group="login",
+                    status=204,
+                    errors=(403, 421),
+                ),
+                self.log_out,
+            ),
+            (
+                Operation(
+                    name="get_person",
+                    method="GET",
+                    path="/me",
+                    summary="Who you are, and what you may do",
+                    group="fleet",
+                    reply=PersonModel,
+                    errors=_LOOKING,
+                ),
+                self.get_person,
+            ),
+            (
+                Operation(
+                    name="get_robot",
+                    method="GET",
+                    path="/robots/{robot}",
+                    summary="One robot",
+                    group="fleet",
+                    reply=RobotModel,
+                    errors=(*_LOOKING, 404),
+                ),
+                self.get_robot,
+            ),
+            (
+                Operation(
+                    name="put_goal",
+                    method="PUT",
+                    path="/robots/{robot}/goal",
+                    summary="Send a robot to a cell",
+                    group="fleet",
+                    body=GoalRequest,
+                    reply=Answer,
+                    errors=_STEERING,
+                ),
+                self.put_goal,
+            ),
+            (
+                Operation(
+                    name="put_cell",
+                    method="PUT",
+                    path="/cells/{cell}",
+                    summary="Block or free a cell",
+                    group="fleet",
+                    body=CellRequest,
+                    reply=Answer,
+                    errors=_STEERING,
+                ),
+                self.put_cell,
+            ),
+        ]
+
+    # Handlers
+
+    async def page(self, request: web.Request) -> web.StreamResponse:
+        """The page itself."""
+        del request
+        return web.FileResponse(STATIC / "index.html", headers={hdrs.CACHE_CONTROL: "no-cache"})
+
+    async def login_page(self, request: web.Request) -> web.StreamResponse:
+        """The page where people log in."""
+        del request
+        return web.FileResponse(STATIC / "login.html", headers={hdrs.CACHE_CONTROL: "no-cache"})
+
+    async def log_in(self, request: web.Request) -> web.StreamResponse:
+        """Check a password at the engine; the token goes into a cookie, never to the page."""
+        who = LoginRequest.model_validate_json(await read_whole(request))
+        token = await self._entrance.log_in(who.userID, who.password, request.remote or "")
+        response = web.Response(status=204)
+        set_cookie(response, token, secure=request.secure)
+        return response
+
+    async def log_out(self, request: web.Request) -> web.StreamResponse:
+        """Make the token worthless that the request shows."""
+        await self._entrance.log_out(shown_token(request))
+        response = web.Response(status=204)
+        response.del_cookie(COOKIE)
+        return response
+
+    async def get_person(self, request: web.Request) -> web.StreamResponse:
+        """Who asks."""
+        person = request[PERSON]
+        return _reply(
+            PersonModel(
+                name=person.name,
+                role=person.role,
+                steers=person.steers,
+                logged_in=self._entrance.has_logins,
+            )
+        )
+
+    async def get_fleet(self, request: web.Request) -> web.StreamResponse:
+        """Everything that is known of the fleet."""
+        del request
+        grid = self._view.map()
+        return _reply(
+            FleetModel(
+                map=None if grid is None else MapModel(**grid),
+                robots=[RobotModel(**robot) for robot in self._view.robots()],
+                blocked=self._view.blocked(),
+                pending=self._view.pending(),
+            )
+        )
+
+    async def get_robot(self, request: web.Request) -> web.StreamResponse:
+        """One robot."""
+        wanted = request.match_info["robot"]
+        for robot in self._view.robots():
+            if robot["id"] == wanted:
+                return _reply(RobotModel(**robot))
+        known = ", ".join(self._view.robot_ids()) or "none yet"
+        return problem(404, f"there is no robot {wanted!r}; known are: {known}")
+
+    async def put_goal(self, request: web.Request) -> web.StreamResponse:
+        """Send a robot to a cell."""
+        robot = request.match_info["robot"]
+        refusal = self._door.may_steer(request, "set_goal", robot)
+        if refusal is not None:
+            return refusal
+        wish = GoalRequest.model_validate_json(await read_whole(request))
+        message = await self._fleet.set_goal(robot, wish.cell)
+        self._door.note(request, "set_goal", robot, "stop" if wish.cell is None else f"cell {wish.cell}")
+        return _reply(Answer(message=message))
+
+    async def put_cell(self, request: web.Request) -> web.StreamResponse:
+        """Block or free a cell."""
+        number = request.match_info["cell"]
+        if not number.isdecimal() or len(number) > MAX_DIGITS or int(number) > MAX_CELL:
+            return problem(404, f"{number[:SHOWN]!r} is not the number of a cell")
+        refusal = self._door.may_steer(request, "block_cell", number)
+        if refusal is not None:
+            return refusal
+        wish = CellRequest.model_validate_json(await read_whole(request))
+        message = await self._fleet.block_cell(int(number), blocked=wish.blocked)
+        self._door.note(request, "block_cell" if wish.blocked else "free_cell", number)
+        return _reply(Answer(message=message))
+
+    async def live(self, request: web.Request) -> web.StreamResponse:
+        """Send a page what changes, until it goes."""
+        socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, compress=False)
+        await socket.prepare(request)
+        page = self._pages.open()
+        writer = asyncio.create_task(_write(socket, page))
+        watcher = asyncio.create_task(self._close_when_out(socket, request))
+        try:
+            async for message in socket:
+                if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
+                    continue
+        finally:
+            self._pages.close(page)
+            writer.cancel()
+            watcher.cancel()
+            await asyncio.gather(writer, watcher, return_exceptions=True)
+        return socket
+
+    async def _close_when_out(self, socket: web.WebSocketResponse, request: web.Request) -> None:
+        """End a page's socket when its person may not look any more."""
+        while True:
+            await asyncio.sleep(CHECK_S)
+            if not await self._door.is_still_in(request):
+                break
+        await socket.close(code=WSCloseCode.POLICY_VIOLATION, message=b"your login ended; log in again")
+
+
+async def _write(socket: web.WebSocketResponse, page: Page) -> None:
+    with contextlib.suppress(ConnectionError):
+        while True:
+            for text in await page.take():
+                await socket.send_str(text)
+            await asyncio.sleep(MIN_FRAME_S)
+
+
+@web.middleware
+async def _problems(request: web.Request, handler: Handler) -> web.StreamResponse:
+    """Turn what goes wrong into an answer that says so."""
+    try:
+        return await handler(request)
+    except ValidationError as error:
+        faults = [f"{'.'.join(map(str, fault['loc'])) or 'body'}: {fault['msg']}" for fault in error.errors()]
+        return problem(400, "; ".join(faults))
+    except EntranceError as error:
+        headers = {"Retry-After": str(error.retry_after)} if error.retry_after else None
+        return problem(error.status, str(error), headers)
+    except PlannerAwayError as error:
+        return problem(503, str(error))
+    except FleetError as error:
+        return problem(409, str(error))
+    except web.HTTPException as error:
+        kept = {"Allow": error.headers["Allow"]} if "Allow" in error.headers else None
+        return problem(error.status, error.reason, kept)
+
+
+def _reply(model: BaseModel) -> web.Response:
+    return web.Response(text=model.model_dump_json(), content_type="application/json")
