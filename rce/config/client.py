@@ -5,27 +5,23 @@ Keys are those of the RoboEarth Cloud Engine's files (``docs/protocol.md``).
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 from urllib.parse import urlsplit
 
-from pydantic import AfterValidator, BeforeValidator, Field, SecretStr, ValidationError
+from pydantic import AfterValidator, Field, SecretStr, ValidationError
 
 from rce.config import client_checks
+from rce.config.bridges import Bridge, expand
 from rce.config.documents import parse, read_file
 from rce.config.exceptions import ConfigError, Fault
+from rce.config.items import Container, Interface, Link, Name, Node, Parameter
 from rce.config.validation import Strict, faults_of
-from rce.protocol import messages
 from rce.protocol.messages import (
-    CHOICES,
-    HUMAN_PATTERNS,
     AddInterface,
-    AddNode,
     ConfigureComponents,
     ConfigureConnections,
     Connection,
-    ContainerData,
     CreateContainer,
     DeleteParam,
     DestroyContainer,
@@ -34,28 +30,9 @@ from rce.protocol.messages import (
     Request,
     SetParam,
 )
-from rce.protocol.names import InterfaceType
-from rce.protocol.quantities import read_bandwidth, read_cores, read_memory
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rce.tls.identity import Context
-
-
-def _matches(kind: Any) -> AfterValidator:
-    """Check with the rule that the protocol has for the same value."""
-    (meta,) = kind.__metadata__
-    pattern = re.compile(meta.pattern)
-
-    def check(text: str) -> str:
-        if not pattern.match(text):
-            raise ValueError(HUMAN_PATTERNS[meta.pattern])
-        if meta.max_length is not None and len(text) > meta.max_length:
-            raise ValueError(f"must have at most {meta.max_length} characters")
-        return text
-
-    return AfterValidator(check)
+    from collections.abc import Mapping
 
 
 def _check_url(url: str) -> str:
@@ -75,166 +52,6 @@ def _check_authority(text: str) -> str:
     return text
 
 
-def _check_type(text: str) -> str:
-    InterfaceType.parse(text)
-    return text
-
-
-def _check_value(value: Any) -> Any:
-    for item in value if isinstance(value, list) else [value]:
-        if not isinstance(item, bool | int | float | str):
-            raise ValueError("must be a number, a boolean, a string, or a list of such")  # noqa: TRY004 - pydantic's
-    return value
-
-
-def _check_features(value: Any) -> Any:
-    if not all(isinstance(item, str) for item in (value if isinstance(value, list) else [value])):
-        raise ValueError("must be a string or a list of strings")
-    return value
-
-
-def _quantity(read: Callable[[object], float]) -> AfterValidator:
-    """Check an amount with the reader that the protocol has for it; it stays as it was written."""
-
-    def check(value: Any) -> Any:
-        read(value)
-        return value
-
-    return AfterValidator(check)
-
-
-def _one_of(key: str) -> BeforeValidator:
-    def check(value: Any) -> Any:
-        if value not in CHOICES[key]:
-            raise ValueError(f"must be one of {', '.join(CHOICES[key])}")
-        return value
-
-    return BeforeValidator(check)
-
-
-Name = Annotated[str, _matches(messages.Name)]
-PackageName = Annotated[str, _matches(messages.PackageName)]
-Text = Annotated[str, _matches(messages.Text)]
-RosName = Annotated[str, _matches(messages.RosName)]
-ClassName = Annotated[str, _matches(messages.ClassName)]
-InterfacePath = Annotated[str, _matches(messages.InterfacePath)]
-
-
-class Container(Strict):
-    """A container to make; zero or empty means no wish."""
-
-    tag: Name = Field(alias="cTag")
-    group: Text = ""
-    group_ip: Text = Field(default="", alias="groupIp")
-    network: Annotated[Any, _one_of("network")] = ""
-    image: Text = ""
-    size: int = Field(default=1, ge=0, le=2**16)
-    """Slots of the machine."""
-    cpu: Annotated[Any, _quantity(read_cores)] = 0
-    """Cores, or a text such as ``50%``."""
-    memory: Annotated[Any, _quantity(read_memory)] = 0
-    """MB, or a text such as ``256M``."""
-    bandwidth: Annotated[Any, _quantity(read_bandwidth)] = 0
-    """Bytes per second, or a text such as ``10Mbit``."""
-    wait: bool = False
-    """Wait for room if no machine has any."""
-    special_features: Annotated[Any, AfterValidator(_check_features)] = Field(
-        default="", alias="specialFeatures"
-    )
-    """Labels that the machine must have: a list of strings, or one string of words."""
-
-    def data(self) -> ContainerData:
-        """The same as the protocol has it."""
-        return ContainerData(
-            group=self.group,
-            group_ip=self.group_ip,
-            network=self.network,
-            image=self.image,
-            size=self.size,
-            cpu=self.cpu,
-            memory=self.memory,
-            bandwidth=self.bandwidth,
-            special_features=self.special_features,
-            wait=self.wait,
-        )
-
-
-class Node(Strict):
-    """A node to start in a container."""
-
-    container: Name = Field(alias="cTag")
-    tag: Name = Field(alias="nTag")
-    pkg: PackageName
-    exe: Annotated[str, _matches(messages.Executable)]
-    args: Text = ""
-    name: Annotated[str, _matches(messages.OptionalName)] = ""
-    namespace: Annotated[str, _matches(messages.OptionalNamespace)] = ""
-    restart: Annotated[Any, _one_of("restart")] = "never"
-    """When it is started again after it ended by itself."""
-    max_restarts: int = Field(default=5, alias="maxRestarts", ge=0, lt=2**31)
-    """In a row; 0 for no limit."""
-    after: tuple[Name, ...] = Field(default=(), strict=False)
-    """Tags of nodes that must be ready before it starts."""
-    heartbeat: Annotated[str, _matches(messages.OptionalRosName)] = ""
-    """A topic that it publishes as long as it is well."""
-    heartbeat_timeout: float = Field(default=5.0, alias="heartbeatTimeout", ge=0.1, le=86400)
-    """Seconds."""
-
-    def message(self) -> AddNode:
-        """The same as the protocol has it."""
-        return AddNode(
-            container_tag=self.container,
-            node_tag=self.tag,
-            pkg=self.pkg,
-            exe=self.exe,
-            args=self.args,
-            name=self.name,
-            namespace=self.namespace,
-            restart=self.restart,
-            max_restarts=self.max_restarts,
-            after=self.after,
-            heartbeat=self.heartbeat,
-            heartbeat_timeout=self.heartbeat_timeout,
-        )
-
-
-class Parameter(Strict):
-    """A parameter to set in a container."""
-
-    container: Name = Field(alias="cTag")
-    name: RosName
-    value: Annotated[Any, AfterValidator(_check_value)]
-    """Integer, number, boolean, string, or a list of such."""
-
-
-class Interface(Strict):
-    """An interface to make."""
-
-    endpoint: Name = Field(alias="eTag")
-    tag: Name = Field(alias="iTag")
-    type: Annotated[str, AfterValidator(_check_type)] = Field(alias="iType")
-    cls: ClassName = Field(alias="iCls")
-    addr: Annotated[str, _matches(messages.OptionalRosName)] = ""
-    """ROS name of the topic or service: in the container, or (Forwarders) in the robot's own graph."""
-
-    @property
-    def path(self) -> str:
-        """``ENDPOINT/INTERFACE``."""
-        return f"{self.endpoint}/{self.tag}"
-
-    @property
-    def kind(self) -> InterfaceType:
-        """The parsed type."""
-        return InterfaceType.parse(self.type)
-
-
-class Link(Strict):
-    """Two interfaces to join."""
-
-    a: InterfacePath = Field(alias="tagA")
-    b: InterfacePath = Field(alias="tagB")
-
-
 class ClientConfig(Strict):
     """All that one robot's file says."""
 
@@ -252,7 +69,16 @@ class ClientConfig(Strict):
     nodes: tuple[Node, ...] = Field(default=(), strict=False)
     parameters: tuple[Parameter, ...] = Field(default=(), strict=False)
     interfaces: tuple[Interface, ...] = Field(default=(), strict=False)
+    """Those that the file lists, and those that its bridges need."""
     connections: tuple[Link, ...] = Field(default=(), strict=False)
+    """Those that the file lists, and those that its bridges need."""
+    bridges: tuple[Bridge, ...] = Field(default=(), strict=False)
+    """The short form of interfaces and connections."""
+
+    @property
+    def untyped(self) -> dict[int, Bridge]:
+        """The bridges without a type, by their index."""
+        return {index: bridge for index, bridge in enumerate(self.bridges) if bridge.type is None}
 
     @property
     def robot_interfaces(self) -> tuple[Interface, ...]:
@@ -330,12 +156,16 @@ def load(path: Path) -> ClientConfig:
     return loads(read_file(path), str(path))
 
 
-def loads(text: str, source: str = "config") -> ClientConfig:
+def loads(
+    text: str, source: str = "config", *, types: Mapping[int, str] | None = None, draft: bool = False
+) -> ClientConfig:
     """Read a config from text.
 
     Args:
         text: JSON or YAML.
         source: Name of the file, for errors.
+        types: Types of bridges that give none, by index.
+        draft: Leave bridges out whose type is not known, instead of refusing the file.
 
     Raises:
         ConfigError: Something is wrong in it; every fault is listed.
@@ -350,11 +180,33 @@ def loads(text: str, source: str = "config") -> ClientConfig:
     except ValidationError as error:
         config, faults = None, faults_of(error, ClientConfig)
     faults += client_checks.credential_faults(data)
-    faults += client_checks.check(client_checks.Parts.salvage(data, _ITEMS))
+    parts = client_checks.Parts.salvage(data, _ITEMS)
+    if config is not None:
+        known = types or {}
+        wiring = expand(config.bridges, known, config.robot, config.interfaces, config.connections)
+        unknown = config.untyped.keys() - known.keys()
+        faults += wiring.faults
+        if not draft:
+            faults += [Fault(f"bridges[{index}].type", _NO_TYPE) for index in sorted(unknown)]
+        parts = client_checks.Parts(
+            config.robot,
+            complete=not unknown,
+            containers=list(enumerate(config.containers)),
+            nodes=list(enumerate(config.nodes)),
+            parameters=list(enumerate(config.parameters)),
+            interfaces=list(enumerate(wiring.interfaces)),
+            connections=list(enumerate(wiring.connections)),
+            origins=wiring.origins,
+        )
+        made = {"interfaces": tuple(wiring.interfaces), "connections": tuple(wiring.connections)}
+        config = config.model_copy(update=made)
+    faults += client_checks.check(parts)
     if faults or config is None:
         raise ConfigError(source, faults)
     return config
 
+
+_NO_TYPE = "is missing; only rce-ros can read it, from the robot's ROS graph"
 
 _ITEMS: dict[str, type[Strict]] = {
     "containers": Container,

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Iterator, Mapping
     from typing import Self
 
-    from rce.config.client import Container, Interface, Link, Node, Parameter
+    from rce.config.items import Container, Interface, Link, Node, Parameter
     from rce.config.validation import Strict
 
 
@@ -35,6 +35,13 @@ class Parts:
     parameters: list[tuple[int, Parameter]] = field(default_factory=list)
     interfaces: list[tuple[int, Interface]] = field(default_factory=list)
     connections: list[tuple[int, Link]] = field(default_factory=list)
+    origins: Mapping[tuple[str, int], str] = field(default_factory=dict)
+    """Where the file asks for items that it does not list itself, by key and index."""
+
+    def place(self, key: str, index: int, field_: str = "") -> str:
+        """Say where in the file an item, or one of its fields, is."""
+        origin = self.origins.get((key, index))
+        return origin or (f"{key}[{index}].{field_}" if field_ else f"{key}[{index}]")
 
     @classmethod
     def salvage(cls, data: Mapping[str, Any], kinds: Mapping[str, type[Strict]]) -> Self:
@@ -51,6 +58,7 @@ class Parts:
                     continue  # reported with the whole document
             if key == "interfaces" and (not isinstance(items, list) or len(good) < len(items)):
                 parts.complete = False
+        parts.complete = parts.complete and not data.get("bridges")
         return parts
 
 
@@ -80,16 +88,16 @@ def _check_tags(parts: Parts) -> Iterator[Fault]:
     for index, container in parts.containers:
         if container.tag == parts.robot:
             yield Fault(f"containers[{index}].cTag", f"{container.tag!r} is the robot's own name")
-    yield from _repeated("containers", "cTag", ((i, item.tag) for i, item in parts.containers))
-    yield from _repeated("nodes", "nTag", ((i, (item.container, item.tag)) for i, item in parts.nodes))
+    yield from _repeated(parts, "containers", "cTag", ((i, item.tag) for i, item in parts.containers))
+    yield from _repeated(parts, "nodes", "nTag", ((i, (item.container, item.tag)) for i, item in parts.nodes))
     yield from _repeated(
-        "parameters", "name", ((i, (item.container, item.name)) for i, item in parts.parameters)
+        parts, "parameters", "name", ((i, (item.container, item.name)) for i, item in parts.parameters)
     )
     yield from _repeated(
-        "interfaces", "iTag", ((i, (item.endpoint, item.tag)) for i, item in parts.interfaces)
+        parts, "interfaces", "iTag", ((i, (item.endpoint, item.tag)) for i, item in parts.interfaces)
     )
     yield from _repeated(
-        "connections", "", ((i, frozenset((item.a, item.b))) for i, item in parts.connections)
+        parts, "connections", "", ((i, frozenset((item.a, item.b))) for i, item in parts.connections)
     )
     for index, node in parts.nodes:
         if node.container == parts.robot:
@@ -99,12 +107,12 @@ def _check_tags(parts: Parts) -> Iterator[Fault]:
             yield Fault(f"parameters[{index}].cTag", f"{parameter.container!r} is the robot, not a container")
 
 
-def _repeated(key: str, field_: str, items: Iterable[tuple[int, Hashable]]) -> Iterator[Fault]:
+def _repeated(parts: Parts, key: str, field_: str, items: Iterable[tuple[int, Hashable]]) -> Iterator[Fault]:
     first: dict[Hashable, int] = {}
     for index, identity in items:
         if identity in first:
-            place = f"{key}[{index}].{field_}" if field_ else f"{key}[{index}]"
-            yield Fault(place, f"is the same as in {key}[{first[identity]}]")
+            problem = f"is the same as in {parts.place(key, first[identity])}"
+            yield Fault(parts.place(key, index, field_), problem)
         first.setdefault(identity, index)
 
 
@@ -136,15 +144,16 @@ def _check_order(parts: Parts) -> Iterator[Fault]:
 def _check_interfaces(parts: Parts) -> Iterator[Fault]:
     containers = {item.tag for _, item in parts.containers}
     for index, item in parts.interfaces:
-        place = f"interfaces[{index}]"
         if item.kind.form is Form.INTERFACE:
             if not item.addr:
-                yield Fault(f"{place}.addr", f"is missing; a {item.type} needs the ROS name in the container")
+                problem = f"is missing; a {item.type} needs the ROS name in the container"
+                yield Fault(parts.place("interfaces", index, "addr"), problem)
             if item.endpoint == parts.robot:
                 problem = f"a {item.type} belongs in a container; a robot has Converters and Forwarders"
-                yield Fault(f"{place}.iType", problem)
+                yield Fault(parts.place("interfaces", index, "iType"), problem)
         elif item.endpoint in containers:
-            yield Fault(f"{place}.iType", f"a {item.type} belongs on a robot; a container has Interfaces")
+            problem = f"a {item.type} belongs on a robot; a container has Interfaces"
+            yield Fault(parts.place("interfaces", index, "iType"), problem)
 
 
 def _check_connections(parts: Parts) -> Iterator[Fault]:
@@ -152,19 +161,20 @@ def _check_connections(parts: Parts) -> Iterator[Fault]:
     ours = {item.tag for _, item in parts.containers} | {parts.robot}
     providers: dict[str, int] = {}
     for index, link in parts.connections:
-        place = f"connections[{index}]"
         for key, path in (("tagA", link.a), ("tagB", link.b)):
             item = interfaces.get(path)
             if item is None:
                 if parts.complete and path.partition("/")[0] in ours:
-                    yield Fault(f"{place}.{key}", f"there is no interface {path!r} in this file")
+                    place = parts.place("connections", index, key)
+                    yield Fault(place, f"there is no interface {path!r} in this file")
             elif item.kind.role is Role.SERVICE_PROVIDER:
                 if path in providers:
-                    other = f"connections[{providers[path]}]"
+                    other = parts.place("connections", providers[path])
                     problem = f"{path!r} takes one connection, and that is in {other}"
-                    yield Fault(f"{place}.{key}", problem)
+                    yield Fault(parts.place("connections", index, key), problem)
                 providers.setdefault(path, index)
         if link.a in interfaces and link.b in interfaces:
+            place = parts.place("connections", index)
             yield from _check_pair(place, interfaces[link.a], interfaces[link.b])
 
 
