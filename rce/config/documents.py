@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rce.config.exceptions import ConfigError, Fault
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
 _MAX_SIZE = 4 * 2**20
@@ -88,6 +88,18 @@ def _repeated_keys(value: Any, place: str) -> Iterator[Fault]:
     elif isinstance(value, list):
         for index, inner in enumerate(value):
             yield from _repeated_keys(inner, join(place, index))
+
+
+def write_items(data: Mapping[str, Any]) -> str:
+    """Write a document as JSON, with a line for each item of its lists."""
+    lines = []
+    for key, value in data.items():
+        if isinstance(value, list | tuple) and value:
+            items = ",\n".join(f"        {json.dumps(item)}" for item in value)
+            lines.append(f'    "{key}": [\n{items}\n    ]')
+        else:
+            lines.append(f'    "{key}": {json.dumps(value)}')
+    return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
 def join(place: str, step: str | int) -> str:

@@ -15,7 +15,7 @@ import typer
 import uvloop
 
 from rce.cli.tls_options import Authority
-from rce.config.client import load
+from rce.config.documents import read_file
 from rce.config.exceptions import ConfigError, ShippedFileError
 from rce.config.logs import start_logging
 from rce.config.resources import examples_dir
@@ -28,12 +28,15 @@ from rce_client.connection import CONNECTING, Connection, State
 from rce_client.exceptions import ClientError
 from rce_client.reminder import Reminder
 from rce_client.ros_bridge.bridge import build, joined_graph, wait_ready
-from rce_client.ros_bridge.plan import check, make_plan
+from rce_client.ros_bridge.explain import dot, long_form, picture
+from rce_client.ros_bridge.plan import make_plan
+from rce_client.ros_bridge.robot_file import RobotFile
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from rce.config.client import ClientConfig
+    from rce.ros.node import Node
     from rce.tls.identity import Context
     from rce_client.ros_bridge.plan import Plan
 
@@ -56,6 +59,10 @@ def bridge(
     package_path: Annotated[
         list[Path] | None, typer.Option(help="Folder with packages that define messages; may be repeated.")
     ] = None,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="Only show the long form of the file, and its wiring.")
+    ] = False,
+    as_dot: Annotated[bool, typer.Option("--dot", help="Only show the wiring, for Graphviz.")] = False,
     authority: Authority = None,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log more.")] = False,
 ) -> None:
@@ -63,33 +70,30 @@ def bridge(
     start_logging(logging.DEBUG if verbose else logging.WARNING)
     types = TypeRegistry(_packages(package_path or ()))
     try:
-        read = load(config)
-        check(read, types, str(config))
+        file = RobotFile(str(config), read_file(config), types)
+        if check_only:
+            print(summary(file.draft))  # noqa: T201
+        elif explain or as_dot:
+            read = uvloop.run(file.resolve(ros_master_uri, say))
+            print(dot(read) if as_dot else f"{long_form(read)}\n{picture(read)}")  # noqa: T201
+        else:
+            tls = client_contexts(authority or file.draft.authority_file)
+            uvloop.run(run(file, ros_master_uri, tls))
     except ConfigError as error:
         print(error, file=sys.stderr)  # noqa: T201
         raise typer.Exit(BAD_CONFIG) from error
-    plan = make_plan(read)
-    for tag in plan.unbridged:
-        say(f"interface {tag} has no addr, so nothing in the robot's ROS graph is joined to it")
-    if check_only:
-        print(summary(read, plan))  # noqa: T201
-        return
-    try:
-        tls = client_contexts(authority or read.authority_file)
-        uvloop.run(run(read, plan, types, ros_master_uri, tls))
     except (ClientError, RosError, CertificateError) as error:
         print(f"rce-ros: {error}", file=sys.stderr)  # noqa: T201
         raise typer.Exit(FAILED) from error
 
 
-async def run(
-    config: ClientConfig, plan: Plan, types: TypeRegistry, master_uri: str, tls: Context | None = None
-) -> None:
+async def run(file: RobotFile, master_uri: str, tls: Context | None = None) -> None:
     """Bridge until SIGINT or SIGTERM. A second signal ends the program at once, and leaves what it made.
 
     Raises:
         ClientError: The engine does not take this robot.
         RosError: The robot's graph does not take part.
+        ConfigError: The robot's graph does not tell the type of a bridge.
     """
     task = asyncio.current_task()
     assert task is not None
@@ -103,16 +107,24 @@ async def run(
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, on_signal, number)
     try:
-        await serve(config, plan, types, master_uri, tls)
+        await serve(file, master_uri, tls)
     except asyncio.CancelledError:
         task.uncancel()
 
 
-async def serve(
-    config: ClientConfig, plan: Plan, types: TypeRegistry, master_uri: str, tls: Context | None = None
-) -> None:
+async def serve(file: RobotFile, master_uri: str, tls: Context | None = None) -> None:
     """Bridge until cancelled or refused, then remove what was made."""
-    conn = Connection(
+    async with joined_graph(file.draft.robot, master_uri, file.types, say) as node:
+        config = await file.complete(node, say)
+        plan = make_plan(config)
+        for tag in plan.unbridged:
+            say(f"interface {tag} has no addr, so nothing in the robot's ROS graph is joined to it")
+        async with _connection(config, tls) as conn:
+            await _serve(config, plan, conn, node)
+
+
+def _connection(config: ClientConfig, tls: Context | None) -> Connection:
+    return Connection(
         config.url,
         config.user,
         config.password.get_secret_value(),
@@ -122,20 +134,22 @@ async def serve(
         on_error=lambda text: say(f"engine: {text}"),
         on_state=partial(_tell_state, Reminder()),
     )
-    async with joined_graph(config.robot, master_uri, types, say) as node, conn:
-        try:
-            await build(plan, conn, node)
-            await wait_ready(plan, conn, say)
-            print(f"rce-ros ready: robot {config.robot} connected", flush=True)  # noqa: T201
-            await conn.wait_refused()
-        except asyncio.CancelledError:
-            current = asyncio.current_task()
-            assert current is not None
-            current.uncancel()  # told to stop: what follows must not be cancelled again
-            await remove(conn)
-        except (ClientError, RosError):
-            await remove(conn)
-            raise
+
+
+async def _serve(config: ClientConfig, plan: Plan, conn: Connection, node: Node) -> None:
+    try:
+        await build(plan, conn, node)
+        await wait_ready(plan, conn, say)
+        print(f"rce-ros ready: robot {config.robot} connected", flush=True)  # noqa: T201
+        await conn.wait_refused()
+    except asyncio.CancelledError:
+        current = asyncio.current_task()
+        assert current is not None
+        current.uncancel()  # told to stop: what follows must not be cancelled again
+        await remove(conn)
+    except (ClientError, RosError):
+        await remove(conn)
+        raise
 
 
 async def remove(conn: Connection) -> None:
@@ -147,8 +161,9 @@ async def remove(conn: Connection) -> None:
         say("the engine is away; what was made there stays")
 
 
-def summary(config: ClientConfig, plan: Plan) -> str:
+def summary(config: ClientConfig) -> str:
     """Say in words what a config file asks for."""
+    plan = make_plan(config)
     lines = [f"{config.robot} of user {config.user} at {config.url}"]
     lines += [f"  container {item.tag}" for item in config.containers]
     lines += [
@@ -158,6 +173,7 @@ def summary(config: ClientConfig, plan: Plan) -> str:
     lines += [f"  parameter {item.container}: {item.name} = {item.value!r}" for item in config.parameters]
     lines += [f"  {span}" for span in plan.spans]
     lines += [f"  connection {link.a} - {link.b}" for link in config.connections]
+    lines += [f"  {bridge}: its type is read from the robot's graph" for bridge in config.untyped.values()]
     return "\n".join(lines)
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import sys
 
+from rce.config.documents import write_items
 from rce_fleet.demo.children import Children, Program
 from rce_fleet.demo.counters import Counters, read_counters
 from rce_fleet.demo.machine import RCE
 from rce_fleet.demo.play import Play
 from rce_fleet.demo.setting import START_TIMEOUT
-from rce_fleet.wiring import as_text, fleet_config, robot_config
+from rce_fleet.wiring import fleet_config, robot_config
 
 
 class Cloud:
@@ -51,9 +52,9 @@ class Cloud:
         play, account, folder = self._play, self._play.account, self._play.folder
         play.write_scene()
         fleet = fleet_config(account, play.planner_parameters)
-        (folder / "fleet.config").write_text(as_text(fleet), encoding="utf-8")
+        (folder / "fleet.config").write_text(write_items(fleet), encoding="utf-8")
         for number in range(1, len(play.scenario.robots) + 1):
-            text = as_text(robot_config(number, account))
+            text = write_items(robot_config(number, account))
             (folder / f"robot{number}.config").write_text(text, encoding="utf-8")
 
     async def _graphs(self, children: Children, world: Program) -> dict[str, str]:

@@ -7,28 +7,37 @@ from pathlib import Path
 import pytest
 
 from rce.config.client import ClientConfig, load, loads
+from rce.config.documents import write_items
 from rce.protocol.names import Role
-from rce_fleet.wiring import Account, as_text, fleet_config, robot_config
+from rce_client.ros_bridge.explain import wires
+from rce_fleet.wiring import Account, fleet_config, robot_config
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_shipped_robot_files_are_what_is_made(number: int) -> None:
-    assert (CONFIGS / f"robot{number}.config").read_text() == as_text(robot_config(number))
+    assert (CONFIGS / f"robot{number}.config").read_text() == write_items(robot_config(number))
 
 
 def test_the_shipped_operator_file_is_what_is_made() -> None:
-    assert (CONFIGS / "fleet.config").read_text() == as_text(fleet_config())
+    assert (CONFIGS / "fleet.config").read_text() == write_items(fleet_config())
 
 
-@pytest.mark.parametrize("name", ["test", "robot1", "robot2", "robot3", "fleet"])
+@pytest.mark.parametrize("name", ["test", "robot1-long", "robot1", "robot2", "robot3", "fleet"])
 def test_shipped_files_are_valid(name: str) -> None:
     load(CONFIGS / f"{name}.config")
 
 
+def test_the_long_form_says_the_same_as_the_short_one() -> None:
+    long, short = (load(CONFIGS / f"{name}.config") for name in ("robot1-long", "robot1"))
+    assert not long.bridges
+    assert set(wires(long)) == set(wires(short))
+    assert (long.containers, long.nodes) == (short.containers, short.nodes)
+
+
 def made(number: int) -> ClientConfig:
-    return loads(as_text(robot_config(number, Account(url="http://cloud:1/", user="u"))))
+    return loads(write_items(robot_config(number, Account(url="http://cloud:1/", user="u"))))
 
 
 @pytest.mark.parametrize("number", [1, 12, 100])

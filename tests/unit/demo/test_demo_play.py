@@ -6,13 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from rce.config.client import loads
+from rce.config.documents import write_items
 from rce_fleet.demo.bus import received
 from rce_fleet.demo.floor import draw
 from rce_fleet.demo.machine import node_names, planner_argv, world_argv
 from rce_fleet.demo.multi import PLANNER, sync_argv
 from rce_fleet.demo.play import Play
 from rce_fleet.demo.ports import Ports
-from rce_fleet.wiring import as_text, fleet_config
+from rce_fleet.wiring import fleet_config
 
 PLAY = Play(draw(3, 0), 0, Ports(), Path("/folder"))
 
@@ -22,7 +23,7 @@ def test_the_planner_is_not_told_of_hidden_boxes() -> None:
     assert parameters["walls"] == sorted(scenario.grid.blocked)
     assert parameters["blocked"] == list(scenario.known_boxes)
     assert not {*parameters["walls"], *parameters["blocked"]}.intersection(scenario.hidden_boxes)
-    loads(as_text(fleet_config(None, parameters)))
+    loads(write_items(fleet_config(None, parameters)))
 
 
 def test_the_planner_gets_its_parameters_on_its_command_line() -> None:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 from rce.config.client import loads
+from rce.config.documents import write_items
 from rce.protocol.messages import ConfigureComponents, RemoveNode
 from rce_fleet.station.respawn import repairs
 from rce_fleet.station.wishes import CellWish, GoalWish, Wishes
-from rce_fleet.wiring import as_text, fleet_config
+from rce_fleet.wiring import fleet_config
 
-CONFIG = loads(as_text(fleet_config()))
+CONFIG = loads(write_items(fleet_config()))
 
 
 def state(

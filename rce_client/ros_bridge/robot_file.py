@@ -1,0 +1,60 @@
+"""A robot's file as ``rce-ros`` reads it: what it leaves out, the robot's ROS graph knows."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rce.config.client import loads
+from rce_client.ros_bridge.bridge import joined_graph
+from rce_client.ros_bridge.plan import check
+from rce_client.ros_bridge.type_lookup import find_types
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rce.config.client import ClientConfig
+    from rce.ros.node import Node
+    from rce.ros.types import TypeRegistry
+
+
+class RobotFile:
+    """A robot's file, of which types may be known to the robot's graph only.
+
+    Args:
+        source: Its name, for errors.
+        text: What it says.
+        types: The message types that are known here.
+
+    Attributes:
+        draft: The file without the bridges whose types are to be found out.
+
+    Raises:
+        ConfigError: Something is wrong in it.
+    """
+
+    def __init__(self, source: str, text: str, types: TypeRegistry) -> None:
+        self.types = types
+        self._source = source
+        self._text = text
+        self.draft = loads(text, source, draft=True)
+        check(self.draft, types, source)
+
+    async def resolve(self, master_uri: str, say: Callable[[str], None]) -> ClientConfig:
+        """Return the whole file, for which the robot's graph is asked if it must be.
+
+        Raises:
+            ConfigError: A type cannot be found out, or does not fit.
+        """
+        if not self.draft.untyped:
+            return self.draft
+        async with joined_graph(self.draft.robot, master_uri, self.types, say) as node:
+            return await self.complete(node, say)
+
+    async def complete(self, node: Node, say: Callable[[str], None]) -> ClientConfig:
+        """Do the same with a node that is in the robot's graph already."""
+        if not self.draft.untyped:
+            return self.draft
+        found = await find_types(self.draft.untyped, node, self._source, say)
+        config = loads(self._text, self._source, types=found)
+        check(config, self.types, self._source)
+        return config
