@@ -11,11 +11,11 @@ from support.fuzzing import Tracebacks, answers_of
 from support.master_program import master
 
 from rce.web.server import HttpServer
-from rce_client.station.engine_entrance import EngineAccount, EngineEntrance
-from rce_client.station.fleet_link import FleetError, FleetLink
-from rce_client.station.live import Broadcast
-from rce_client.station.server import Station
-from rce_client.station.view import FleetView
+from rce_fleet.station.engine_entrance import EngineAccount, EngineEntrance
+from rce_fleet.station.fleet_link import FleetError, FleetLink
+from rce_fleet.station.live import Broadcast
+from rce_fleet.station.server import Station
+from rce_fleet.station.view import FleetView
 
 if TYPE_CHECKING:
     from pathlib import Path
