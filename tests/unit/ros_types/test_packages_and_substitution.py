@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import xml
 from collections.abc import Callable, Iterator
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
@@ -166,12 +167,12 @@ def test_distributions_add_nodes_that_are_functions(distributed: Callable[..., N
 
 def test_distributions_add_packages_with_nodes_that_are_scripts(distributed: Callable[..., None]) -> None:
     distributed(
-        ("rce.packages", "shop", "json"),
+        ("rce.packages", "shop", "xml"),
         ("rce.nodes", "shop:tool.py", "json.tool"),
         ("rce.packages", "bad", "no.x"),
     )
     found = PackageIndex([]).find("shop")
-    assert found.path == Path(json.__file__).parent
+    assert found.path == Path(xml.__file__).parent
     script = Path(json.__file__).parent / "tool.py"
     assert found.executable("tool.py") == [sys.executable, str(script)]
     with pytest.raises(BadPackage, match=r"entry point no\.x"):
