@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import compileall
+import contextlib
 import os
 import shutil
 import stat
@@ -197,9 +198,10 @@ class NamespaceRuntime(Runtime):
                     async with asyncio.timeout(_PROBE_TIMEOUT_S):
                         await handle.launch()
                 except StartError as error:
-                    words = (
-                        segment_path(folder.logs, ENVIRONMENT_LOG, 0).read_text(errors="replace").splitlines()
-                    )
+                    words: list[str] = []
+                    with contextlib.suppress(OSError):  # the shim may have removed it already
+                        log = segment_path(folder.logs, ENVIRONMENT_LOG, 0)
+                        words = log.read_text(errors="replace").splitlines()
                     raise StartError("; ".join([str(error), *words[-1:]])) from error
                 finally:
                     await handle.kill()

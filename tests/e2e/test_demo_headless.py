@@ -12,7 +12,7 @@ import aiohttp
 import psutil
 import pytest
 from support.demo import clean_folder, environment, run_headless, running_demo
-from support.engine import engine_processes, until
+from support.engine import command_line, engine_processes, until
 
 from rce_fleet.demo.exceptions import StationAwayError
 from rce_fleet.demo.floor import draw
@@ -103,7 +103,7 @@ async def test_a_run_that_is_too_short_says_so() -> None:
 
 async def test_a_program_that_dies_ends_the_demo_and_is_named() -> None:
     async with running_demo("--robots", 1, "--runtime", "process", "--no-auto") as demo:
-        (world,) = [p for p in engine_processes(demo.folder) if "rce_fleet.drivers" in p.cmdline()]
+        (world,) = [p for p in engine_processes(demo.folder) if "rce_fleet.drivers" in command_line(p)]
         world.kill()
         assert await asyncio.wait_for(demo.process.wait(), 40) == 1
         assert "world was ended by SIGKILL" in demo.output()
@@ -150,7 +150,7 @@ async def test_robots_go_on_when_parts_of_the_engine_are_killed(runtime: str) ->
             victims = [
                 process
                 for process in psutil.Process(demo.process.pid).children(recursive=True)
-                if part in process.cmdline()
+                if part in command_line(process)
             ]
             assert victims, part
             victims[0].kill()
@@ -182,7 +182,7 @@ async def test_a_planner_that_is_killed_comes_back_and_knows_what_was_wanted() -
         (planner,) = [
             process
             for process in psutil.Process(demo.process.pid).children(recursive=True)
-            if process.cmdline()[-1:] and process.cmdline()[-1].endswith("fleet_planner.py")
+            if " ".join(command_line(process)).endswith("fleet_planner.py")
         ]
         planner.kill()
         await until(lambda: states(station, "arrived"), timeout=90, what="the robot is at its goal")

@@ -12,7 +12,7 @@ from typing import Any
 import aiohttp
 import psutil
 import pytest
-from support.demo import run_headless, running_demo
+from support.demo import kill_program, run_headless, running_demo
 from support.engine import engine_processes, until
 from support.ports import free_port
 
@@ -135,7 +135,7 @@ async def test_a_killed_planner_and_a_killed_move_client_come_back(mode: str) ->
             (("move_client.py", "__ns:=Robot1"), cells[-1]),
         ):
             await _send(station, "Robot1", cell)
-            _kill(demo.process.pid, *words)
+            kill_program(demo.process.pid, *words)
             await until(
                 lambda cell=cell: _arrives(station, "Robot1", cell),  # type: ignore[misc]
                 timeout=80,
@@ -163,17 +163,6 @@ async def _arrives(station: StationApi, robot: str, cell: int) -> bool:
             for one in (await station.fleet()).robots
         )
     return False
-
-
-def _kill(demo: int, *words: str) -> None:
-    """Kill the one program of a demo whose command line holds all words."""
-    found = []
-    for child in psutil.Process(demo).children():
-        with contextlib.suppress(psutil.ZombieProcess):
-            line = " ".join(child.cmdline())
-            found += [child] if all(word in line for word in words) else []
-    assert len(found) == 1, words
-    found[0].kill()
 
 
 async def _state(station: StationApi) -> str:

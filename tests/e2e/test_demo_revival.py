@@ -4,32 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import TYPE_CHECKING
 
 import aiohttp
-import psutil
 import pytest
-from support.demo import running_demo
+from support.demo import kill_program, running_demo
 from support.engine import until
 
 from rce_fleet.demo.exceptions import StationError
 from rce_fleet.demo.station import StationApi
 
-if TYPE_CHECKING:
-    from support.demo import Demo
-
 pytestmark = [pytest.mark.e2e]
-
-
-def kill(demo: Demo, *words: str) -> None:
-    """Kill the one program of the demo whose command line holds all words."""
-    found = []
-    for child in psutil.Process(demo.process.pid).children():
-        with contextlib.suppress(psutil.NoSuchProcess):
-            line = " ".join(child.cmdline())
-            found += [child] if all(word in line for word in words) else []
-    assert len(found) == 1
-    found[0].kill()
 
 
 async def reaches(station: StationApi, robot: str, cell: int) -> None:
@@ -53,14 +37,14 @@ async def test_killed_bridge_and_station_come_back_and_a_killed_world_is_named()
         assert fleet.map is not None
         taken = {one.cell for one in fleet.robots} | set(fleet.blocked)
         cells = [cell for cell in range(fleet.map.rows * fleet.map.columns) if cell not in taken]
-        kill(demo, "rce_client.ros_bridge", f"{robot.id.lower()}.config")
-        kill(demo, "rce_fleet.station")
+        kill_program(demo.process.pid, "rce_client.ros_bridge", f"{robot.id.lower()}.config")
+        kill_program(demo.process.pid, "rce_fleet.station")
         await until(
             lambda: demo.output().count("was ended by SIGKILL; it is started again") == 2,
             timeout=30,
             what="the demo tells what it starts again",
         )
         await reaches(station, robot.id, cells[0])
-        kill(demo, "rce_fleet.drivers")
+        kill_program(demo.process.pid, "rce_fleet.drivers")
         assert await asyncio.wait_for(demo.process.wait(), 60) == 1
         assert "rce demo: world was ended by SIGKILL" in demo.output()

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.engine import Engine, Program, running_engine, until
+from support.engine import Engine, Program, command_line, running_engine, until
 from support.ros_real import Graph, real_graph
 from support.stranger import Stranger, stranger
 
@@ -122,7 +122,7 @@ class World:
         await self.graph.says(listener, topic, str(len(texts)), text=expected)
 
     def nodes(self, name: str) -> list[Any]:
-        return [p for p in self.engine.processes_of("latcher.py") if name in p.cmdline()]
+        return [p for p in self.engine.processes_of("latcher.py") if name in command_line(p)]
 
 
 @contextlib.asynccontextmanager

@@ -19,7 +19,7 @@ from typing import Any
 import aiohttp
 import pytest
 import pytest_asyncio
-from support.engine import engine_processes, free_ports, until
+from support.engine import command_line, engine_processes, free_ports, until
 
 from rce.ros.core import Core
 from rce.tls import authority
@@ -585,7 +585,7 @@ async def test_rce_ros_outlives_faults_of_the_certificate(
                 assert b"rce-ros ready: robot patient" in await process.stdout.readline()
             folder.issue("engine", hosts, days=-1)
             (endpoint,) = (
-                found for found in engine_processes(world.folder) if "rce_robot" in found.cmdline()
+                found for found in engine_processes(world.folder) if "rce_robot" in command_line(found)
             )
             endpoint.kill()
             await told("the server's certificate has expired; renew it there")

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from support.engine import Program, engine_processes, until
+from support.engine import Program, command_line, engine_processes, until
 from support.leaks import sweep_cgroups
 from support.ports import free_ports
 from support.stranger import check_echo, stranger, wire_echo
@@ -53,7 +53,7 @@ async def rce_up(folder: Path, ports: list[int], *arguments: str) -> AsyncIterat
 def pid_of(folder: Path, module: str) -> int | None:
     for process in engine_processes(folder):
         with contextlib.suppress(psutil.NoSuchProcess, psutil.ZombieProcess):
-            if process.cmdline()[1:4] == ["-P", "-m", module]:
+            if command_line(process)[1:4] == ["-P", "-m", module]:
                 return process.pid
     return None
 

@@ -15,8 +15,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from rce_fleet.demo.ports import Ports, option_of
-from support.engine import engine_processes, until
+from support.engine import command_line, engine_processes, until
 from support.leaks import sweep_cgroups
 from support.ports import free_ports
 from support.processes import finish
@@ -132,3 +134,19 @@ async def running_demo(*options: object) -> AsyncIterator[Demo]:
                 process.kill()
                 await process.wait()
             log.unlink()
+
+
+def kill_program(demo: int, *words: str) -> None:
+    """Kill the one program of a demo whose command line holds all words.
+
+    Args:
+        demo: The demo's pid.
+        words: Parts of the command line.
+    """
+    found = [
+        child
+        for child in psutil.Process(demo).children()
+        if all(word in " ".join(command_line(child)) for word in words)
+    ]
+    assert len(found) == 1, words
+    found[0].kill()

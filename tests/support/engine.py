@@ -239,6 +239,14 @@ class Engine:
         return found
 
 
+def command_line(process: psutil.Process) -> list[str]:
+    """The command line of a process; empty once it has ended."""
+    try:
+        return process.cmdline()
+    except (psutil.NoSuchProcess, psutil.ZombieProcess):
+        return []
+
+
 def engine_processes(folder: Path) -> list[psutil.Process]:
     """All processes that an engine with this folder started, whoever their parent is, and their children."""
     found: dict[int, psutil.Process] = {}

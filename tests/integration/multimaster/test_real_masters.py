@@ -9,7 +9,9 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
+import psutil
 import pytest
+from support.engine import command_line
 from support.multimaster import STRING, Neighbourhood, node, process, real_master, ros_environment
 from support.ports import free_port, free_ports
 
@@ -141,13 +143,9 @@ async def test_a_killed_master_is_left_and_found_again(neighbourhood: Neighbourh
 
 
 def _kill_master(port: int) -> None:
-    import psutil
-
-    (found,) = [
-        child
-        for child in psutil.Process().children(recursive=True)
-        if "rosmaster" in " ".join(child.cmdline()) and str(port) in child.cmdline()
-    ]
+    children = psutil.Process().children(recursive=True)
+    lines = {child: command_line(child) for child in children}
+    (found,) = [child for child, line in lines.items() if "rosmaster" in " ".join(line) and str(port) in line]
     found.send_signal(signal.SIGKILL)
 
 
