@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import typer
 
 from rce import __version__
+from rce.cli.streams import open_missing_streams
 from rce.extras import missing_for
 
 if TYPE_CHECKING:
@@ -84,6 +85,7 @@ def _add_unavailable(app: typer.Typer, name: str, problem: str) -> None:
 
 def main() -> None:
     """Run the ``rce`` program. A command that is named first is the only one that gets imported."""
+    open_missing_streams()
     points = sorted(entry_points(group=GROUP), key=lambda point: point.name)
     asked = [point for point in points if point.name == sys.argv[1]] if len(sys.argv) > 1 else []
     build_app(asked or points)(prog_name="rce")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 
+from rce.cli.streams import open_missing_streams
 from rce.extras import missing_for
 
 
@@ -24,6 +25,7 @@ def container() -> None:
 
 
 def _run(program: str, package: str) -> None:
+    open_missing_streams()
     if problem := missing_for(package):
         sys.exit(f"{program}: {problem}")
     import_module(f"{package}.__main__").main()

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 import uvloop
 
+from rce.cli.streams import open_missing_streams
 from rce.cli.tls_options import Authority
 from rce.config.documents import read_file
 from rce.config.exceptions import ConfigError, ShippedFileError
@@ -198,6 +199,7 @@ def _packages(given: Iterable[Path]) -> PackageIndex:
 
 def main() -> None:
     """Run the program."""
+    open_missing_streams()
     app()
 
 

@@ -49,6 +49,11 @@ class _Order:
     parts: Sequence[Buffer]
     answer: asyncio.Future[tuple[Result, list[memoryview]]]
 
+    def refuse(self, _: object = None) -> None:
+        """Tell the one who waits that the pool is closed, if there was no answer yet."""
+        if not self.answer.done():
+            self.answer.set_exception(ConversionFailed("the robot endpoint is shutting down"))
+
 
 class ConversionPool:
     """The worker processes of an endpoint.
@@ -107,8 +112,7 @@ class ConversionPool:
         self._closed = True
         for orders in self._waiting.values():
             for order in orders:
-                if not order.answer.done():
-                    order.answer.set_exception(ConversionFailed("the robot endpoint is shutting down"))
+                order.refuse()
         self._waiting.clear()
         for task in self._tasks:
             task.cancel()
@@ -141,6 +145,7 @@ class ConversionPool:
             task = asyncio.get_running_loop().create_task(self._serve(worker, order))
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
+            task.add_done_callback(order.refuse)  # a task cancelled before its first step did not
 
     def _next(self) -> _Order | None:
         """Take the next order, user by user in turn."""
@@ -168,8 +173,7 @@ class ConversionPool:
             if not order.answer.done():
                 order.answer.set_exception(ConversionFailed(str(error)))
         finally:
-            if not order.answer.done():
-                order.answer.set_exception(ConversionFailed("the robot endpoint is shutting down"))
+            order.refuse()
             self._running -= Counter([order.user])
             if sound and not self._closed:
                 loop = asyncio.get_running_loop()
