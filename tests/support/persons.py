@@ -104,6 +104,6 @@ def _copy_engine(folder: Path) -> str:
     if subprocess.run(["cp", "-al", source, site], capture_output=True, check=False).returncode:
         shutil.rmtree(site, ignore_errors=True)
         subprocess.run(["cp", "-a", source, site], check=True)
-    for name in ("rce", "rce_container", "examples", "configs", "tests/support"):
+    for name in ("rce", "rce_container", "rce_fleet", "examples", "configs", "tests/support"):
         shutil.copytree(ROOT / name, folder / "source" / name, ignore=shutil.ignore_patterns("__pycache__"))
     return str(folder / "venv" / "bin" / "python")
