@@ -253,6 +253,12 @@ class Machine:
 
         return await until(found, what=f"{id_}/{tag} is {state.value} (faults: {self.faults})")
 
+    async def node_pid(self, id_: str, tag: str) -> int:
+        """Wait until the pid of a node's process is reported. It may start yet: not all nodes register."""
+        return await until(
+            lambda: (node := self.node(id_, tag)) and node.pid, what=f"the pid of {id_}/{tag} is told"
+        )
+
     async def log(self, id_: str, node: str, offset: int = 0) -> str:
         request = ReadLog(request=1, id=id_, node=node, offset=offset, limit=1 << 20)
         return (await self.read_log(request)).text

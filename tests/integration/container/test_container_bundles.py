@@ -139,7 +139,7 @@ async def test_a_new_version_comes_while_nodes_run(shop: Machine) -> None:
         new = offer(shop, "nav", "1.10", nodes__run=SAY.format(text="new"))
         await shop.put(BOX, nodes=(node("nav"),), bundles=(old,))
         await shop.log_holds(BOX, "node", "old")
-        before = await until(lambda: shop.node(BOX, "node").pid, what="its process is told")
+        before = await shop.node_pid(BOX, "node")
         nodes = (node("nav"), node("nav", tag="newer"), node("nav@1.0", tag="fixed"))
         await shop.put(BOX, 2, nodes=nodes, bundles=(old, new))
         await shop.log_holds(BOX, "newer", "new")
@@ -154,7 +154,7 @@ async def test_a_new_manager_goes_on_where_the_old_one_was(shop: Machine) -> Non
         nodes = (node("nav"), node("late", tag="late"))
         await shop.put(BOX, nodes=nodes, bundles=(nav, late))
         await shop.log_holds(BOX, "node", "here")
-        before = (await shop.node_is(BOX, "node", NodeState.RUNNING)).pid
+        before = await shop.node_pid(BOX, "node")
         await shop.node_is(BOX, "late", NodeState.WAITING)
     (shop.folder / "bundles" / "incoming" / "half").mkdir(parents=True)
     shop.library.open()

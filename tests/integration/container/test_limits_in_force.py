@@ -92,7 +92,7 @@ async def test_who_takes_too_much_memory_dies_alone(packages: Machine) -> None:
         assert died.detail.startswith(OUT_OF_MEMORY)
         assert any(OUT_OF_MEMORY in fault for fault in machine.faults)
         await machine.log_holds(OTHER, "hog", "has all")
-        pid = (await machine.node_is(BOX, "talk", NodeState.RUNNING)).pid
+        pid = await machine.node_pid(BOX, "talk")
         seen = await until(lambda: (one := usage(machine, BOX)) and one.oom_kills and one)
         assert (seen.oom_kills, seen.memory_limit) == (1, 64 * MB)
         assert 50 * MB < seen.memory_peak <= 64 * MB
@@ -233,7 +233,7 @@ async def test_nodes_die_before_their_environment_and_both_before_the_engine(pac
     async with machine.engine():
         await machine.put(BOX, nodes=(NodeSpec(tag="talk", pkg="own", exe="talk.py"),))
         await machine.log_holds(BOX, "talk", "hello")
-        node = (await machine.node_is(BOX, "talk", NodeState.RUNNING)).pid
+        node = await machine.node_pid(BOX, "talk")
         environment = machine.environment().pid
         scores = [int(Path(f"/proc/{pid}/oom_score_adj").read_text()) for pid in (node, environment)]
         assert scores == [600, 300]
