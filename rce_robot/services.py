@@ -133,6 +133,7 @@ class AnsweredByRobot(RobotInterface):
             raise CallTimeout(f"the robot did not answer within {self._timeout:g} s") from error
         finally:
             del self._calls[msg_id]
+            del answer  # its error refers to this frame, and so to the request, until the collector comes
 
     def take(self, message: DataMessage) -> None:
         """Complete a call. A string in place of ``msg`` is the robot's word for why it failed."""

@@ -159,6 +159,7 @@ class Channel:
         finally:
             if self._calls.drop(call_id) and not carrier.withdraw(queue, call_id):
                 carrier.control(Frame(FrameType.CANCEL, self.number, call_id))
+            del answer  # its error refers to this frame, and so to the request, until the collector comes
 
     def reply(self, call_id: int, answer: Buffer) -> None:
         """Send the answer to a request."""

@@ -106,6 +106,7 @@ class ConversionPool:
             return await order.answer
         finally:
             self._withdraw(order)
+            del order  # its error refers to this frame, and so to the message, until the collector comes
 
     async def close(self) -> None:
         """End all processes; what waits fails."""
