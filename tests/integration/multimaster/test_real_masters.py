@@ -15,6 +15,8 @@ from support.engine import command_line
 from support.multimaster import STRING, Neighbourhood, node, process, real_master, ros_environment
 from support.ports import free_port, free_ports
 
+from rce.ros.node import Publisher
+
 TALKER = """
 import rospy
 from std_msgs.msg import String
@@ -50,6 +52,15 @@ async def heard(program: asyncio.subprocess.Process, text: str) -> None:
             pass
 
 
+async def say_until_heard(orders: Publisher, program: asyncio.subprocess.Process, text: str) -> None:
+    """Say it again and again: a discovery that hears nothing for a while lets go of subscribers."""
+    hearing = asyncio.ensure_future(heard(program, text))
+    while not hearing.done():
+        orders.publish(data=text)
+        await asyncio.wait([hearing], timeout=0.2)
+    await hearing
+
+
 @pytest.mark.needs("rospy")
 @pytest.mark.parametrize("both_real", [False, True])
 async def test_rospy_nodes_at_a_real_master(
@@ -69,11 +80,7 @@ async def test_rospy_nodes_at_a_real_master(
         async with asyncio.timeout(90):
             assert (await anext(aiter(said))).data == "from rospy"
             await orders.wait_for_subscribers()
-        hearing = asyncio.ensure_future(heard(listener, "go"))
-        while not hearing.done():  # a discovery that hears nothing for a while lets go of subscribers
-            orders.publish(data="go")
-            await asyncio.wait([hearing], timeout=0.2)
-        await hearing
+        await say_until_heard(orders, listener, "go")
 
 
 @asynccontextmanager
@@ -98,8 +105,7 @@ async def test_rospy_listens_again_after_its_talker_was_lost_for_a_while(
     ):
         orders = await ours.advertise("orders", STRING)
         await orders.wait_for_subscribers(timeout=40)
-        orders.publish(data="one")
-        await heard(listener, "one")
+        await say_until_heard(orders, listener, "one")
         with far.discovery.watch() as events:
             send = near.discovery._socket.send_to
             near.discovery._socket.send_to = lambda *_: None  # type: ignore[method-assign] # the network is gone
@@ -113,8 +119,7 @@ async def test_rospy_listens_again_after_its_talker_was_lost_for_a_while(
                 while not far.sync.registrar.held:
                     await asyncio.sleep(0.05)
                 await orders.wait_for_subscribers()
-        orders.publish(data="two")
-        await heard(listener, "two")
+        await say_until_heard(orders, listener, "two")
 
 
 @pytest.mark.needs("rospy")
