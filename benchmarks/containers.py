@@ -19,12 +19,12 @@ ENGINE_KINDS = {
     "rce-master": "-m rce_master",
     "rce-robot": "-m rce_robot",
     "rce-container": "-m rce_container --settings",
-    "fork server": "-m rce_container.nursery",
+    "fork server": "-m rce_container.forkserver",
 }
 """What a process is called, and what its command line holds; of two that fit the later counts."""
 CONTAINER_KINDS = {
     "environment": "rce_container.environment",
-    "cradle": "rce_container.nursery.cradle",
+    "node fork server": "rce_container.forkserver.nodes",
     "echo node": "stringEcho.py",
     "bwrap": "bwrap",
     "holder": "read -r word",

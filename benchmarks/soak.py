@@ -39,7 +39,7 @@ PROGRAMS = {
     "master": "rce_master",
     "robot": "rce_robot",
     "manager": "rce_container",
-    "nursery": "rce_container.nursery",
+    "fork server": "rce_container.forkserver",
 }
 FLOOD = f"""
 import os, sys, time

@@ -37,7 +37,7 @@ from rce_container.environment import messages as m
 from rce_container.environment import proc
 from rce_container.environment.channel import connect
 from rce_container.environment.exceptions import ChannelError
-from rce_container.environment.process import strike_all
+from rce_container.environment.process import kill_marked
 from rce_container.exceptions import ContainerError, ExecutionError, NetworkError, StateError
 from rce_container.executions import Executions
 from rce_container.folder import ContainerFolder
@@ -221,7 +221,7 @@ class Manager:
         record = folder.read_record()
         process = proc.read(record.pid) if record is not None else None
         runtime = self._runtimes.get(record.runtime, self._runtime) if record is not None else self._runtime
-        if record is None or process is None or process.start != record.start or runtime.is_unborn(record):
+        if record is None or process is None or process.start != record.start or runtime.is_starting(record):
             self._tasks.create_task(self._prune(folder), name=f"prune {folder.mark}")
             return
         if record.group:
@@ -254,7 +254,7 @@ class Manager:
                         pass
             finally:
                 channel.close()
-        await strike_all(folder.mark)
+        await kill_marked(folder.mark)
         await self._launcher.undo(folder.mark)
         await asyncio.to_thread(folder.remove)
         await asyncio.to_thread(self._state.archive.settle_one, folder.mark, time.time())

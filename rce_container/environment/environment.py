@@ -36,14 +36,14 @@ from rce_container.environment.executions import Executions
 from rce_container.environment.interfaces import InterfaceMaker, Readiness
 from rce_container.environment.logs.rosout import RosoutLog
 from rce_container.environment.nodes.causes import Causes
-from rce_container.environment.nodes.cradle import Cradle
+from rce_container.environment.nodes.fork_server import NodeForkServer
 from rce_container.environment.nodes.heartbeats import Heartbeats
 from rce_container.environment.nodes.launch import OWN_NODE
 from rce_container.environment.nodes.node_life import Workshop
 from rce_container.environment.nodes.node_set import NodeSet
 from rce_container.environment.nodes.reaper import Reaper
 from rce_container.environment.parameters import Values, difference, evaluate_all
-from rce_container.environment.process import strike_all
+from rce_container.environment.process import kill_marked
 from rce_container.environment.reach import Operator
 
 log = logging.getLogger(__name__)
@@ -62,16 +62,20 @@ class Environment:
         boot: What the manager says of the container.
         control: A listening unix socket; managers connect to it.
         links: A listening unix socket; peers' links come in on it.
-        cradle: Starts nodes that are Python scripts; None for none.
+        node_server: Starts nodes that are Python scripts; None for none.
     """
 
     def __init__(
-        self, boot: m.Boot, control: socket.socket, links: socket.socket, cradle: Cradle | None = None
+        self,
+        boot: m.Boot,
+        control: socket.socket,
+        links: socket.socket,
+        node_server: NodeForkServer | None = None,
     ) -> None:
         self._boot = boot
         self._control = control
         self._links = links
-        self._cradle = cradle
+        self._node_server = node_server
         self._loop = asyncio.get_running_loop()
         self._ending = asyncio.Event()
         self._end_reason = ""
@@ -95,7 +99,7 @@ class Environment:
     async def run(self) -> None:
         """Live; returns when every process, socket and task of the container has ended."""
         async with contextlib.AsyncExitStack() as stack:
-            reaper = stack.enter_context(Reaper(self._cradle))
+            reaper = stack.enter_context(Reaper(self._node_server))
             self._executions = Executions(reaper, self._environ, self._boot.mark, self._boot.home)
             self._core = await stack.enter_async_context(self._make_core())
             types = TypeRegistry(self._packages)
@@ -149,7 +153,7 @@ class Environment:
         await self._endpoint.close()
         await self._nodes.close()
         if not self._boot.isolated:
-            await strike_all(self._boot.mark)
+            await kill_marked(self._boot.mark)
         self._report()
         if self._handover is not None:
             await self._handover.close()

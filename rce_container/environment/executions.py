@@ -16,7 +16,7 @@ from rce.control.execution import MAX_DATA, NOT_RUN, Command, Frame, Part, decod
 from rce_container.environment.descriptors import read_some, write_all
 from rce_container.environment.nodes.launch import NODE_MARK
 from rce_container.environment.nodes.reaper import Child, Reaper
-from rce_container.environment.process import strike_all
+from rce_container.environment.process import kill_marked
 
 log = logging.getLogger(__name__)
 
@@ -104,7 +104,7 @@ class Executions:
                 return await _Conversation(child, streams, sock).hold(mark)
             finally:
                 child.signal_group(signal.SIGKILL)
-                await strike_all(mark, variable=NODE_MARK)
+                await kill_marked(mark, variable=NODE_MARK)
 
 
 async def _part(sock: socket.socket) -> None:
@@ -211,7 +211,7 @@ class _Conversation:
             if not self._child.ended.done():
                 await self._hang_up()
             # What it left running in the background would keep its streams open.
-            await strike_all(mark, variable=NODE_MARK)
+            await kill_marked(mark, variable=NODE_MARK)
             await asyncio.wait(outputs, timeout=REST_S)
         finally:
             tasks = (*outputs, listening)

@@ -27,7 +27,7 @@ _STRIKES = 100
 _STRIKE_PAUSE_S = 0.02
 
 
-def keep_to_oneself() -> None:
+def set_undumpable() -> None:
     """Keep other processes of the same user, the container's nodes, from looking into this one.
 
     It holds the sockets of the container's control and links and the links' tokens.
@@ -35,7 +35,7 @@ def keep_to_oneself() -> None:
     _prctl(_PR_SET_DUMPABLE, 0)
 
 
-def die_before_others(score: int, pid: int | None = None) -> None:
+def set_oom_score(score: int, pid: int | None = None) -> None:
     """Offer this process, or another one, to the kernel for the time when memory has run out.
 
     Args:
@@ -53,7 +53,7 @@ def die_before_others(score: int, pid: int | None = None) -> None:
             return
 
 
-def limit_oneself(rlimits: Mapping[int, int]) -> None:
+def set_rlimits(rlimits: Mapping[int, int]) -> None:
     """Limit this process and each one that it starts, as far as it is not limited further already.
 
     Args:
@@ -65,13 +65,13 @@ def limit_oneself(rlimits: Mapping[int, int]) -> None:
             resource.setrlimit(number, (limit, limit))
 
 
-def take_in_orphans() -> None:
+def become_subreaper() -> None:
     """Become the parent of what descendants leave behind, and end when the own parent ends."""
     _prctl(_PR_SET_CHILD_SUBREAPER, 1)
     _prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
-async def strike_all(mark: str, *, variable: str = proc.MARK) -> bool:
+async def kill_marked(mark: str, *, variable: str = proc.MARK) -> bool:
     """Kill -9 all that carries a mark, and what that forks meanwhile.
 
     Returns:

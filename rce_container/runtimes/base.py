@@ -178,7 +178,7 @@ class Runtime(ABC):
             StartError: It cannot be started.
         """
 
-    def is_unborn(self, record: Record) -> bool:  # noqa: ARG002
+    def is_starting(self, record: Record) -> bool:  # noqa: ARG002
         """Whether the manager that noted this died before it had noted the environment."""
         return False
 

@@ -1,4 +1,4 @@
-"""The runtime of Linux namespaces: bubblewrap makes them, the nursery's children live in them.
+"""The runtime of Linux namespaces: bubblewrap makes them, the fork server's children live in them.
 
 A container has its own user, pid, mount, network, ipc, uts and cgroup namespaces. Its root is read-only and
 holds the system's programs, the engine's Python and the packages; its home and /tmp live in memory and are
@@ -26,11 +26,11 @@ from rce_container.environment.logs.files import ENVIRONMENT_LOG, segment_path
 from rce_container.environment.messages import Boot
 from rce_container.exceptions import ContainerError, RuntimeUnavailableError, StartError
 from rce_container.folder import ContainerFolder, Record
+from rce_container.forkserver.confine import USER_ID
+from rce_container.forkserver.messages import SpawnRequest
+from rce_container.forkserver.mounts import HOME, LOGS, TEMPORARY
+from rce_container.forkserver.process import ForkServer
 from rce_container.network.hosts import hostname, hosts_text
-from rce_container.nursery.confine import USER_ID
-from rce_container.nursery.keeper import Nursery
-from rce_container.nursery.messages import Birth
-from rce_container.nursery.mounts import HOME, LOGS, TEMPORARY
 from rce_container.runtimes.base import Order, Runtime, clean_environ, source_root
 from rce_container.runtimes.held import HOLDER, HeldHandle
 from rce_container.seccomp.library import FilterUnavailableError, make_filter
@@ -79,7 +79,7 @@ class NamespaceRuntime(Runtime):
         self._uids = uids or UidPool(FIRST_UID, UIDS)
         self._root = os.geteuid() == 0
         self._bwrap = shutil.which("bwrap") or ""
-        self._nursery = Nursery(b"", {})
+        self._fork_server = ForkServer(b"", {})
 
     def probe(self) -> None:
         """Make a container and start the engine's Python in it."""
@@ -87,10 +87,10 @@ class NamespaceRuntime(Runtime):
             raise RuntimeUnavailableError(self.name, "it needs Linux")
         self.require()
         _compile()
-        self._nursery.close()
+        self._fork_server.close()
         program, missing = _make_filter()
         self.detail = "; ".join(filter(None, (missing, self._claimed())))
-        self._nursery = Nursery(program, clean_environ(HOME))
+        self._fork_server = ForkServer(program, clean_environ(HOME))
         failures: list[Exception] = []
         trying = threading.Thread(target=self._try, args=(failures,))  # there may be a loop in this one
         trying.start()
@@ -114,8 +114,8 @@ class NamespaceRuntime(Runtime):
         """The same in every container."""
         return BUNDLES
 
-    def is_unborn(self, record: Record) -> bool:
-        """An environment is noted when the nursery has answered."""
+    def is_starting(self, record: Record) -> bool:
+        """An environment is noted when the fork server has answered."""
         return not record.environment
 
     def review(self, packages: Iterable[Path]) -> str:
@@ -133,8 +133,8 @@ class NamespaceRuntime(Runtime):
         return f"users for containers belong to {', '.join(owners)} too: choose others by --first-uid"
 
     def close(self) -> None:
-        """End the nursery; the containers live on."""
-        self._nursery.close()
+        """End the fork server; the containers live on."""
+        self._fork_server.close()
 
     def start(self, order: Order) -> HeldHandle:
         """Make the container's namespaces; the environment comes to life by the handle's ``launch``."""
@@ -146,7 +146,7 @@ class NamespaceRuntime(Runtime):
         except OSError as error:
             raise StartError(f"its /etc cannot be written: {error}") from error
         uid, lock = self._uids.take() if self._root else (0, -1)
-        birth = Birth(
+        request = SpawnRequest(
             boot=order.boot,
             environ={**clean_environ(HOME), "USER": USER, "LOGNAME": USER},
             uid=uid,
@@ -157,7 +157,7 @@ class NamespaceRuntime(Runtime):
             check=check,
         )
         try:
-            handle = HeldHandle.start(self._command(order), order, birth, self._nursery, lock)
+            handle = HeldHandle.start(self._command(order), order, request, self._fork_server, lock)
         finally:
             if lock >= 0:
                 os.close(lock)
@@ -247,7 +247,7 @@ def _python_packages() -> list[Path]:
 
 
 def _mounts(order: Order) -> list[str]:
-    """The container's tree of files; the rest is done from inside (:mod:`rce_container.nursery.mounts`)."""
+    """The container's files; the rest is mounted from inside (:mod:`rce_container.forkserver.mounts`)."""
     folder = order.folder
     return [
         *system_mounts(),

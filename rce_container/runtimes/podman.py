@@ -1,4 +1,4 @@
-"""The runtime of images: podman makes the namespaces, the nursery's children live in them.
+"""The runtime of images: podman makes the namespaces, the fork server's children live in them.
 
 It is the ``namespace`` runtime with another root. The holder is a shell of the image, started by podman; the
 environment joins it from outside and confines itself as everywhere, so an image needs no Python of its own.
@@ -21,8 +21,8 @@ from itertools import chain
 from pathlib import Path
 
 from rce_container.exceptions import RuntimeUnavailableError, StartError
+from rce_container.forkserver.mounts import HOME, LOGS
 from rce_container.network.hosts import hostname
-from rce_container.nursery.mounts import HOME, LOGS
 from rce_container.runtimes.base import Order
 from rce_container.runtimes.held import HOLDER, HeldHandle
 from rce_container.runtimes.namespace import (
@@ -59,7 +59,7 @@ shift
 exec "$@" 3<&0 0</dev/null 1>&2
 """
 _HOLDER = f"exec <&3 >&3 3<&-; {HOLDER[-1]}"
-"""Podman passes the tether on as descriptor 3; the holder wants it as its standard input and output."""
+"""Podman passes the lifeline on as descriptor 3; the holder wants it as its standard input and output."""
 
 _APART = ("--mount", "--pid", "--fork", "--kill-child", "--mount-proc", "--propagation", "private")
 _MACHINE = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32")

@@ -11,7 +11,7 @@ import errno
 import socket
 from typing import NamedTuple
 
-from rce_container.nursery.kernel import Namespaces
+from rce_container.forkserver.kernel import Namespaces
 
 _LOW_HALF = 0xFFFF_FFFF
 _NAMESPACE_TIME = 0x80

@@ -44,7 +44,7 @@ def make_filter() -> bytes:
     A process that makes calls as another architecture (32-bit programs) is killed.
 
     Returns:
-        Instructions, for :func:`rce_container.nursery.kernel.filter_calls`.
+        Instructions, for :func:`rce_container.forkserver.kernel.filter_calls`.
 
     Raises:
         FilterUnavailableError: libseccomp is missing, or does not do it.

@@ -145,7 +145,7 @@ class Chaos:
 
 
 def parts(traces: Traces) -> dict[str, list[int]]:
-    """The processes of containers and the nursery, by what they are."""
+    """The processes of containers and the fork server, by what they are."""
     found: dict[str, list[int]] = {}
     for process in traces.look():
         name = _part(process.pid)
@@ -162,8 +162,8 @@ def _part(pid: int) -> str:
     line = " ".join(words)
     names = {
         "rce-container-shim": "shim",
-        "rce_container.nursery.cradle": "cradle",
-        "rce_container.nursery": "nursery",
+        "rce_container.forkserver.nodes": "node fork server",
+        "rce_container.forkserver": "fork server",
         "rce_container.environment": "environment",
         "stringEcho.py": "node",
         "read -r word": "holder",
@@ -186,13 +186,13 @@ async def customers(engine: Engine, *, groups: bool) -> AsyncIterator[list[Custo
 
 
 def allowed(engine: Engine) -> set[int]:
-    """The processes that may run while there is no container: the programs, and the manager's nursery."""
-    nurseries = {
+    """The processes that may run while there is no container: the programs, and the manager's fork server."""
+    fork_servers = {
         one.pid
         for one in proc.table().values()
-        if one.parent == engine.container.pid and _part(one.pid) == "nursery"
+        if one.parent == engine.container.pid and _part(one.pid) == "fork server"
     }
-    return {program.pid for program in engine.programs} | nurseries
+    return {program.pid for program in engine.programs} | fork_servers
 
 
 async def run(runtime: str, seed: int, rounds: int, *, groups: bool) -> list[str]:

@@ -253,14 +253,14 @@ def _uid(pid: int) -> int:
 
 def search_from_outside(world: World) -> dict[str, list[str]]:
     """Search the memory of all that takes part, as far as this person may: who knows what?"""
-    pids = {"nursery": world.machine.runtime._nursery.pid}  # type: ignore[attr-defined]
+    pids = {"fork server": world.machine.runtime._fork_server.pid}  # type: ignore[attr-defined]
     inside = world.environment(ATTACKER)
     pids["environment"] = inside.pid
     for process in proc.descendants(inside.pid, proc.table()):
         with contextlib.suppress(FileNotFoundError):  # what the node started is ending
             words = Path(f"/proc/{process.pid}/cmdline").read_bytes().split(b"\0")
-            if b"rce_container.nursery.cradle" in words:
-                pids["cradle"] = process.pid
+            if b"rce_container.forkserver.nodes" in words:
+                pids["node fork server"] = process.pid
     texts = {"secret": SECRET, "token": TOKEN, "other token": OTHER_TOKEN, "neighbour": NEIGHBOUR}
     found = {}
     for who, pid in pids.items():

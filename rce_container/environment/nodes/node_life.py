@@ -19,7 +19,7 @@ from rce_container.environment.logs.pump import Pump
 from rce_container.environment.nodes.events import Ended, Event, Made, Refused
 from rce_container.environment.nodes.launch import NODE_MARK, Launch, prepare
 from rce_container.environment.nodes.reaper import Child, Reaper
-from rce_container.environment.process import strike_all
+from rce_container.environment.process import kill_marked
 
 _PASSING = frozenset({errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE, errno.ETXTBSY, errno.ENOSPC})
 """Errors for which a start may succeed when it is tried later."""
@@ -99,7 +99,7 @@ class NodeLife:
                 code, reason = await self._watch(child)
             finally:
                 child.signal_group(signal.SIGKILL)
-                await strike_all(launch.env[NODE_MARK], variable=NODE_MARK)
+                await kill_marked(launch.env[NODE_MARK], variable=NODE_MARK)
         if code and not self._halted.done() and (words := self._log.last_words):
             reason += f"; its last words: {words}"
         return Ended(self._spec.tag, self.life, code, reason)

@@ -9,8 +9,8 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
-from rce_container.environment.nodes.cradle import Cradle
-from rce_container.environment.process import OF_NODES, die_before_others
+from rce_container.environment.nodes.fork_server import NodeForkServer
+from rce_container.environment.process import OF_NODES, set_oom_score
 
 
 class Child:
@@ -47,11 +47,11 @@ class Reaper:
     it collects exit codes that nobody else will see then.
 
     Args:
-        cradle: Starts the processes that it can; None for none.
+        node_server: Starts the processes that it can; None for none.
     """
 
-    def __init__(self, cradle: Cradle | None = None) -> None:
-        self._cradle = cradle
+    def __init__(self, node_server: NodeForkServer | None = None) -> None:
+        self._node_server = node_server
         self._children: dict[int, Child] = {}
         self._before: Any = None
 
@@ -74,8 +74,8 @@ class Reaper:
             OSError: It cannot be started.
         """
         ended: asyncio.Future[int] = asyncio.get_running_loop().create_future()
-        if self._cradle is not None:
-            pid = self._cradle.spawn(argv, env=env, cwd=cwd, stdout=stdout, stderr=stderr)
+        if self._node_server is not None:
+            pid = self._node_server.spawn(argv, env=env, cwd=cwd, stdout=stdout, stderr=stderr)
             if pid:
                 return self._keep(Child(pid, ended))
         process = subprocess.Popen(  # noqa: S603 - what a user's package offers is what runs here
@@ -87,7 +87,7 @@ class Reaper:
             stderr=stderr,
             start_new_session=True,
         )
-        die_before_others(OF_NODES, process.pid)
+        set_oom_score(OF_NODES, process.pid)
         return self._keep(Child(process.pid, ended, process))
 
     def spawn_attached(
@@ -123,7 +123,7 @@ class Reaper:
             start_new_session=True,
             preexec_fn=_take_terminal if terminal else None,  # noqa: PLW1509 - no other way; one system call
         )
-        die_before_others(OF_NODES, process.pid)
+        set_oom_score(OF_NODES, process.pid)
         return self._keep(Child(process.pid, ended, process))
 
     def _keep(self, child: Child) -> Child:

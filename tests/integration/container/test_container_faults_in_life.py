@@ -51,12 +51,12 @@ class Stage:
                 await machine.put(BOX)
                 await until(lambda: self._children(self.unit.handle.process.pid), what="bubblewrap is held")
             case "held":
-                self._stop(self.runtime._nursery.pid)
+                self._stop(self.runtime._fork_server.pid)
                 await machine.put(BOX)
                 await until(lambda: self.unit.handle.namespaces_pid, what="the holder is there")
             case "born":
                 await machine.put(BOX)
-                environment = await until(lambda: self.unit.handle.environment, what="a birth")
+                environment = await until(lambda: self.unit.handle.environment, what="its start")
                 self._stop(environment.pid)
             case "running" | "resizing":
                 await machine.put(BOX, nodes=(STUBBORN,))
@@ -75,15 +75,15 @@ class Stage:
         handle = self.unit.handle
         shim = handle.process.pid
         environment = handle.environment.pid if handle.environment is not None else 0
-        cradles = (pid for pid in self._children(environment) if program_of(pid) == "rce-cradle")
+        node_servers = (pid for pid in self._children(environment) if program_of(pid) == "rce-node-server")
         node = self.machine.node(BOX, "node")
         pids = {
             "shim": shim,
             "bubblewrap": next(iter(self._children(shim)), 0),
             "holder": handle.namespaces_pid,
-            "nursery": self.runtime._nursery.pid,
+            "fork server": self.runtime._fork_server.pid,
             "environment": environment,
-            "cradle": next(cradles, 0),
+            "node fork server": next(node_servers, 0),
             "node": node.pid if node is not None else 0,
         }
         assert pids[part], f"there is no {part}"
@@ -121,7 +121,7 @@ async def stage(folder: Path) -> AsyncIterator[Stage]:
 
 KILLS = [
     *(("spawned", part) for part in ("shim", "bubblewrap")),
-    *(("held", part) for part in ("shim", "bubblewrap", "holder", "nursery")),
+    *(("held", part) for part in ("shim", "bubblewrap", "holder", "fork server")),
     *(("born", part) for part in ("shim", "holder", "environment")),
     *(("resizing", part) for part in ("bubblewrap", "environment")),
 ]
@@ -136,7 +136,7 @@ async def test_what_is_wanted_comes_to_life_again(stage: Stage, step: str, part:
         old = dict(machine.pids)
         os.kill(stage.pid_of(part), signal.SIGKILL)
         stage.go_on()
-        if part != "nursery":
+        if part != "fork server":
             await until(lambda: machine.status(BOX).incarnation not in ("", mark), what="another life")  # type: ignore[union-attr]
             assert [pid for pid, start in old.items() if proc.alive(pid, start)] == []
             assert not [path for path in machine.containers if path.name == mark]
@@ -144,7 +144,7 @@ async def test_what_is_wanted_comes_to_life_again(stage: Stage, step: str, part:
         assert len(machine.containers) == 1
 
 
-@pytest.mark.parametrize("part", ["shim", "holder", "environment", "cradle", "node"])
+@pytest.mark.parametrize("part", ["shim", "holder", "environment", "node fork server", "node"])
 async def test_what_is_not_wanted_any_more_is_gone(
     stage: Stage, part: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -190,12 +190,12 @@ async def test_a_manager_may_die_while_it_cleans(stage: Stage, monkeypatch: pyte
         await until(lambda: not machine.containers, what=lambda: machine.containers)
 
 
-async def test_nodes_and_cradle_may_die_while_a_container_is_resized(stage: Stage) -> None:
+async def test_nodes_and_their_fork_server_may_die_while_a_container_is_resized(stage: Stage) -> None:
     machine = stage.machine
     async with machine.engine(interrupt_timeout=0.2, terminate_timeout=0.2):
         await stage.reach("resizing")
         mark = stage.unit.mark
-        os.kill(stage.pid_of("cradle"), signal.SIGKILL)
+        os.kill(stage.pid_of("node fork server"), signal.SIGKILL)
         os.kill(stage.pid_of("node"), signal.SIGKILL)
         await machine.node_is(BOX, "node", NodeState.FAILED)
         assert stage.unit.mark == mark

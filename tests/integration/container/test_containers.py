@@ -265,7 +265,7 @@ async def test_a_namespace_hides_the_machine(machine: Machine, monkeypatch: pyte
     assert not [name for name in seen["env"] if name.startswith(("RCE_SECRET", "XDG", "PYTEST"))]
     assert seen["env"]["HOME"] == HOME
     assert seen["host"] == "box"
-    assert len(seen["pids"]) <= 7  # two nodes, what is beside them, and who is between them at a birth
+    assert len(seen["pids"]) <= 7  # two nodes, what is beside them, and who is between them at a start
     assert (seen["home"], seen["tmp"]) == (True, True)
     assert (seen["usr"], seen["slash"], seen["package"]) == (False, False, False)
     assert (seen["loopback"], seen["secret"], seen["environment"]) == (False, False, False)

@@ -35,7 +35,7 @@ def found(person: Person) -> dict[str, Any]:
 
 @pytest.fixture(params=["forked", "executed"])
 def node(request: pytest.FixtureRequest, found: dict[str, Any]) -> dict[str, Any]:
-    """What a node said that the cradle forked, and one that was executed."""
+    """What a node said that the node fork server forked, and one that was executed."""
     said = found[request.param]
     assert said["forked"] is (request.param == "forked")
     assert isinstance(said, dict)

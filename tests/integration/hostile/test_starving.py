@@ -12,7 +12,7 @@ pytestmark = [pytest.mark.needs("bwrap"), pytest.mark.xdist_group("starving")]
 
 KILLED, NO_SPACE, NO_MORE = {"killed"}, {"ENOSPC"}, {"EAGAIN"}
 OWN_PROCESSES = 4
-"""Holder, environment, cradle, and the attacker itself."""
+"""Holder, environment, node fork server, and the attacker itself."""
 
 MEMORY = {
     "anonymous": KILLED,

@@ -10,7 +10,7 @@ import struct
 
 import pytest
 
-from rce_container.nursery.kernel import Namespaces
+from rce_container.forkserver.kernel import Namespaces
 from rce_container.seccomp.calls import ALLOWED, CONDITIONAL, PRETENDED, REFUSED
 from rce_container.seccomp.library import LIBRARY, FilterUnavailableError, make_filter
 

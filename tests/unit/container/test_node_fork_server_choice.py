@@ -1,4 +1,4 @@
-"""Which nodes the cradle may start."""
+"""Which nodes the node fork server may start."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rce_container.environment.nodes.cradle import fits
+from rce_container.environment.nodes.fork_server import fits
 
 OWN = {"PATH": "/bin", "PYTHONPATH": "/engine"}
 

@@ -29,9 +29,9 @@ async def namespaces(folder: Path) -> AsyncIterator[Machine]:
     machine.tidy()
 
 
-def nursery(machine: Machine) -> int:
+def fork_server(machine: Machine) -> int:
     assert isinstance(machine.runtime, NamespaceRuntime)
-    return machine.runtime._nursery.pid
+    return machine.runtime._fork_server.pid
 
 
 async def running(machine: Machine, id_: str = BOX, **parts: object) -> None:
@@ -66,35 +66,35 @@ async def test_a_container_that_lost_a_part_is_made_again(namespaces: Machine, v
         await machine.node_is(BOX, "echo", NodeState.RUNNING)
 
 
-async def test_containers_do_not_need_the_nursery(namespaces: Machine) -> None:
+async def test_containers_do_not_need_the_fork_server(namespaces: Machine) -> None:
     machine = namespaces
     async with machine.engine():
         await running(machine, nodes=(TALK,))
         before = machine.status(BOX)
-        old = nursery(machine)
+        old = fork_server(machine)
         os.kill(old, signal.SIGKILL)
         await running(machine, "user/other")
-        assert nursery(machine) not in (0, old)
+        assert fork_server(machine) not in (0, old)
         assert machine.status(BOX).incarnation == before.incarnation
         await machine.put(BOX, 2, nodes=(TALK, ECHO))
         await machine.node_is(BOX, "echo", NodeState.RUNNING)
         assert machine.faults == []
 
 
-async def test_a_start_survives_the_nursery(namespaces: Machine) -> None:
+async def test_a_start_survives_the_fork_server(namespaces: Machine) -> None:
     machine = namespaces
     async with machine.engine():
-        old = nursery(machine)
+        old = fork_server(machine)
         os.kill(old, signal.SIGSTOP)
         await machine.put(BOX)
-        await until(lambda: _waits_for_birth(machine), what="the nursery has got its order")
+        await until(lambda: _waits_for_request(machine), what="the fork server has got its order")
         os.kill(old, signal.SIGKILL)
         await until(lambda: machine.status(BOX).state is EndpointState.RUNNING)
         assert machine.faults == []
         assert len(machine.marks | {path.name for path in machine.containers}) == 1
 
 
-def _waits_for_birth(machine: Machine) -> bool:
+def _waits_for_request(machine: Machine) -> bool:
     return any(unit.handle.namespaces_pid and not unit.handle.environment for unit in _units(machine))
 
 
@@ -105,36 +105,36 @@ def _units(machine: Machine) -> list[object]:
 async def test_a_manager_that_dies_before_a_birth_leaves_nothing(namespaces: Machine) -> None:
     machine = namespaces
     async with machine.managed(grace=0.2):
-        os.kill(nursery(machine), signal.SIGSTOP)
+        os.kill(fork_server(machine), signal.SIGSTOP)
         await machine.put(BOX)
-        await until(lambda: _waits_for_birth(machine), what="the nursery has got its order")
+        await until(lambda: _waits_for_request(machine), what="the fork server has got its order")
         machine.note_processes()
-    os.kill(nursery(machine), signal.SIGKILL)
+    os.kill(fork_server(machine), signal.SIGKILL)
     await until(lambda: not machine.left(), what=machine.left)
 
 
-async def test_a_node_starts_without_the_cradle(namespaces: Machine) -> None:
+async def test_a_node_starts_without_the_node_fork_server(namespaces: Machine) -> None:
     machine = namespaces
     async with machine.engine():
         await running(machine)
-        (cradle,) = [one for one in machine.processes() if program_of(one.pid) == "rce-cradle"]
-        os.kill(cradle.pid, signal.SIGKILL)
-        await until(lambda: not proc.alive(cradle.pid, cradle.start))
+        (node_server,) = [one for one in machine.processes() if program_of(one.pid) == "rce-node-server"]
+        os.kill(node_server.pid, signal.SIGKILL)
+        await until(lambda: not proc.alive(node_server.pid, node_server.start))
         await machine.put(BOX, 2, nodes=(TALK, ECHO))
         assert "hello" in await machine.log_holds(BOX, "node", "hello")
         await machine.node_is(BOX, "echo", NodeState.RUNNING)
         assert machine.faults == []
 
 
-async def test_the_nursery_ends_with_its_manager(namespaces: Machine) -> None:
-    pid = nursery(namespaces)
+async def test_the_fork_server_ends_with_its_manager(namespaces: Machine) -> None:
+    pid = fork_server(namespaces)
     process = proc.read(pid)
     assert process is not None
     assert isinstance(namespaces.runtime, NamespaceRuntime)
-    orders = namespaces.runtime._nursery._orders
+    orders = namespaces.runtime._fork_server._orders
     assert orders is not None
     orders.close()
-    await until(lambda: not proc.alive(pid, process.start), what="the nursery has ended")
+    await until(lambda: not proc.alive(pid, process.start), what="the fork server has ended")
 
 
 async def test_nobody_waits_for_bubblewrap_that_fails(namespaces: Machine) -> None:

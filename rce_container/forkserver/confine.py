@@ -1,4 +1,4 @@
-"""Turning a child of the nursery into a process of a container that has no rights at all.
+"""Turning a child of the fork server into a process of a container that has no rights at all.
 
 Two processes do it. The first one enters the container's namespaces with all the rights it needs there; its
 child, the first of the two to be inside the pid namespace, makes a user namespace below the one that all the
@@ -14,10 +14,10 @@ import resource
 import select
 from pathlib import Path
 
-from rce_container.environment.process import limit_oneself
-from rce_container.nursery import kernel, mounts
-from rce_container.nursery.kernel import Namespaces
-from rce_container.nursery.messages import Birth, Gifts
+from rce_container.environment.process import set_rlimits
+from rce_container.forkserver import kernel, mounts
+from rce_container.forkserver.kernel import Namespaces
+from rce_container.forkserver.messages import Descriptors, SpawnRequest
 
 USER_ID = 1000
 """User and group inside."""
@@ -40,12 +40,12 @@ _NO_CORE = 1
 """The one size by which the kernel gives a core neither to a file nor to a program of the machine."""
 
 
-def confine(birth: Birth, gifts: Gifts, program: bytes) -> int:
+def confine(request: SpawnRequest, descriptors: Descriptors, program: bytes) -> int:
     """Enter the container and give up all rights. Returns in a new process: the others are gone.
 
     Args:
-        birth: What the container is like.
-        gifts: Descriptors; they stay open.
+        request: What the container is like.
+        descriptors: Descriptors; they stay open.
         program: Filter of system calls; empty for none.
 
     Returns:
@@ -54,26 +54,26 @@ def confine(birth: Birth, gifts: Gifts, program: bytes) -> int:
     Raises:
         OSError: The kernel refuses; not all rights may be given up.
     """
-    for file in birth.join:
+    for file in request.join:
         Path(file).write_text(str(os.getpid()))
     procfs = os.open("/proc", os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
-    _enter(gifts.holder, procfs, birth)
-    owner = birth.uid or os.geteuid()
-    mounts.limit(mounts.HOME, birth.home_bytes, owner, 0o700)
+    _enter(descriptors.holder, procfs, request)
+    owner = request.uid or os.geteuid()
+    mounts.limit(mounts.HOME, request.home_bytes, owner, 0o700)
     for path in mounts.TEMPORARY:
-        mounts.limit(path, birth.tmp_bytes, owner, 0o1777)
+        mounts.limit(path, request.tmp_bytes, owner, 0o1777)
     mounts.mask_machine()
     logs = mounts.take_away_logs(owner)
-    os.fchown(gifts.log, owner, owner)
+    os.fchown(descriptors.log, owner, owner)
     _become_user(procfs, owner)
     os.close(procfs)
     _give_up(program)
     return logs
 
 
-def _enter(holder: int, procfs: int, birth: Birth) -> None:
-    kinds = _JOINED if birth.host_network else _JOINED | Namespaces.NET
-    if birth.uid:
+def _enter(holder: int, procfs: int, request: SpawnRequest) -> None:
+    kinds = _JOINED if request.host_network else _JOINED | Namespaces.NET
+    if request.uid:
         os.setgroups(())
     else:
         # The namespaces' owner, of whom the holder's own user namespace may be a child.
@@ -136,10 +136,10 @@ def _give_up(program: bytes) -> None:
     os.setsid()
     os.umask(0o022)
     resource.setrlimit(resource.RLIMIT_CORE, (_NO_CORE, _NO_CORE))
-    limit_oneself(_RLIMITS)
+    set_rlimits(_RLIMITS)
     _leave_files_to_others()
     kernel.give_up_capabilities()
-    kernel.take_in_orphans()
+    kernel.become_subreaper()
     kernel.set_dumpable(False)
     if program:
         kernel.filter_calls(program)

@@ -20,7 +20,7 @@ if child:
         signal.signal(-code, signal.SIG_DFL)
         os.kill(os.getpid(), -code)
     os._exit(code)
-from rce_container.nursery.script import open_streams, run_script
+from rce_container.forkserver.script import open_streams, run_script
 open_streams(unbuffered={unbuffered})
 run_script(sys.argv[1], sys.argv[2:])
 """

@@ -1,4 +1,4 @@
-"""The manager's side of the nursery: starts it, starts it again when it died, and gives it orders."""
+"""The manager's side of the fork server: starts it, starts it again when it died, and gives it orders."""
 
 from __future__ import annotations
 
@@ -15,7 +15,14 @@ import msgspec
 
 from rce.supervision.title import ROOM_VARIABLE, padding
 from rce_container.exceptions import StartError
-from rce_container.nursery.messages import MAX_PACKET, Answer, Birth, Gifts, decode_answer, encode
+from rce_container.forkserver.messages import (
+    MAX_PACKET,
+    Answer,
+    Descriptors,
+    SpawnRequest,
+    decode_answer,
+    encode,
+)
 
 log = logging.getLogger(__name__)
 
@@ -24,12 +31,12 @@ _CREDENTIALS = struct.Struct("iII")
 _CLOSE_TIMEOUT_S = 5.0
 
 
-class Nursery:
-    """Gives birth to environments. Used by one event loop; :meth:`close` ends it.
+class ForkServer:
+    """Makes environments. Used by one event loop; :meth:`close` ends it.
 
     Args:
-        program: The filter of system calls for all that is born; empty for none.
-        environ: The environment variables of the nursery, which hold no secret.
+        program: The filter of system calls for all environments; empty for none.
+        environ: The environment variables of the fork server, which hold no secret.
     """
 
     def __init__(self, program: bytes, environ: Mapping[str, str]) -> None:
@@ -43,12 +50,12 @@ class Nursery:
         """The process that orders go to now; 0 while there is none."""
         return self._process.pid if self._process is not None else 0
 
-    async def bear(self, birth: Birth, gifts: Gifts) -> int:
+    async def spawn(self, request: SpawnRequest, descriptors: Descriptors) -> int:
         """Make an environment; returns its pid.
 
         Args:
-            birth: What it is like.
-            gifts: What it gets; :attr:`Gifts.answer` is put in here.
+            request: What it is like.
+            descriptors: What it gets; :attr:`Descriptors.answer` is put in here.
 
         Raises:
             StartError: It cannot be made.
@@ -57,7 +64,7 @@ class Nursery:
             ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             with ours, theirs:
                 ours.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
-                self._order(birth, gifts._replace(answer=theirs.fileno()))
+                self._order(request, descriptors._replace(answer=theirs.fileno()))
                 theirs.close()
                 answer, pid = await _hear(ours)
             if answer is None:
@@ -67,7 +74,7 @@ class Nursery:
                 raise StartError(f"its environment cannot be confined: {answer.error}")
             return pid
         raise StartError(
-            "its environment, or the nursery that makes it, dies each time; see this program's log for why"
+            "its environment, or the fork server that makes it, dies each time; this program's log tells why"
         )
 
     def start(self) -> None:
@@ -83,7 +90,7 @@ class Nursery:
         with theirs:
             try:
                 self._process = subprocess.Popen(  # noqa: S603
-                    [sys.executable, "-P", "-m", "rce_container.nursery", padding()],
+                    [sys.executable, "-P", "-m", "rce_container.forkserver", padding()],
                     stdin=theirs.fileno(),
                     stdout=subprocess.DEVNULL,
                     env=self._environ,
@@ -97,7 +104,7 @@ class Nursery:
         self._orders = ours
 
     def close(self) -> None:
-        """End the process. What it has given birth to lives on."""
+        """End the process. The environments that it made live on."""
         if self._orders is not None:
             self._orders.close()
             self._orders = None
@@ -109,22 +116,22 @@ class Nursery:
                 self._process.wait()
             self._process = None
 
-    def _order(self, birth: Birth, gifts: Gifts) -> None:
-        packet = encode(birth)
+    def _order(self, request: SpawnRequest, descriptors: Descriptors) -> None:
+        packet = encode(request)
         if len(packet) > MAX_PACKET:
             raise StartError(f"what is to be told of it takes {len(packet)} bytes; {MAX_PACKET} are allowed")
         for _ in range(_ATTEMPTS):
             self.start()
             assert self._orders is not None
             try:
-                socket.send_fds(self._orders, [packet], gifts)
+                socket.send_fds(self._orders, [packet], descriptors)
             except (BrokenPipeError, ConnectionResetError):
                 self.close()
             except OSError as error:
-                raise StartError(f"the nursery of environments takes no order: {error}") from error
+                raise StartError(f"the fork server of environments takes no order: {error}") from error
             else:
                 return
-        raise StartError("the nursery of environments dies at once; its reason is in this program's log")
+        raise StartError("the fork server of environments dies at once; its reason is in this program's log")
 
 
 async def hear_credentials(sock: socket.socket, size: int) -> tuple[bytes, int]:

@@ -1,6 +1,6 @@
-"""What the manager tells the nursery and what comes back: JSON packets with descriptors.
+"""What the manager tells the fork server and what comes back: JSON packets with descriptors.
 
-The first packet holds the filter of system calls; each one after it is a :class:`Birth`.
+The first packet holds the filter of system calls; each one after it is a :class:`SpawnRequest`.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ MAX_PACKET = 1 << 18
 """Bytes."""
 
 
-class Birth(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """An environment to be made. Comes with the descriptors of :class:`Gifts`."""
+class SpawnRequest(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """An environment to be made. Comes with the descriptors of :class:`Descriptors`."""
 
     boot: Boot
     environ: dict[str, str]
     """All of its environment variables."""
     uid: int
-    """User and group of the machine that it runs as; 0: the nursery's own."""
+    """User and group of the machine that it runs as; 0: the fork server's own."""
     home_bytes: int
     """Size of the container's home."""
     tmp_bytes: int
@@ -35,14 +35,14 @@ class Birth(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """A command that must succeed in the container before the answer says that all is well."""
 
 
-class Gifts(NamedTuple):
-    """The descriptors that come with a birth, in this order."""
+class Descriptors(NamedTuple):
+    """The descriptors that come with a request, in this order."""
 
     holder: int
     """A pidfd of the process that holds the namespaces."""
     answer: int
     """A socket on which the environment sends its :class:`Answer`, and by that who it is."""
-    tether: int
+    lifeline: int
     """The holder's other end: the container lives as long as the environment keeps it open."""
     control: int
     links: int
@@ -51,15 +51,15 @@ class Gifts(NamedTuple):
 
 
 class Answer(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """How a birth went."""
+    """How a request went."""
 
     error: str = ""
     """Empty if the environment is about to run."""
 
 
 FAREWELL = b"done\n"
-"""Written to the tether by an environment that ended properly, for the holder to do likewise."""
+"""Written to the lifeline by an environment that ended properly, for the holder to do likewise."""
 
 encode = msgspec.json.Encoder().encode
-decode_birth = msgspec.json.Decoder(Birth).decode
+decode_request = msgspec.json.Decoder(SpawnRequest).decode
 decode_answer = msgspec.json.Decoder(Answer).decode

@@ -1,4 +1,4 @@
-"""The environment's side of the cradle (:mod:`rce_container.nursery.cradle`)."""
+"""The environment's side of the node fork server (:mod:`rce_container.forkserver.nodes`)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from rce_container.nursery.cradle import Script, encode_script
+from rce_container.forkserver.nodes import Script, encode_script
 
 log = logging.getLogger(__name__)
 
@@ -18,11 +18,11 @@ _MAX_ANSWER = 32
 _HANDLED = "PYTHONUNBUFFERED"
 
 
-class Cradle:
+class NodeForkServer:
     """Starts Python scripts without starting a Python.
 
     Args:
-        sock: Leads to the cradle.
+        sock: Leads to the node fork server.
     """
 
     def __init__(self, sock: socket.socket) -> None:
@@ -44,7 +44,9 @@ class Cradle:
             socket.send_fds(self._sock, [packet], (stdout, stderr))
             answer = self._sock.recv(_MAX_ANSWER)
         except OSError as error:
-            log.warning("nodes start more slowly from now on: the cradle does not answer: %s", error)
+            log.warning(
+                "nodes start more slowly from now on: the node fork server does not answer: %s", error
+            )
             answer = b""
         if not answer:
             self.close()
@@ -52,7 +54,7 @@ class Cradle:
         return int(answer)
 
     def close(self) -> None:
-        """Let the cradle end."""
+        """Let the node fork server end."""
         if self._sock is not None:
             self._sock.close()
             self._sock = None

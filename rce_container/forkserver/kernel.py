@@ -99,7 +99,7 @@ def set_dumpable(dumpable: bool) -> None:
     _prctl(_Prctl.SET_DUMPABLE, int(dumpable))
 
 
-def take_in_orphans() -> None:
+def become_subreaper() -> None:
     """Become the parent of what descendants leave behind."""
     _prctl(_Prctl.SET_CHILD_SUBREAPER, 1)
 

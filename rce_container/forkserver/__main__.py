@@ -1,4 +1,4 @@
-"""``python -m rce_container.nursery PADDING``: forks environments on the orders of one manager.
+"""``python -m rce_container.forkserver PADDING``: forks environments on the orders of one manager.
 
 Its standard input is a socket for the orders; it ends when the other end is closed. It has one thread and no
 event loop, and knows no secret: all that it ever held is in every environment's memory.
@@ -22,38 +22,38 @@ import msgspec
 
 from rce.supervision.title import set_title, show_variables
 from rce_container.environment.messages import Boot
-from rce_container.environment.nodes.cradle import Cradle
-from rce_container.environment.process import OF_ENVIRONMENT, die_before_others, limit_oneself
+from rce_container.environment.nodes.fork_server import NodeForkServer
+from rce_container.environment.process import OF_ENVIRONMENT, set_oom_score, set_rlimits
 from rce_container.environment.running import run_environment
-from rce_container.nursery import kernel
-from rce_container.nursery.confine import confine
-from rce_container.nursery.cradle import rock
-from rce_container.nursery.messages import (
+from rce_container.forkserver import kernel
+from rce_container.forkserver.confine import confine
+from rce_container.forkserver.messages import (
     FAREWELL,
     MAX_PACKET,
     Answer,
-    Birth,
-    Gifts,
-    decode_birth,
+    Descriptors,
+    SpawnRequest,
+    decode_request,
     encode,
 )
-from rce_container.nursery.mounts import HOME
+from rce_container.forkserver.mounts import HOME
+from rce_container.forkserver.nodes import serve
 
 for _module in ("encodings.idna", "importlib.metadata", "uvloop", "yaml", "xml.etree.ElementTree"):
     with contextlib.suppress(ImportError):  # what environments and nodes would import when they need it
         importlib.import_module(_module)
 
-_GIFTS = len(Gifts._fields)
+_DESCRIPTORS = len(Descriptors._fields)
 
 
 def main() -> None:
     """Serve a manager; in a forked child, be what was ordered."""
-    die_before_others(OF_ENVIRONMENT)
-    set_title((sys.executable, "-m", "rce_container.nursery"), "rce-nursery")
+    set_oom_score(OF_ENVIRONMENT)
+    set_title((sys.executable, "-m", "rce_container.forkserver"), "rce-fork server")
     orders = socket.socket(fileno=os.dup(0))
     program = orders.recv(MAX_PACKET)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
-    kernel.take_in_orphans()
+    kernel.become_subreaper()
     gc.collect()
     gc.freeze()  # no collection touches, and so copies, what the children share
     found = _wait(orders)
@@ -62,16 +62,16 @@ def main() -> None:
         _live(*found, program)
 
 
-def _wait(orders: socket.socket) -> tuple[Birth, Gifts] | None:
+def _wait(orders: socket.socket) -> tuple[SpawnRequest, Descriptors] | None:
     """Fork a child for each order. Returns in the children, and with nothing when the manager is gone."""
     packet = bytearray(MAX_PACKET)
     while True:
         size, fds = _receive(orders, packet)
         if not size:
             return None
-        child = os.fork() if len(fds) == _GIFTS else -1
+        child = os.fork() if len(fds) == _DESCRIPTORS else -1
         if child == 0:
-            return decode_birth(memoryview(packet)[:size]), Gifts(*fds)
+            return decode_request(memoryview(packet)[:size]), Descriptors(*fds)
         packet[:size] = bytes(size)  # the next container shall not find who came before
         for fd in fds:
             os.close(fd)
@@ -80,7 +80,7 @@ def _wait(orders: socket.socket) -> tuple[Birth, Gifts] | None:
 def _receive(orders: socket.socket, packet: bytearray) -> tuple[int, array.array[int]]:
     """Wait for an order; returns its size and its descriptors."""
     fds = array.array("i")
-    room = socket.CMSG_SPACE(_GIFTS * fds.itemsize)
+    room = socket.CMSG_SPACE(_DESCRIPTORS * fds.itemsize)
     size, ancillary, _, _ = orders.recvmsg_into((packet,), room)
     for level, kind, data in ancillary:
         if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
@@ -88,34 +88,34 @@ def _receive(orders: socket.socket, packet: bytearray) -> tuple[int, array.array
     return size, fds
 
 
-def _live(birth: Birth, gifts: Gifts, program: bytes) -> None:
+def _live(request: SpawnRequest, descriptors: Descriptors, program: bytes) -> None:
     """Become the environment of a container."""
-    answer = socket.socket(fileno=gifts.answer)
+    answer = socket.socket(fileno=descriptors.answer)
     try:
-        set_title((sys.executable, "-m", "rce_container.environment", birth.boot.id), "rce-environment")
-        logs = confine(birth, gifts, program)
-        boot = _settle(birth, gifts, logs)
-        _check(birth.check)
+        set_title((sys.executable, "-m", "rce_container.environment", request.boot.id), "rce-environment")
+        logs = confine(request, descriptors, program)
+        boot = _settle(request, descriptors, logs)
+        _check(request.check)
     except Exception as error:  # noqa: BLE001 - whatever it is, the manager is told
         answer.send(encode(Answer(error=f"{type(error).__name__}: {error}")))
         os._exit(1)
-    cradle = _fork_cradle(answer)
-    if cradle is None:
+    node_server = _fork_node_server(answer)
+    if node_server is None:
         return
     answer.send(encode(Answer()))
     answer.close()
-    control, links = socket.socket(fileno=gifts.control), socket.socket(fileno=gifts.links)
-    run_environment(boot, control, links, Cradle(cradle))
+    control, links = socket.socket(fileno=descriptors.control), socket.socket(fileno=descriptors.links)
+    run_environment(boot, control, links, NodeForkServer(node_server))
     with contextlib.suppress(OSError):
-        os.write(gifts.tether, FAREWELL)
+        os.write(descriptors.lifeline, FAREWELL)
 
 
-def _fork_cradle(answer: socket.socket) -> socket.socket | None:
-    """Fork the cradle, while nothing is known that nodes must not know.
+def _fork_node_server(answer: socket.socket) -> socket.socket | None:
+    """Fork the node fork server, while nothing is known that nodes must not know.
 
     Returns:
-        In the environment its end of a socket that leads to the cradle; None in the cradle, and in each node
-        that it forked, when they are to end.
+        In the environment its end of a socket that leads to the node fork server; None in that server, and in
+        each node that it forked, when they are to end.
     """
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     if os.fork():
@@ -124,27 +124,27 @@ def _fork_cradle(answer: socket.socket) -> socket.socket | None:
     ours.close()
     answer.detach()  # closed with all others, and its number may be taken by a node later
     _close_all_but({0, 1, 2, theirs.fileno()})
-    set_title((sys.executable, "-m", "rce_container.nursery.cradle"), "rce-cradle")
-    rock(theirs)
+    set_title((sys.executable, "-m", "rce_container.forkserver.nodes"), "rce-node-server")
+    serve(theirs)
     return None
 
 
-def _settle(birth: Birth, gifts: Gifts, logs: int) -> Boot:
+def _settle(request: SpawnRequest, descriptors: Descriptors, logs: int) -> Boot:
     """Arrange descriptors, variables and signals as a new program finds them."""
     nothing = os.open(os.devnull, os.O_RDWR)
-    for fd, number in ((nothing, 0), (gifts.log, 1), (gifts.log, 2)):
+    for fd, number in ((nothing, 0), (descriptors.log, 1), (descriptors.log, 2)):
         os.dup2(fd, number)
-    kept = (gifts.answer, gifts.tether, gifts.control, gifts.links, logs)
+    kept = (descriptors.answer, descriptors.lifeline, descriptors.control, descriptors.links, logs)
     _close_all_but({0, 1, 2, *kept})
     for fd in kept:
         os.set_inheritable(fd, False)
     os.environ.clear()
-    os.environ.update(birth.environ)
-    show_variables(birth.environ)
+    os.environ.update(request.environ)
+    show_variables(request.environ)
     os.chdir(HOME)
-    limit_oneself(birth.boot.rlimits)
+    set_rlimits(request.boot.rlimits)
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    return msgspec.structs.replace(birth.boot, home=HOME, logs=f"/proc/self/fd/{logs}")
+    return msgspec.structs.replace(request.boot, home=HOME, logs=f"/proc/self/fd/{logs}")
 
 
 def _check(command: Sequence[str]) -> None:

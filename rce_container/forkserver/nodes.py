@@ -1,4 +1,4 @@
-"""The cradle: a child of the environment, confined like it, that forks nodes which are Python scripts.
+"""The node fork server: a confined child of the environment that forks nodes which are Python scripts.
 
 It was forked before the environment knew anything, holds nothing but its socket, and has all imported that
 nodes of the engine need: such a node starts without an interpreter's start and without imports.
@@ -16,9 +16,9 @@ import msgspec
 from msgspec import Struct
 
 from rce.supervision.title import set_title, show_variables
-from rce_container.environment.process import OF_NODES, die_before_others
-from rce_container.nursery import kernel
-from rce_container.nursery.script import open_streams, run_script
+from rce_container.environment.process import OF_NODES, set_oom_score
+from rce_container.forkserver import kernel
+from rce_container.forkserver.script import open_streams, run_script
 
 MAX_PACKET = 1 << 18
 """Bytes."""
@@ -41,7 +41,7 @@ encode_script = msgspec.json.Encoder().encode
 decode_script = msgspec.json.Decoder(Script).decode
 
 
-def rock(orders: socket.socket) -> None:
+def serve(orders: socket.socket) -> None:
     """Fork a node for each order. Returns in each node when it ends, else when the environment is gone."""
     while True:
         packet, fds, _, _ = socket.recv_fds(orders, MAX_PACKET, STREAMS)
@@ -79,7 +79,7 @@ def _be(script: Script, fds: list[int]) -> None:
     show_variables(script.environ)
     set_title((sys.executable, script.path, *script.arguments), os.path.basename(sys.executable))  # noqa: PTH119
     kernel.set_dumpable(True)
-    die_before_others(OF_NODES)
+    set_oom_score(OF_NODES)
     os.chdir(script.folder)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     open_streams(unbuffered=bool(script.environ.get("PYTHONUNBUFFERED")))

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from rce_container.nursery.kernel import Mount, mount, unmount
+from rce_container.forkserver.kernel import Mount, mount, unmount
 
 HOME = "/home/rce"
 LOGS = "/var/log/rce"
