@@ -20,9 +20,9 @@ from rce.protocol.codec import encode
 from rce.protocol.http import LATCH, SINGLE_FRAME
 from rce.protocol.messages import NO_ID, DataMessage, ErrorReport, InterfaceStatus, LatchedSources
 from rce.protocol.stream import Fault
-from rce_client.courier import Courier, Target, Timing
 from rce_client.desired import Desired
 from rce_client.ends import ServiceClient, read_call_fault
+from rce_client.engine_transport import EngineTransport, Target, Timing
 from rce_client.exceptions import (
     InterfaceError,
     InUseError,
@@ -115,7 +115,7 @@ class Connection(Requests, OwnInterfaces):
         self.active: dict[str, bool] = {}
         """Own interface tags to whether they are joined with a peer."""
         target = Target(url=url, user=user_id, password=password, token=token, robot=robot_id, tls=tls)
-        self._courier = Courier(target, self, timing, limits)
+        self._transport = EngineTransport(target, self, timing, limits)
         self._desired = Desired()
         self._ends: dict[str, End] = {}
         self._early: dict[tuple[str, str], DataMessage] = {}
@@ -155,7 +155,7 @@ class Connection(Requests, OwnInterfaces):
         """Send what waits, then close. What was made in the engine stays there."""
         assert self._tasks is not None
         if exc is None:
-            await self._courier.flush()
+            await self._transport.flush()
         for end in self._ends.values():
             end.on_closed()
         for task in list(self._work):
@@ -172,12 +172,12 @@ class Connection(Requests, OwnInterfaces):
     @property
     def connected(self) -> bool:
         """Whether there is a connection at this moment."""
-        return self._courier.connected
+        return self._transport.connected
 
     @property
     def dropped(self) -> Mapping[str, int]:
         """Interface tag to the number of its messages that found no room to wait."""
-        return self._courier.dropped
+        return self._transport.dropped
 
     # Requests
 
@@ -186,7 +186,7 @@ class Connection(Requests, OwnInterfaces):
         self._check_open()
         self._desired.apply(request)
         try:
-            await self._courier.deliver(encode(request))
+            await self._transport.deliver(encode(request))
         except LostError:
             self._backlog.append(request)
 
@@ -233,7 +233,7 @@ class Connection(Requests, OwnInterfaces):
 
     def post_data(self, tag: str, frames: Sequence[Frame], key: str | None = None) -> bool:
         """Send a topic's message; False if there is no connection."""
-        return self._courier.post_data(tag, frames, key)
+        return self._transport.post_data(tag, frames, key)
 
     def is_active(self, tag: str) -> bool:
         """Whether an interface is joined with a peer."""
@@ -242,16 +242,16 @@ class Connection(Requests, OwnInterfaces):
     @property
     def knows_sources(self) -> bool:
         """Whether the engine takes the names of latched messages' sources."""
-        return LATCH in self._courier.features
+        return LATCH in self._transport.features
 
     @property
     def takes_single_frames(self) -> bool:
         """Whether the engine takes serialized messages in one frame."""
-        return SINGLE_FRAME in self._courier.features
+        return SINGLE_FRAME in self._transport.features
 
     def post_control(self, frames: Sequence[Frame]) -> bool:
         """Send a service message; False if that is not possible now."""
-        return self._courier.post_control(frames)
+        return self._transport.post_control(frames)
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         """Run something until the connection is closed by the program."""
@@ -272,7 +272,7 @@ class Connection(Requests, OwnInterfaces):
             end.on_closed()
             await self.remove_interface(self.robot_id, end.tag)
 
-    # What the courier tells: rce_client.courier.Listener
+    # What the transport tells: rce_client.engine_transport.Listener
 
     def on_connecting(self) -> None:
         """An attempt to connect begins."""
@@ -288,7 +288,7 @@ class Connection(Requests, OwnInterfaces):
     def on_connected(self) -> None:
         """Ask again for everything that was made."""
         for request in (*self._backlog, *self._desired.restore()):
-            self._courier.post_request(encode(request))
+            self._transport.post_request(encode(request))
         self._backlog.clear()
         state = State.RESTORED if self._was_connected else State.CONNECTED
         self._was_connected = True
@@ -330,7 +330,7 @@ class Connection(Requests, OwnInterfaces):
 
     async def _run(self) -> None:
         try:
-            await self._courier.run()
+            await self._transport.run()
         except RefusedError as error:
             self._refusal = error
             for end in self._ends.values():

@@ -23,7 +23,7 @@ from rce.control.limits import MEMORY_PER_SLOT
 from rce.control.messages import MachineInfo
 from rce.control.usage import machine_memory
 from rce.link.address import in_url, is_any, own_address
-from rce.link.handover import Doorman
+from rce.link.handover import LinkAcceptor
 from rce.link.listening import listen_on
 from rce.ros.packages import PackageIndex, installed_shares
 from rce.supervision.signals import end_signals
@@ -129,10 +129,10 @@ class App:
         keep = self.settings.log_days, self.settings.log_space
         with StateFolder(self._state_dir, run_dir(), log_days=keep[0], log_space=keep[1]) as state:
             name = state.name(self.name)
-            doorman = Doorman(tls=self.settings.tls)
+            acceptor = LinkAcceptor(tls=self.settings.tls)
             async with contextlib.AsyncExitStack() as stack:
-                stack.push_async_callback(doorman.close)
-                port = await listen_on(doorman.listen, self.host, self.link_port)
+                stack.push_async_callback(acceptor.close)
+                port = await listen_on(acceptor.listen, self.host, self.link_port)
                 limiter = await asyncio.to_thread(choose_limiter, state.token, state.cgroups)
                 stack.callback(limiter.close)
                 for one in runtimes.values():
@@ -148,7 +148,7 @@ class App:
                     runtimes=runtimes,
                     runtime=runtime,
                     state=state,
-                    doorman=doorman,
+                    acceptor=acceptor,
                     links=(reach, port),
                     limiter=limiter,
                     library=library,

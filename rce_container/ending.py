@@ -12,7 +12,7 @@ from rce.config.folders import run_dir
 from rce.control.contents import Piece
 from rce.control.exceptions import ContentError
 from rce.control.messages import MachineInfo
-from rce.link.handover import Doorman
+from rce.link.handover import LinkAcceptor
 from rce.link.unix import remove_stale_sockets
 from rce_container.bundles.cache import BundleCache
 from rce_container.bundles.supply import Library
@@ -67,7 +67,7 @@ async def end_containers(
             runtimes=runtimes,
             runtime=runtimes[ProcessRuntime.name],
             state=state,
-            doorman=Doorman(),
+            acceptor=LinkAcceptor(),
             links=("", 0),
             limiter=limiter,
             library=Library(cache=BundleCache(state.library, _no_master, space=settings.bundle_space)),

@@ -20,7 +20,7 @@ from rce_container.runtimes.base import Handle, Order
 if TYPE_CHECKING:
     from rce_container.limits import Limiter
     from rce_container.network import Networks
-    from rce_container.network.networks import Seat
+    from rce_container.network.networks import Membership
     from rce_container.runtimes.base import Runtime
     from rce_container.settings import ContainerSettings
 
@@ -137,7 +137,7 @@ class Launcher:
             raise StartError(f"the runtime {runtime.name} has no networks of groups")
         return runtime
 
-    def _enroll(self, id_: str, folder: ContainerFolder, resources: Resources) -> Seat | None:
+    def _enroll(self, id_: str, folder: ContainerFolder, resources: Resources) -> Membership | None:
         if resources.network is not Network.GROUP:
             return None
         return self._networks.enroll(
@@ -151,7 +151,7 @@ class Launcher:
         resources: Resources,
         runtime: Runtime,
         cell: Cell,
-        seat: Seat | None,
+        seat: Membership | None,
     ) -> m.Boot:
         settings = self._settings
         own_network = runtime.isolated and resources.network is not Network.HOST

@@ -44,7 +44,7 @@ from rce_container.folder import ContainerFolder
 from rce_container.launcher import Launcher
 from rce_container.life import Phase
 from rce_container.limits import Cell
-from rce_container.limits.warden import Warden
+from rce_container.limits.enforcer import LimitEnforcer
 from rce_container.log_reads import LogReads
 from rce_container.network import Networks
 from rce_container.reading import read_for
@@ -54,7 +54,7 @@ from rce_container.usage import Subject, UsageMeter
 
 if TYPE_CHECKING:
     from rce.control.dialing import RunDialer
-    from rce.link.handover import Doorman
+    from rce.link.handover import LinkAcceptor
     from rce_container.folder import StateFolder
     from rce_container.limits import Limiter
     from rce_container.runtimes.base import Runtime
@@ -73,7 +73,7 @@ class Manager:
         runtimes: All runtimes by name, for containers that an earlier manager started.
         runtime: The one for new containers.
         state: Where everything is kept.
-        doorman: Accepts links by TCP.
+        acceptor: Accepts links by TCP.
         links: Host and port where it does.
         limiter: Enforces the containers' limits.
         library: Gives packages that users bring.
@@ -92,7 +92,7 @@ class Manager:
         runtimes: Mapping[str, Runtime],
         runtime: Runtime,
         state: StateFolder,
-        doorman: Doorman,
+        acceptor: LinkAcceptor,
         links: tuple[str, int],
         limiter: Limiter,
         library: Library,
@@ -119,7 +119,7 @@ class Manager:
         )
         self._office = Office(
             settings=settings,
-            doorman=doorman,
+            acceptor=acceptor,
             feed=self._feed,
             networks=self._networks,
             archive=state.archive,
@@ -329,8 +329,8 @@ class Manager:
         self._start_waiting()
 
     def _own(self, id_: str, folder: ContainerFolder, handle: Handle, cell: Cell, *, isolated: bool) -> Unit:
-        warden = Warden(EndpointId.parse(id_).tag, cell, self._settings)
-        unit = Unit(id_, folder, handle, warden, self._office, isolated=isolated)
+        enforcer = LimitEnforcer(EndpointId.parse(id_).tag, cell, self._settings)
+        unit = Unit(id_, folder, handle, enforcer, self._office, isolated=isolated)
         self._units[unit.mark] = unit
         self._tasks.create_task(self._run_unit(unit), name=f"container {id_}")
         return unit
@@ -368,7 +368,7 @@ class Manager:
             for unit in self._units.values():
                 unit.poll()
             wanted = {
-                unit.id: Subject(unit.handle, unit.warden.cell, unit.node_pids, unit.counters)
+                unit.id: Subject(unit.handle, unit.enforcer.cell, unit.node_pids, unit.counters)
                 for unit in self._units.values()
             }
             usage = await asyncio.to_thread(self._meter.measure, wanted)

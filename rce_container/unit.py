@@ -15,7 +15,7 @@ import msgspec
 from rce.control.execution import FEATURE as EXEC
 from rce.control.execution import Command
 from rce.control.model import EndpointSpec, EndpointStatus, LinkAddress, NodeStatus
-from rce.link.handover import Doorman, HandoverSender
+from rce.link.handover import HandoverSender, LinkAcceptor
 from rce.link.tasks import TaskScope
 from rce.protocol.names import EndpointId
 from rce_container import events, intake
@@ -36,7 +36,7 @@ from rce_container.exceptions import (
     StateError,
 )
 from rce_container.folder import ContainerFolder
-from rce_container.limits.warden import Warden
+from rce_container.limits.enforcer import LimitEnforcer
 from rce_container.logs import last_line
 from rce_container.network import Networks
 from rce_container.runtimes.base import Handle
@@ -55,7 +55,7 @@ class Office:
     """What all lives of all containers share."""
 
     settings: ContainerSettings
-    doorman: Doorman
+    acceptor: LinkAcceptor
     feed: Callable[[events.Event], None]
     networks: Networks
     archive: LogArchive
@@ -69,7 +69,7 @@ class Unit:
         id: The container.
         folder: Belongs to this life.
         handle: Its outermost process.
-        warden: Looks after its cell.
+        enforcer: Looks after its cell.
         office: What all lives share.
         isolated: Whether pids that the environment reports are those of a namespace of its own.
     """
@@ -79,7 +79,7 @@ class Unit:
         id: str,  # noqa: A002 - what it is
         folder: ContainerFolder,
         handle: Handle,
-        warden: Warden,
+        enforcer: LimitEnforcer,
         office: Office,
         *,
         isolated: bool,
@@ -87,7 +87,7 @@ class Unit:
         self.id = id
         self.folder = folder
         self.handle = handle
-        self.warden = warden
+        self.enforcer = enforcer
         self.counters = m.Counters()
         """What went through links and interfaces, as the environment said last."""
         self.status: EndpointStatus | None = None
@@ -166,7 +166,7 @@ class Unit:
         if self._channel is None or self._stopping:
             return
         self._channel.send(m.encode(m.Poll()))
-        for text in self.warden.review():
+        for text in self.enforcer.review():
             self._office.feed(events.Faulted(self.id, self.mark, text))
 
     def stop(self, reason: str = "") -> None:
@@ -191,7 +191,7 @@ class Unit:
         try:
             reason = await self._live()
             if not self._stopping:
-                reason = self.warden.claim_all() or reason
+                reason = self.enforcer.claim_all() or reason
                 reason += await asyncio.to_thread(self._last_words)
                 log.warning("container %s: %s", self.id, reason)
             self._office.feed(events.Lost(self.id, self.mark, reason))
@@ -262,7 +262,7 @@ class Unit:
             self._channel.close()
             self._channel = None
         if sender is not None:
-            self._office.doorman.forget(sender)
+            self._office.acceptor.forget(sender)
             sender.close()
 
     async def _converse(self, channel: Channel) -> None:
@@ -279,7 +279,7 @@ class Unit:
                 case m.Counters() as counters:
                     self.counters = intake.sound_counters(counters)
                 case m.Killed(request=number):
-                    channel.send(m.encode(m.Cause(request=number, text=self.warden.claim())))
+                    channel.send(m.encode(m.Cause(request=number, text=self.enforcer.claim())))
                 case m.Dial() as request:
                     self._errands.spawn(self._dial(channel, request), f"dial for {self.id}")
             if pause := pace.pause:
@@ -305,7 +305,7 @@ class Unit:
         """Replace the nodes' pids inside the container by those outside."""
         if any(node.pid and node.pid not in self._pids for node in status.nodes):
             pace.pay(intake.PER_LOOK)
-            pids = self.warden.cell.pids() or [one.pid for one in self.handle.members(proc.table())]
+            pids = self.enforcer.cell.pids() or [one.pid for one in self.handle.members(proc.table())]
             self._pids = {proc.inner_pid(pid): pid for pid in pids}
         return tuple(
             msgspec.structs.replace(node, pid=self._pids.get(node.pid, 0)) if node.pid else node
@@ -318,7 +318,7 @@ class Unit:
             self._deadline.reschedule(None if seconds is None else loop.time() + seconds)
 
     async def _resize(self, spec: EndpointSpec) -> None:
-        if text := await self.warden.apply(spec.resources):
+        if text := await self.enforcer.apply(spec.resources):
             self._office.feed(events.Faulted(self.id, self.mark, text))
 
     # Links
@@ -330,7 +330,7 @@ class Unit:
             channel.send(m.encode(m.Handover()), theirs.fileno())
 
     async def _route(self, sender: HandoverSender, spec: EndpointSpec) -> None:
-        await self._office.doorman.assign(sender, [link.id for link in spec.links if not link.dial])
+        await self._office.acceptor.assign(sender, [link.id for link in spec.links if not link.dial])
 
     async def _dial(self, channel: Channel, request: m.Dial) -> None:
         """Connect to a peer of this container, and to nothing else."""
@@ -365,13 +365,13 @@ class Unit:
             async with asyncio.timeout(patience):
                 await self.handle.wait()
         try:
-            await self.warden.end()
+            await self.enforcer.end()
             await self.handle.kill()
         except KillError as error:
             log.error("container %s: %s", self.id, error)  # noqa: TRY400 - its text says it all
         await self._office.networks.detach(self.mark)
         await asyncio.to_thread(self.folder.remove)
         try:
-            await self.warden.remove()
+            await self.enforcer.remove()
         except LimitError as error:
             log.error("container %s: %s", self.id, error)  # noqa: TRY400 - its text says it all

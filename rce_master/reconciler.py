@@ -32,8 +32,8 @@ from rce_master.usage import UsageBook
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rce_master.realm import Realm
     from rce_master.state.changes import Changes, Notice
+    from rce_master.state_service import StateService
 
 logger = logging.getLogger(__name__)
 
@@ -57,18 +57,18 @@ class Reconciler:
     """Sends every change to the task sets that it concerns.
 
     Changes of one endpoint are never added up: its whole spec goes out, with a new revision, to where it is
-    placed. Listens to the realm, so nothing goes out that is not stored.
+    placed. Listens to the state service, so nothing goes out that is not stored.
 
     Attributes:
         book: What the connected task sets told of what they consume.
     """
 
-    def __init__(self, realm: Realm) -> None:
+    def __init__(self, state_service: StateService) -> None:
         self.book = UsageBook()
-        self._realm = realm
+        self._state_service = state_service
         self._peers: dict[str, Peer] = {}
         self._arriving: dict[str, Peer] = {}
-        realm.listeners.append(self.on_changes)
+        state_service.listeners.append(self.on_changes)
 
     # From the task sets
 
@@ -81,7 +81,7 @@ class Reconciler:
         """
         self._arriving[peer.process] = peer
         try:
-            await self._realm.submit(commands.TaskSetArrived(hello=hello))
+            await self._state_service.submit(commands.TaskSetArrived(hello=hello))
         except Refused as error:
             raise PeerRefusedError(str(error)) from error
         finally:
@@ -100,20 +100,20 @@ class Reconciler:
             case Left():
                 command = commands.RobotLeft(process=process, id=message.id, reason=message.reason)
             case Usage():
-                placed = {e.id for e in self._realm.tables.endpoints.by("task_set", process)}
+                placed = {e.id for e in self._state_service.tables.endpoints.by("task_set", process)}
                 self.book.note(process, message, placed)
                 return
             case _:
                 logger.warning("%s sent a %s, which means nothing here", process, type(message).__name__)
                 return
-        await self._realm.enqueue([command])
+        await self._state_service.enqueue([command])
 
     async def on_gone(self, peer: Peer) -> None:
         """Note that a task set's channel ended."""
         if self._peers.get(peer.process) is peer:
             del self._peers[peer.process]
             self.book.forget(peer.process)
-            await self._realm.submit(commands.TaskSetLeft(process=peer.process))
+            await self._state_service.submit(commands.TaskSetLeft(process=peer.process))
 
     async def read_log(
         self,
@@ -130,7 +130,7 @@ class Reconciler:
             TaskSetAway: Its task set is not connected or does not answer.
         """
         request = LogRequest(id_, node, offset, limit, wish)
-        return await read_log(self._realm.tables, self._peers, request)
+        return await read_log(self._state_service.tables, self._peers, request)
 
     def task_set_of(self, id_: str) -> Peer:
         """Return the connected task set of a container.
@@ -139,7 +139,7 @@ class Reconciler:
             NotFound: There is no such container.
             TaskSetAway: Its task set is not connected, or it waits for a machine.
         """
-        container = self._realm.tables.container(id_)
+        container = self._state_service.tables.container(id_)
         tag = id_.partition("/")[2]
         if container is None:
             raise NotFound(f"there is no container {tag!r}")
@@ -161,10 +161,10 @@ class Reconciler:
             message = Drop(id=withdrawal.id, revision=withdrawal.revision, reason=withdrawal.reason)
             self._send(withdrawal.process, message)
         for id_ in changes.touched:
-            endpoint = self._realm.tables.endpoints.get(id_)
+            endpoint = self._state_service.tables.endpoints.get(id_)
             if endpoint is not None and id_ != changes.answered:
-                self._send(endpoint.task_set, Put(endpoint=self._realm.spec(id_)))
-                copy = self._realm.copy_spec(id_)
+                self._send(endpoint.task_set, Put(endpoint=self._state_service.spec(id_)))
+                copy = self._state_service.copy_spec(id_)
                 if copy is not None:
                     self._send(copy[0], Put(endpoint=copy[1]))
         if changes.arrived:
@@ -174,17 +174,17 @@ class Reconciler:
 
     def probe(self, robot: str) -> None:
         """Have the task set of a robot find out whether the robot is still there."""
-        found = self._realm.tables.robot(robot)
+        found = self._state_service.tables.robot(robot)
         if found is not None:
             self._send(found.task_set, Probe(id=robot))
 
     def _sync(self, process: str) -> None:
         peer = self._peers[process] = self._arriving[process]
-        placed = self._realm.tables.endpoints.by("task_set", process)
-        peer.send(Sync(endpoints=tuple(self._realm.spec(endpoint.id) for endpoint in placed)))
+        placed = self._state_service.tables.endpoints.by("task_set", process)
+        peer.send(Sync(endpoints=tuple(self._state_service.spec(endpoint.id) for endpoint in placed)))
 
     def _notify(self, notice: Notice) -> None:
-        tables = self._realm.tables
+        tables = self._state_service.tables
         user, slash, _ = notice.to.partition("/")
         robots = [tables.robot(notice.to)] if slash else tables.robots(user)
         connected = (

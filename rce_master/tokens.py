@@ -53,7 +53,7 @@ def new_token(
 
 
 class _Submits(Protocol):
-    """Carries out commands: :class:`rce_master.realm.Realm`."""
+    """Carries out commands: :class:`rce_master.state_service.StateService`."""
 
     async def submit_all(self, commands: Sequence[commands.Command]) -> object:
         """Do commands."""
@@ -97,9 +97,9 @@ class Tokens:
         used, self._used = self._used, {}
         return commands.NoteTokenUses(used=used)
 
-    async def run(self, realm: _Submits) -> None:
+    async def run(self, state_service: _Submits) -> None:
         """Note the uses again and again, until cancelled."""
         while True:
             await asyncio.sleep(NOTE_EVERY_S)
             if self._used:
-                await realm.submit_all([self.uses()])
+                await state_service.submit_all([self.uses()])

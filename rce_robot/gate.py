@@ -32,7 +32,7 @@ _log = logging.getLogger(__name__)
 _FORBIDDEN, _CONFLICT = 403, 409
 
 
-class House(Protocol):
+class Admission(Protocol):
     """Who lives here, and who knows who may."""
 
     async def log_in(self, credentials: Credentials, address: str) -> EndpointSpec:
@@ -50,12 +50,12 @@ class Gate:
 
     def __init__(
         self,
-        house: House,
+        admission: Admission,
         settings: SessionSettings,
         origins: Collection[str],
         proxies: TrustedProxies | None = None,
     ) -> None:
-        self._house = house
+        self._admission = admission
         self._settings = settings
         self._origins = origins
         self._proxies = proxies or TrustedProxies()
@@ -107,14 +107,14 @@ class Gate:
     async def _claim(self, credentials: Credentials, address: str) -> Namespace:
         """Log in. A former connection of the robot that turns out to be dead makes room for the new one."""
         try:
-            spec = await self._house.log_in(credentials, address)
+            spec = await self._admission.log_in(credentials, address)
         except HandshakeError as error:
-            namespace = self._house.find(EndpointId(credentials.user, credentials.robot))
+            namespace = self._admission.find(EndpointId(credentials.user, credentials.robot))
             former = None if namespace is None else namespace.session
             if error.status != _CONFLICT or former is None or await former.probe():
                 raise
-            spec = await self._house.log_in(credentials, address)
-        namespace = await self._house.settle(spec)
+            spec = await self._admission.log_in(credentials, address)
+        namespace = await self._admission.settle(spec)
         if namespace.session is not None:
             raise HandshakeError(_CONFLICT, _already(namespace.id, namespace.session.client))
         return namespace

@@ -52,7 +52,7 @@ class Forms(Protocol):
         """Return the forms from and to the robot; raises :class:`rce.link.InterfaceError` for a bad spec."""
 
 
-class Headquarters(Protocol):
+class NamespaceListener(Protocol):
     """What a namespace tells and asks the task set."""
 
     def changed(self, namespace: Namespace) -> None:
@@ -82,7 +82,7 @@ class Namespace:
         id: EndpointId,  # noqa: A002
         hub: LinkHub,
         forms: Forms,
-        headquarters: Headquarters,
+        listener: NamespaceListener,
         address: LinkAddress,
         *,
         call_timeout: float,
@@ -97,7 +97,7 @@ class Namespace:
         self.dropped: Counter[str] = Counter()
         self._live: Session | None = None
         self._forms = forms
-        self._headquarters = headquarters
+        self._listener = listener
         self._call_timeout = call_timeout
         self._interfaces: dict[str, RobotInterface] = {}
         self._applying = asyncio.Lock()
@@ -241,7 +241,7 @@ class Namespace:
 
     async def ask_master(self, request: Request) -> tuple[str, ...]:
         """Have a request of the robot carried out."""
-        return await self._headquarters.ask_master(self.id, request)
+        return await self._listener.ask_master(self.id, request)
 
     def joined(self, session: Session) -> None:
         """Give the robot what it must know at once."""
@@ -261,7 +261,7 @@ class Namespace:
         if self.session is session:
             self.session = None
             self._changed()
-            self._headquarters.robot_left(self, reason)
+            self._listener.robot_left(self, reason)
 
     # rce_robot.interface.RobotSide
 
@@ -356,7 +356,7 @@ class Namespace:
         self._account.note()
 
     def _changed(self) -> None:
-        self._headquarters.changed(self)
+        self._listener.changed(self)
 
     def _failed(self, text: str) -> None:
-        self._headquarters.failed(self, text)
+        self._listener.failed(self, text)

@@ -175,7 +175,7 @@ class RobotTaskSet:
                     tasks.create_task(_end(namespace, "the robot endpoint is shutting down"))
             self._namespaces.clear()
 
-    # What the gate asks: rce_robot.gate.House
+    # What the gate asks: rce_robot.gate.Admission
 
     async def log_in(self, credentials: Credentials, address: str) -> EndpointSpec:
         """Ask the master whether a robot may come in.
@@ -219,7 +219,7 @@ class RobotTaskSet:
         await namespace.apply(spec)
         return namespace
 
-    # What the namespaces ask: rce_robot.namespace.Headquarters
+    # What the namespaces ask: rce_robot.namespace.NamespaceListener
 
     def changed(self, namespace: Namespace) -> None:
         """Report a robot's status, once for all changes of one moment."""

@@ -16,7 +16,7 @@ from rce.config.logs import start_logging
 from rce.ros.errors import RosError
 from rce.ros.multimaster.discovery import Discovery
 from rce.ros.multimaster.listing import list_masters
-from rce.ros.multimaster.neighbourhood import Neighbour, PeerEvent
+from rce.ros.multimaster.peer_table import Neighbour, PeerEvent
 from rce.ros.multimaster.settings import DiscoverySettings, local_master
 
 _DEFAULT = DiscoverySettings()

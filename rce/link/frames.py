@@ -68,7 +68,7 @@ class FrameType(IntEnum):
     SECURE = 7
     """Dialing end's first frame on TCP, where the peer's address wants TLS: the link; TLS begins after it."""
     GRANT = 6
-    """How far the peer may send bulk: an offset of 8 bytes in the stream; see :mod:`rce.link.valve`."""
+    """How far the peer may send bulk: an offset of 8 bytes in the stream (:mod:`rce.link.flow_control`)."""
     OPEN = 8
     """The sender's interface is ready on this channel."""
     CLOSE = 9

@@ -4,7 +4,7 @@ One process of a machine accepts links for all its containers. It reads the HELL
 names the link, and passes the socket with those bytes to the container's process, over a unix socket with
 ``SCM_RIGHTS``. From then on data goes straight to that process::
 
-    peer --TCP--> Doorman --(socket, HELLO)--> HandoverSender ==unix==> HandoverReceiver --> LinkHub.adopt
+    peer --TCP--> LinkAcceptor --(socket, HELLO)--> HandoverSender =unix=> HandoverReceiver --> LinkHub.adopt
 
 The unix socket must keep message boundaries (``SOCK_SEQPACKET`` or ``SOCK_DGRAM``).
 """
@@ -158,7 +158,7 @@ def _receive(sock: socket.socket) -> tuple[bytes, list[int]]:
     return received, list(descriptors)
 
 
-class Doorman:
+class LinkAcceptor:
     """Accepts TCP links for the endpoints of other processes and hands each to the right one.
 
     Args:
@@ -206,7 +206,7 @@ class Doorman:
         sock = socket.create_server((host, port), backlog=512)
         sock.setblocking(False)
         self._sockets.append(sock)
-        self._scope.spawn(self._accept(sock), f"doorman on port {port}")
+        self._scope.spawn(self._accept(sock), f"link acceptor on port {port}")
         taken: int = sock.getsockname()[1]
         return taken
 

@@ -15,7 +15,7 @@ from rce.guard.lobby import Lobby, address_of
 from rce.link.carrier import Carrier, LocalCarrier
 from rce.link.exceptions import LinkError, LinkLost, LinkRefused
 from rce.link.frames import Frame, FrameType, encode
-from rce.link.handover import Doorman
+from rce.link.handover import LinkAcceptor
 from rce.link.handshake import check_answer, encode_hello, encode_welcome, parse_hello
 from rce.link.opening import secured_link
 from rce.link.secure import Adopter, accept_secure, dial_secure
@@ -63,7 +63,7 @@ class LinkHub:
         tls: bool = False,
     ) -> None:
         self._tls = tls
-        self._doormen: list[Doorman] = []
+        self._doormen: list[LinkAcceptor] = []
         self.machine = machine
         self.timeouts = timeouts or LinkTimeouts()
         self.limits = limits or LinkLimits()
@@ -131,9 +131,9 @@ class LinkHub:
 
     async def listen_secure(self, host: str, port: int) -> int:
         """Accept links on TCP, in TLS only. Arguments and result are those of :meth:`listen_tcp`."""
-        doorman = Doorman(self.timeouts, self.limits, tls=True, everything=Adopter(self.adopt))
-        self._doormen.append(doorman)
-        return await doorman.listen(host, port)
+        acceptor = LinkAcceptor(self.timeouts, self.limits, tls=True, everything=Adopter(self.adopt))
+        self._doormen.append(acceptor)
+        return await acceptor.listen(host, port)
 
     async def adopt(self, sock: socket.socket, received: bytes) -> None:
         """Take over a connection that was accepted elsewhere, with what was read from it.
@@ -160,8 +160,8 @@ class LinkHub:
             server.close()
         for path, inode in self._unix_sockets.items():
             unlink_own(path, inode)
-        for doorman in self._doormen:
-            await doorman.close()
+        for acceptor in self._doormen:
+            await acceptor.close()
         await self._greetings.close()
         await asyncio.sleep(0)  # connections that were just being accepted come into view
         carriers = list(self._carriers)

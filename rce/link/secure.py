@@ -64,7 +64,7 @@ def _handed_on(sock: socket.socket) -> socket.socket:
 
 
 class Adopter:
-    """Takes connections that a doorman accepted for a hub of its own process.
+    """Takes connections that a link acceptor accepted for a hub of its own process.
 
     Args:
         adopt: As :meth:`rce.link.hub.LinkHub.adopt`.

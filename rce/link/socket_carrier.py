@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeVar, cast
 from rce.buffers import write_together
 from rce.link.carrier import Carrier, CarrierHandler
 from rce.link.exceptions import LinkLost, ProtocolError
+from rce.link.flow_control import FlowControl
 from rce.link.frames import (
     FRAGMENT_SIZE,
     HANDSHAKE_SIZE,
@@ -20,7 +21,6 @@ from rce.link.frames import (
 )
 from rce.link.lanes import Lanes, frame_chunk
 from rce.link.settings import KIB, MIB
-from rce.link.valve import Valve
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -75,7 +75,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         self._writable = False
         self._straight = False
         """Writable, and without a limit: what finds nothing waiting needs not to ask anybody."""
-        self._valve: Valve | None = None
+        self._flow: FlowControl | None = None
         self.sent = 0
         self.received = 0
         self._handler: CarrierHandler | None = None
@@ -135,9 +135,9 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
 
     def pace(self, pacer: Pacer | None) -> None:
         """Limit what passes."""
-        if not self._ending and (pacer is not None or self._valve is not None):
+        if not self._ending and (pacer is not None or self._flow is not None):
             self._use_valve().pace(pacer)
-            self._look_at_valve()
+            self._look_at_flow()
 
     @property
     def traffic(self) -> tuple[int, int]:
@@ -229,14 +229,14 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
     def get_buffer(self, sizehint: int) -> memoryview:  # noqa: ARG002 - the reader knows better
         """Return where the socket's next bytes go."""
         buffer = self._reader.get_buffer()
-        return buffer if self._valve is None else buffer[: self._valve.read_size]
+        return buffer if self._flow is None else buffer[: self._flow.read_size]
 
     def buffer_updated(self, nbytes: int) -> None:
         """Take bytes of the socket."""
         self.received += nbytes
         self._take(self._reader.advance, nbytes)
-        if self._valve is not None and not self._ending:
-            self._valve.count_received()
+        if self._flow is not None and not self._ending:
+            self._flow.count_received()
 
     def pause_writing(self) -> None:
         """Stop handing bytes to the transport."""
@@ -245,7 +245,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
     def resume_writing(self) -> None:
         """Go on handing bytes to the transport."""
         self._writable = True
-        self._straight = self._valve is None
+        self._straight = self._flow is None
         self.go_on()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -258,7 +258,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         self._closed.set_result(None)
         self._on_closed(self)
 
-    # rce.link.valve.Stream
+    # rce.link.flow_control.Stream
 
     def go_on(self) -> None:
         """Send what waits, as far as the socket takes it and the limits let it pass."""
@@ -277,16 +277,16 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
 
     # Inside
 
-    def _use_valve(self) -> Valve:
-        if self._valve is None:
-            self._valve = Valve(self)
+    def _use_valve(self) -> FlowControl:
+        if self._flow is None:
+            self._flow = FlowControl(self)
             self._straight = False
-        return self._valve
+        return self._flow
 
-    def _look_at_valve(self) -> None:
-        """Do without the valve once nobody has a limit any more."""
-        if self._valve is not None and self._valve.open:
-            self._valve = None
+    def _look_at_flow(self) -> None:
+        """Do without the flow control once nobody has a limit any more."""
+        if self._flow is not None and self._flow.open:
+            self._flow = None
             self._straight = self._writable
 
     def _take(self, read: Callable[[T], list[Frame]], argument: T) -> None:
@@ -324,7 +324,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         except ProtocolError as error:
             self.abort(error)
         else:
-            self._look_at_valve()
+            self._look_at_flow()
 
     def _keep(self, frame: Frame) -> None:
         if len(self._early) > self._limits.max_channels:
@@ -339,7 +339,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         self._turn = None
         budget = _TURN
         while self._lanes and self._writable and not self._ending:
-            chunk = self._lanes.next() if self._valve is None else self._next_through(self._valve)
+            chunk = self._lanes.next() if self._flow is None else self._next_through(self._flow)
             if chunk is None:
                 return
             budget -= self._write(chunk)
@@ -347,13 +347,13 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
                 self._turn = self._loop.call_soon(self._pump)
                 return
 
-    def _next_through(self, valve: Valve) -> Chunk | None:
+    def _next_through(self, flow: FlowControl) -> Chunk | None:
         """Return what may be sent next, paid for. Frames of the link itself never wait: it lives by them."""
         urgent = self._lanes.control or self._lanes.urgent
-        limit = FRAGMENT_SIZE if self._lanes.control else valve.room(urgent=urgent)
+        limit = FRAGMENT_SIZE if self._lanes.control else flow.room(urgent=urgent)
         chunk = self._lanes.next(limit) if limit else None
         if chunk is not None:
-            valve.count_sent(sum(map(len, chunk)), urgent=urgent)
+            flow.count_sent(sum(map(len, chunk)), urgent=urgent)
         return chunk
 
     def _write(self, chunk: Chunk) -> int:
@@ -370,7 +370,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         """Ask a silent peer whether it lives; give a peer up that was silent for too long."""
         now = self._loop.time()
         stood_still = now - self._beat > 2 * self._timeouts.heartbeat  # or this is the first beat
-        paused = self._valve is not None and self._valve.paused
+        paused = self._flow is not None and self._flow.paused
         if stood_still or paused:
             self._heard = now  # nothing was read: that is not the peer's silence
         self._beat = now
@@ -387,8 +387,8 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         if not self._ending:
             self._ending = True
             self._writable = self._straight = False
-            if self._valve is not None:
-                self._valve.close()
+            if self._flow is not None:
+                self._flow.close()
             self._reason = reason
             if self._turn is not None:
                 self._turn.cancel()

@@ -21,7 +21,7 @@ REQUIREMENTS = ".requirements"
 """Folder beside a package, with what its ``requirements.txt`` asked for."""
 
 
-class Outfit(NamedTuple):
+class LaunchEnvironment(NamedTuple):
     """What a node is started with."""
 
     spec: NodeSpec
@@ -91,7 +91,7 @@ class Bundles:
         connections = tuple(one for one in spec.connections if one.interface in tags)
         return msgspec.structs.replace(spec, interfaces=kept, connections=connections)
 
-    def outfit(self, node: NodeSpec, environ: Mapping[str, str]) -> Outfit:
+    def outfit(self, node: NodeSpec, environ: Mapping[str, str]) -> LaunchEnvironment:
         """Work out what a node is started with.
 
         Args:
@@ -103,9 +103,9 @@ class Bundles:
         joined = os.pathsep.join(map(str, path))
         env = {**environ, **dict.fromkeys(PATH_VARIABLES, joined)}
         if bundle is None:
-            return Outfit(node, PackageIndex(path), env)
+            return LaunchEnvironment(node, PackageIndex(path), env)
         requirements = self._root(bundle) / REQUIREMENTS
-        return Outfit(
+        return LaunchEnvironment(
             msgspec.structs.replace(node, pkg=bundle.name),
             PackageIndex(path),
             env,

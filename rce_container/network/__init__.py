@@ -5,6 +5,6 @@ as a descriptor of it, and the shims of the group's containers hold one each. So
 with the group's last container, whoever is killed in whatever order, and nothing has to be swept.
 """
 
-from rce_container.network.networks import Networks, Seat
+from rce_container.network.networks import Membership, Networks
 
-__all__ = ["Networks", "Seat"]
+__all__ = ["Membership", "Networks"]

@@ -28,7 +28,7 @@ _MULTICAST = "224.0.0.0/4"
 _NAMESPACE_LINK = "net:["
 
 
-class Seat(NamedTuple):
+class Membership(NamedTuple):
     """A container's place in its group."""
 
     address: IPv4Interface
@@ -84,7 +84,7 @@ class Networks:
             stack.callback(os.close, inside)
             _plug_in(switch, inside, "probe", IPv4Interface("10.77.0.1/24"), bridge=True)
 
-    def enroll(self, container: EndpointId, group: str, group_ip: str, mark: str, hosts: Path) -> Seat:
+    def enroll(self, container: EndpointId, group: str, group_ip: str, mark: str, hosts: Path) -> Membership:
         """Give a container that is to be started its place.
 
         Args:
@@ -107,7 +107,7 @@ class Networks:
             found = self._groups[key] = _Group(make_namespace(), has_bridge=False)
         found.members[mark] = _Member(container.tag, address, hosts, plugged=False)
         self._of[mark] = key
-        return Seat(address, found.switch)
+        return Membership(address, found.switch)
 
     def adopt(self, container: EndpointId, record: Record, hosts: Path) -> None:
         """Take over a member that an earlier manager attached.

@@ -131,12 +131,12 @@ class CellLedger:
         """
         for robot in self._accounts:
             self.truncate(robot)
-        visits: list[tuple[int, str, int]] = []
+        pending_logins: list[tuple[int, str, int]] = []
         for robot, route in routes.items():
             if route[0][1] != self._accounts[robot].route[-1]:
                 raise InvariantError(f"the plan of {robot} does not begin where its granted cells end")
-            visits.extend((step, robot, cell) for step, cell in route[1:])
-        for _, robot, cell in sorted(visits):
+            pending_logins.extend((step, robot, cell) for step, cell in route[1:])
+        for _, robot, cell in sorted(pending_logins):
             account = self._accounts[robot]
             self._queues.setdefault(cell, deque()).append((robot, account.passed + len(account.route)))
             account.route.append(cell)

@@ -104,7 +104,7 @@ class GridMap:
                     touched.add(cell)
         return touched
 
-    # -- neighbourhood ----------------------------------------------------------------------------
+    # -- neighbours ----------------------------------------------------------------------------
 
     def around(self, cell: int) -> Iterator[int]:
         """Cells of the map that share an edge with ``cell``, blocked or not, ascending."""

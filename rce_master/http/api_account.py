@@ -24,7 +24,7 @@ async def log_in(call: Call) -> models.TokenOut:
     token, record = new_token(user.name, body.label, services.clock(), lifetime)
     # What was used lately must not make room for this one.
     uses = services.tokens.uses()
-    _, outcome = await services.realm.submit_all(
+    _, outcome = await services.state_service.submit_all(
         [uses, commands.AddToken(token=record, password=user.password)]
     )
     if outcome is not None:
@@ -37,7 +37,7 @@ async def log_in(call: Call) -> models.TokenOut:
 @routes.route("DELETE", "/login", "Forget the token that this request carries", status=204, everybody=True)
 async def log_out(call: Call) -> None:
     """Forget the token."""
-    await call.services.realm.submit(commands.RemoveToken(digest=token_digest(call.token)))
+    await call.services.state_service.submit(commands.RemoveToken(digest=token_digest(call.token)))
 
 
 @routes.route("GET", "/user", "Show who you are", reply=models.UserOut)
@@ -50,7 +50,7 @@ async def show_caller(call: Call) -> models.UserOut:
 async def list_users(call: Call) -> models.UsersOut:
     """List all users."""
     views = _views(call)
-    return models.UsersOut(users=[views.user(user) for user in call.services.realm.tables.users])
+    return models.UsersOut(users=[views.user(user) for user in call.services.state_service.tables.users])
 
 
 @routes.route(
@@ -67,7 +67,7 @@ async def add_user(call: Call) -> models.UserOut:
         password=await services.authenticator.hash(digest, call.caller.name),
         created=services.clock(),
     )
-    await services.realm.submit(commands.AddUser(user=user))
+    await services.state_service.submit(commands.AddUser(user=user))
     await services.authenticator.know(user.name, user.password, digest)
     return _views(call).user(user)
 
@@ -75,7 +75,7 @@ async def add_user(call: Call) -> models.UserOut:
 @routes.route("DELETE", "/users/{name}", "Remove a user with all that is theirs", status=204, admin=True)
 async def remove_user(call: Call) -> None:
     """Remove a user."""
-    await call.services.realm.submit(commands.RemoveUser(name=call.path("name")))
+    await call.services.state_service.submit(commands.RemoveUser(name=call.path("name")))
 
 
 @routes.route(
@@ -92,14 +92,14 @@ async def set_password(call: Call) -> None:
     services = call.services
     if name != call.caller.name and not call.is_admin:
         raise Forbidden("only an administrator changes another user's password")
-    if name not in services.realm.tables.users:
+    if name not in services.state_service.tables.users:
         raise NotFound(f"there is no user {name!r}")
     body = call.read(models.PasswordIn)
     if name == call.caller.name:
         await _check_old(call, body.old_password)
     digest = client_digest(body.password)
     hashed = await services.authenticator.hash(digest, call.caller.name)
-    await services.realm.submit(commands.SetPassword(name=name, password=hashed))
+    await services.state_service.submit(commands.SetPassword(name=name, password=hashed))
     await services.authenticator.know(name, hashed, digest)
 
 
@@ -109,7 +109,7 @@ async def set_password(call: Call) -> None:
 async def set_role(call: Call) -> None:
     """Change a role."""
     role = UserRole(call.read(models.RoleIn).role)
-    await call.services.realm.submit(commands.SetRole(name=call.path("name"), role=role))
+    await call.services.state_service.submit(commands.SetRole(name=call.path("name"), role=role))
 
 
 async def _check_old(call: Call, password: str) -> None:
@@ -123,4 +123,4 @@ async def _check_old(call: Call, password: str) -> None:
 
 
 def _views(call: Call) -> Views:
-    return Views(call.services.realm.tables, call.services.reconciler.usage)
+    return Views(call.services.state_service.tables, call.services.reconciler.usage)

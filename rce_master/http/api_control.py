@@ -36,7 +36,7 @@ async def _request(call: Call, kind: str, data: dict[str, Any]) -> None:
     wanted, faults = requests.read(call.owner, kind, data)
     if faults:
         raise Invalid("; ".join(_FAULT.sub(_place, fault) for fault in faults))
-    for outcome in await call.services.realm.submit_all(wanted):
+    for outcome in await call.services.state_service.submit_all(wanted):
         if outcome is not None:
             raise outcome
 

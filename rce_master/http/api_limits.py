@@ -39,13 +39,13 @@ async def set_limits(call: Call) -> models.UserLimitsOut:
     name = call.path("name")
     given = call.read(models.LimitsIn).model_dump(exclude_none=True)
     command = commands.SetLimits(user=name, limits={kind: read_limit(kind, given[kind]) for kind in given})
-    await call.services.realm.submit(command)
+    await call.services.state_service.submit(command)
     return _shown(call, name)
 
 
 def _shown(call: Call, name: str) -> models.UserLimitsOut:
     services = call.services
-    tables, settings = services.realm.tables, services.realm.state.settings
+    tables, settings = services.state_service.tables, services.state_service.state.settings
     user = tables.users.get(name)
     if user is None:
         raise NotFound(f"there is no user {name!r}")

@@ -35,8 +35,8 @@ async def undrain_machine(call: Call) -> models.MachinesOut:
 
 
 async def _set(call: Call, *, draining: bool) -> models.MachinesOut:
-    machine, tables = call.path("machine"), call.services.realm.tables
-    await call.services.realm.submit(commands.SetDraining(machine=machine, draining=draining))
+    machine, tables = call.path("machine"), call.services.state_service.tables
+    await call.services.state_service.submit(commands.SetDraining(machine=machine, draining=draining))
     views = Views(tables, call.services.reconciler.usage)
     found = [s for s in tables.task_sets if machine in (s.process, s.machine.name)]
     return models.MachinesOut(machines=[views.machine(s) for s in found])

@@ -9,7 +9,7 @@ from rce.bundles.exceptions import BadKey
 from rce.bundles.signing import key_id
 from rce.web.bodies import read_pieces
 from rce.web.openapi import Query
-from rce_master.bundles.office import Wish
+from rce_master.bundles.service import Wish
 from rce_master.exceptions import Invalid, NotFound
 from rce_master.http import package_models as models
 from rce_master.http.routes import OF_USER, Call, RouteTable
@@ -28,7 +28,7 @@ _QUERY = (OF_USER,)
 @routes.route("GET", "/packages", "List packages that users brought", reply=models.PackagesOut, query=_QUERY)
 async def list_packages(call: Call) -> models.PackagesOut:
     """List all versions of all packages."""
-    tables = call.services.realm.tables
+    tables = call.services.state_service.tables
     scope = call.scope
     found = tables.bundles if scope is None else tables.bundles.by("user", scope)
     users = {bundle.user for bundle in found}
@@ -47,7 +47,7 @@ async def list_packages(call: Call) -> models.PackagesOut:
 @routes.route("GET", "/packages/{name}/{version}", "Show a package", reply=models.PackageOut, query=_QUERY)
 async def show_package(call: Call) -> models.PackageOut:
     """Show a version of a package."""
-    tables = call.services.realm.tables
+    tables = call.services.state_service.tables
     name, version = call.path("name"), call.path("version")
     found = tables.bundles.get(bundle_key(call.owner, name, version))
     if found is None:
@@ -79,7 +79,7 @@ async def push_package(call: Call) -> models.PackageOut:
     )
     size = call.request.content_length or 0
     bundle, warnings = await call.services.packages.push(wish, size, read_pieces(call.request))
-    return _shown(call.services.realm.tables, bundle, warnings)
+    return _shown(call.services.state_service.tables, bundle, warnings)
 
 
 @routes.route(
@@ -88,7 +88,7 @@ async def push_package(call: Call) -> models.PackageOut:
 async def remove_package(call: Call) -> None:
     """Remove a version that no node needs."""
     command = commands.RemoveBundle(user=call.owner, name=call.path("name"), version=call.path("version"))
-    await call.services.realm.submit(command)
+    await call.services.state_service.submit(command)
 
 
 @routes.route(
@@ -96,7 +96,7 @@ async def remove_package(call: Call) -> None:
 )
 async def list_package_keys(call: Call) -> models.PackageKeysOut:
     """List a user's keys."""
-    found = call.services.realm.tables.package_keys.by("user", call.owner)
+    found = call.services.state_service.tables.package_keys.by("user", call.owner)
     return models.PackageKeysOut(keys=[_key_out(key) for key in found])
 
 
@@ -116,14 +116,14 @@ async def register_package_key(call: Call) -> models.PackageKeyOut:
     except BadKey as error:
         raise Invalid(str(error)) from error
     key = PackageKey(user=call.caller.name, key=body.key, label=body.label, created=call.services.clock())
-    await call.services.realm.submit(commands.AddPackageKey(key=key))
+    await call.services.state_service.submit(commands.AddPackageKey(key=key))
     return _key_out(key)
 
 
 @routes.route("DELETE", "/package-keys/{id}", "Trust a key no more", status=204, query=_QUERY)
 async def revoke_package_key(call: Call) -> None:
     """Trust a key no more."""
-    await call.services.realm.submit(commands.RemovePackageKey(user=call.owner, id=call.path("id")))
+    await call.services.state_service.submit(commands.RemovePackageKey(user=call.owner, id=call.path("id")))
 
 
 def _shown(tables: Tables, bundle: Bundle, warnings: tuple[str, ...] = ()) -> models.PackageOut:

@@ -20,14 +20,16 @@ routes = RouteTable("fleet")
 async def list_robots(call: Call) -> models.RobotsOut:
     """List robots."""
     views = _views(call)
-    return models.RobotsOut(robots=[views.robot(r) for r in call.services.realm.tables.robots(call.scope)])
+    return models.RobotsOut(
+        robots=[views.robot(r) for r in call.services.state_service.tables.robots(call.scope)]
+    )
 
 
 @routes.route("GET", "/containers", "List containers", reply=models.ContainersOut, query=(OF_USER,))
 async def list_containers(call: Call) -> models.ContainersOut:
     """List containers."""
     views = _views(call)
-    found = call.services.realm.tables.containers(call.scope)
+    found = call.services.state_service.tables.containers(call.scope)
     return models.ContainersOut(containers=[views.container(c) for c in found])
 
 
@@ -35,7 +37,7 @@ async def list_containers(call: Call) -> models.ContainersOut:
 async def list_nodes(call: Call) -> models.NodesOut:
     """List nodes."""
     views = _views(call)
-    found = call.services.realm.tables.containers(call.scope)
+    found = call.services.state_service.tables.containers(call.scope)
     return models.NodesOut(nodes=[node for c in found for node in views.nodes(c)])
 
 
@@ -43,7 +45,7 @@ async def list_nodes(call: Call) -> models.NodesOut:
 async def list_parameters(call: Call) -> models.ParametersOut:
     """List parameters."""
     views = _views(call)
-    found = call.services.realm.tables.containers(call.scope)
+    found = call.services.state_service.tables.containers(call.scope)
     return models.ParametersOut(parameters=[p for c in found for p in views.parameters(c)])
 
 
@@ -65,20 +67,22 @@ async def list_connections(call: Call) -> models.ConnectionsOut:
 async def list_machines(call: Call) -> models.MachinesOut:
     """List task sets."""
     views = _views(call)
-    return models.MachinesOut(machines=[views.machine(s) for s in call.services.realm.tables.task_sets])
+    return models.MachinesOut(
+        machines=[views.machine(s) for s in call.services.state_service.tables.task_sets]
+    )
 
 
 def _views(call: Call) -> Views:
-    return Views(call.services.realm.tables, call.services.reconciler.usage)
+    return Views(call.services.state_service.tables, call.services.reconciler.usage)
 
 
 def _endpoints(call: Call) -> Iterable[Endpoint]:
-    tables = call.services.realm.tables
+    tables = call.services.state_service.tables
     return tables.endpoints if call.scope is None else tables.endpoints.by("user", call.scope)
 
 
 def _links(call: Call) -> Iterable[Link]:
-    tables = call.services.realm.tables
+    tables = call.services.state_service.tables
     if call.scope is None:
         return tables.links
     found = (

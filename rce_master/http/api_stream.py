@@ -118,7 +118,7 @@ async def stream_events(call: Call) -> web.StreamResponse:
 
 
 async def _stream(call: Call, scope: str | None, last: int) -> web.StreamResponse:
-    owner = call.services.realm.tables.users.get(scope or "")
+    owner = call.services.state_service.tables.users.get(scope or "")
     born = owner.created if owner is not None else 0.0  # what happened before was another one's of that name
     response = web.StreamResponse(
         headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store", "X-Accel-Buffering": "no"}

@@ -46,7 +46,7 @@ async def add_token(call: Call) -> models.TokenOut:
 )
 async def revoke_token(call: Call) -> None:
     """Revoke a token."""
-    await call.services.realm.submit(commands.RevokeToken(user=call.owner, id=call.path("id")))
+    await call.services.state_service.submit(commands.RevokeToken(user=call.owner, id=call.path("id")))
 
 
 @routes.route(
@@ -87,18 +87,18 @@ async def add_robot_token(call: Call) -> models.TokenOut:
 async def revoke_robot_token(call: Call) -> None:
     """Revoke a robot's token."""
     wanted = commands.RevokeRobotToken(user=call.owner, robot=call.path("robot"))
-    await call.services.realm.submit(wanted)
+    await call.services.state_service.submit(wanted)
 
 
 async def _make(
     call: Call, user: str, label: str, scope: str, days: float, *, replaces: bool = False
 ) -> models.TokenOut:
     services = call.services
-    owner = services.realm.tables.users.get(user)
+    owner = services.state_service.tables.users.get(user)
     if owner is None:
         raise Forbidden(f"user {user!r} was removed meanwhile")
     token, record = new_token(user, label, services.clock(), days * _DAY_S, scope=scope)
-    await services.realm.submit(commands.AddToken(token=record, replaces=replaces))
+    await services.state_service.submit(commands.AddToken(token=record, replaces=replaces))
     return models.TokenOut(
         token=token, userID=user, role=owner.role.value, expires=record.expires, id=record.id, scope=scope
     )
@@ -108,7 +108,7 @@ def _of(call: Call) -> list[Token]:
     if call.owner != call.caller.name and not call.is_admin:
         raise Forbidden("only an administrator sees the tokens of others")
     now = call.services.clock()
-    found = call.services.realm.tables.tokens.by("user", call.owner)
+    found = call.services.state_service.tables.tokens.by("user", call.owner)
     return sorted((token for token in found if not token.is_expired(now)), key=lambda token: token.created)
 
 

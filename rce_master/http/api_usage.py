@@ -65,7 +65,7 @@ async def _stream(call: Call, scope: str | None, interval: int) -> web.StreamRes
 
 def _usage(call: Call, scope: str | None) -> UsageOut:
     services = call.services
-    views = UsageViews(services.realm.tables, services.reconciler.book)
+    views = UsageViews(services.state_service.tables, services.reconciler.book)
     return UsageOut(
         time=services.clock(),
         containers=views.containers(scope),

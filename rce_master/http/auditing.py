@@ -42,7 +42,7 @@ def _action(route: Route) -> str:
 def _claimed(call: Call) -> str:
     """Return the name that a login is for, if there is such a user: else it may be a password."""
     name = str(getattr(call.body, "userID", ""))
-    return name if name in call.services.realm.tables.users else ""
+    return name if name in call.services.state_service.tables.users else ""
 
 
 def _subject(call: Call) -> str:

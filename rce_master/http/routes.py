@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
     from rce_master.audit import AuditLog
     from rce_master.auth import Authenticator
-    from rce_master.bundles.office import PackageOffice
+    from rce_master.bundles.service import PackageService
     from rce_master.events import EventLog
     from rce_master.executions import Executions
     from rce_master.quotas import Quotas
-    from rce_master.realm import Realm
     from rce_master.reconciler import Reconciler
     from rce_master.state.records import User
+    from rce_master.state_service import StateService
     from rce_master.tokens import Tokens
 
 M = TypeVar("M", bound="BaseModel")
@@ -43,7 +43,7 @@ _NUMBER = re.compile(r"-?[0-9]{1,18}")
 class Services:
     """What the handlers work with."""
 
-    realm: Realm
+    state_service: StateService
     reconciler: Reconciler
     authenticator: Authenticator
     events: EventLog
@@ -51,7 +51,7 @@ class Services:
     """Seconds since 1970."""
     token_lifetime: float
     """Seconds."""
-    packages: PackageOffice
+    packages: PackageService
     executions: Executions
     tokens: Tokens
     quotas: Quotas
@@ -132,7 +132,7 @@ class Call:
         looks = looks and self.caller.role.sees_all
         if name != self.caller.name and not self.is_admin and not looks:
             raise Forbidden("only an administrator controls, and only roles above user see, what others have")
-        if name not in self.services.realm.tables.users:
+        if name not in self.services.state_service.tables.users:
             raise NotFound(f"there is no user {name!r}")
         return name
 

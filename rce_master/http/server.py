@@ -52,9 +52,9 @@ def make_app(
     """
     guard = _origin_guard(frozenset(allowed_origins), names or ServerNames())
     app = web.Application(middlewares=[guard, _errors], client_max_size=MAX_BODY)
-    entry = Entry(services.realm.tables, asyncio.get_running_loop().time)
+    entry = Entry(services.state_service.tables, asyncio.get_running_loop().time)
     app.router.add_get("/", entry.handle)
-    app.router.add_get("/healthz", Health(services.realm).handle)
+    app.router.add_get("/healthz", Health(services.state_service).handle)
     app.router.add_get("/metrics", _metrics(services))
     app.router.add_route("*", PREFIX + "/{rest:.*}", LateApi(services).handle)
     return app
@@ -69,7 +69,7 @@ def _metrics(services: Services) -> Handler:
         from rce_master.http.metrics import make_answer  # takes memory that only scraped masters spend
 
         checks = services.authenticator
-        return make_answer(services.realm.tables, services.reconciler.book, lambda: checks.checks)
+        return make_answer(services.state_service.tables, services.reconciler.book, lambda: checks.checks)
 
     async def handle(request: web.Request) -> web.Response:
         check_metrics(request, services)

@@ -164,14 +164,14 @@ async def test_robot_and_container_hear_what_the_other_latched(tmp_path: Path) -
         subjects = "map:/local_map", "string:/robot_description", "tf:/tf_static"
 
         await graph.says(*listener, text=f"{AT_ROBOT}.")
-        async with visitor(engine, "box") as visit:
-            await visit.late(f"{IN_CLOUD}.", *subjects)
+        async with visitor(engine, "box") as pending_login:
+            await pending_login.late(f"{IN_CLOUD}.", *subjects)
 
         await restart(*engine.robots, engine.container, bridge)
         kill_processes(engine, "rce_container.environment")
         await graph.says(*listener, text=AT_ROBOT)
-        async with visitor(engine, "box") as visit:
-            await visit.late(IN_CLOUD, *subjects)
+        async with visitor(engine, "box") as pending_login:
+            await pending_login.late(IN_CLOUD, *subjects)
 
 
 async def test_container_hears_what_another_one_latched(tmp_path: Path) -> None:
@@ -193,10 +193,10 @@ async def test_container_hears_what_another_one_latched(tmp_path: Path) -> None:
         await owner.send(
             "CX", {"connect": [{"tagA": f"source/{tag}", "tagB": f"target/{tag}"} for tag, _, _ in DOWN]}
         )
-        async with visitor(engine, "target") as visit:
-            await visit.late(f"{said}.", *subjects)
+        async with visitor(engine, "target") as pending_login:
+            await pending_login.late(f"{said}.", *subjects)
             kill_processes(engine, "latcher.py")
-            await visit.late(said, *subjects)
+            await pending_login.late(said, *subjects)
             await restart(engine.container)
             kill_processes(engine, "rce_container.environment")
-            await visit.late(said, *subjects)
+            await pending_login.late(said, *subjects)

@@ -39,7 +39,7 @@ from rce.control.model import (
     NodeState,
 )
 from rce.link import Buffer, Endpoint, Interface, LinkHub, Port
-from rce.link.handover import Doorman
+from rce.link.handover import LinkAcceptor
 from rce.protocol.names import EndpointId
 from rce_container.bundles.cache import BundleCache
 from rce_container.bundles.supply import Library
@@ -166,8 +166,8 @@ class Machine:
             packages=(self.packages, examples_dir()),
             **{"usage_interval": 0.2, "interrupt_timeout": 5.0, **options},
         )
-        doorman = Doorman()
-        port = await doorman.listen("127.0.0.1", 0)
+        acceptor = LinkAcceptor()
+        port = await acceptor.listen("127.0.0.1", 0)
         with (
             StateFolder(self.folder / "state", self.folder / "run") as state,
             contextlib.closing(choose_limiter(state.token, state.cgroups)) as limiter,
@@ -180,7 +180,7 @@ class Machine:
                 runtimes=self.runtimes,
                 runtime=self.runtime,
                 state=state,
-                doorman=doorman,
+                acceptor=acceptor,
                 links=("127.0.0.1", port),
                 limiter=limiter,
                 library=self.library,
@@ -199,7 +199,7 @@ class Machine:
                 task.cancel()
                 waiting.cancel()
                 await asyncio.gather(task, waiting, return_exceptions=True)
-                await doorman.close()
+                await acceptor.close()
 
     @contextlib.asynccontextmanager
     async def engine(self, **options: Any) -> AsyncIterator[Manager]:

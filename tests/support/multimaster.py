@@ -28,7 +28,7 @@ def node(name: str, uri: str, **more: Any) -> Node:
     return Node(name, argv=[], master_uri=uri, **more)
 
 
-class Neighbourhood:
+class DiscoveryNetwork:
     """Masters of one test share a multicast port that no other test uses."""
 
     def __init__(self) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from rce.ros.multimaster import messages
-from rce.ros.multimaster.neighbourhood import Link, Neighbour, PeerEvent
+from rce.ros.multimaster.peer_table import Link, Neighbour, PeerEvent
 from rce.ros.node import Node, Publisher
 from rce.ros.types.values import Time
 

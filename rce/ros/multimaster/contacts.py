@@ -11,7 +11,7 @@ from rce.ros.multimaster import messages
 from rce.ros.multimaster.errors import MalformedState
 from rce.ros.multimaster.filters import SyncFilter
 from rce.ros.multimaster.monitor import Origins
-from rce.ros.multimaster.neighbourhood import Contact, PeerKey
+from rce.ros.multimaster.peer_table import Contact, PeerKey
 from rce.ros.multimaster.source import Snapshot
 from rce.ros.multimaster.state import MasterInfo, host_of
 from rce.ros.node import Node, ServiceClient

@@ -20,12 +20,12 @@ from rce.ros.multimaster.errors import MalformedHeartbeat, MultimasterError
 from rce.ros.multimaster.events import EventQueue
 from rce.ros.multimaster.heartbeat import Heartbeat, Kind, decode
 from rce.ros.multimaster.monitor import MasterMonitor
-from rce.ros.multimaster.neighbourhood import (
+from rce.ros.multimaster.peer_table import (
     Contact,
     Neighbour,
-    Neighbourhood,
     PeerEvent,
     PeerKey,
+    PeerTable,
     Step,
 )
 from rce.ros.multimaster.robot_hosts import RobotHosts
@@ -65,7 +65,7 @@ class Discovery:
         self.settings = settings = settings or DiscoverySettings()
         self._core = core
         self._master_uri = core.uri if core is not None else local_master(settings.master_uri)
-        self._neighbours = Neighbourhood(settings.patience)
+        self._neighbours = PeerTable(settings.patience)
         self._watches: set[EventQueue[PeerEvent]] = set()
         self._beat_now = asyncio.Event()
         self._robots = RobotHosts(settings.robot_addresses, self._beat_now.set)

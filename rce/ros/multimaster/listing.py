@@ -5,7 +5,7 @@ from __future__ import annotations
 from rce.ros.errors import MasterRefused
 from rce.ros.multimaster import messages
 from rce.ros.multimaster.errors import NoDiscovery
-from rce.ros.multimaster.neighbourhood import Neighbour
+from rce.ros.multimaster.peer_table import Neighbour
 from rce.ros.node import Node
 from rce.ros.node.master import MasterClient
 from rce.ros.xmlrpc import RpcClient

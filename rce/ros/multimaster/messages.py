@@ -12,7 +12,7 @@ from typing import Any
 
 from rce.ros.multimaster.heartbeat import Stamp
 from rce.ros.multimaster.monitor import Origins
-from rce.ros.multimaster.neighbourhood import Neighbour, PeerChange, PeerEvent
+from rce.ros.multimaster.peer_table import Neighbour, PeerChange, PeerEvent
 from rce.ros.multimaster.plan import Registration, RegistrationKind
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry

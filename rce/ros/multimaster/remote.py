@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from rce.ros.errors import RosError
 from rce.ros.multimaster.contacts import ask_state
 from rce.ros.multimaster.filters import SyncFilter
-from rce.ros.multimaster.neighbourhood import Neighbour
+from rce.ros.multimaster.peer_table import Neighbour
 from rce.ros.multimaster.plan import unreachable_nodes, wanted
 from rce.ros.multimaster.registrar import Registrar
 from rce.ros.multimaster.state import MasterInfo

@@ -13,7 +13,7 @@ from rce.ros.multimaster.addresses import (
     RPC_PORT_OFFSET,
 )
 from rce.ros.multimaster.heartbeat import MAX_RATE
-from rce.ros.multimaster.neighbourhood import Patience
+from rce.ros.multimaster.peer_table import Patience
 from rce.ros.node.settings import DEFAULT_MASTER_URI
 
 _PATIENCE = Patience()

@@ -16,7 +16,7 @@ from rce.ros.multimaster.addresses import master_name
 from rce.ros.multimaster.errors import NoDiscovery
 from rce.ros.multimaster.filters import SyncLists
 from rce.ros.multimaster.listing import masters_known_at
-from rce.ros.multimaster.neighbourhood import Neighbour, PeerChange, PeerEvent
+from rce.ros.multimaster.peer_table import Neighbour, PeerChange, PeerEvent
 from rce.ros.multimaster.registrar import Registrar
 from rce.ros.multimaster.relay.exporter import Exporter
 from rce.ros.multimaster.relay.frames import Frame

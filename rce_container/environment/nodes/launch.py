@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from rce.ros.substitution import split_arguments
-from rce_container.environment.bundles import Outfit
+from rce_container.environment.bundles import LaunchEnvironment
 from rce_container.environment.exceptions import NodeError
 from rce_container.environment.nodes.system import system_environ
 
@@ -28,7 +28,7 @@ class Launch(NamedTuple):
     """The global ROS name that it was told to take; empty if it chooses by itself."""
 
 
-def prepare(outfit: Outfit, mark: str) -> Launch:
+def prepare(outfit: LaunchEnvironment, mark: str) -> Launch:
     """Work out how to start a node.
 
     Args:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rce.control.model import NodeSpec
-from rce_container.environment.bundles import Outfit
+from rce_container.environment.bundles import LaunchEnvironment
 from rce_container.environment.exceptions import NodeError
 from rce_container.environment.logs.node_log import NodeLog
 from rce_container.environment.logs.pump import Pump
@@ -32,7 +32,7 @@ class Workshop:
     """What nodes are made with."""
 
     reaper: Reaper
-    outfit: Callable[[NodeSpec], Outfit]
+    outfit: Callable[[NodeSpec], LaunchEnvironment]
     """Says what a node is started with."""
     mark: str
     home: str

@@ -13,7 +13,7 @@ from support.cloud import PASSWORD, Cloud, running_cloud
 
 from rce_client.backoff import Backoff
 from rce_client.connection import Connection
-from rce_client.courier import Timing
+from rce_client.engine_transport import Timing
 from rce_robot.websocket import RobotSocket
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from rce.control.model import (
     LinkSpec,
 )
 from rce.link import Endpoint, Interface, InterfaceError, LinkHub, LinkLimits, LinkTimeouts, PeerFault
-from rce.link.handover import Doorman, HandoverReceiver, HandoverSender
+from rce.link.handover import HandoverReceiver, HandoverSender, LinkAcceptor
 from rce.protocol.names import EndpointId
 
 if TYPE_CHECKING:
@@ -211,19 +211,19 @@ class Rig:
             party.address = LinkAddress(machine="", host="127.0.0.1", port=port, tls=True)
         elif way in ("handed-over", "handed-over-secure"):
             tls = way == "handed-over-secure"
-            port = await self.doorman(hub, ["L"], tls=tls)
+            port = await self.acceptor(hub, ["L"], tls=tls)
             party.address = LinkAddress(machine="", host="127.0.0.1", port=port, tls=tls)
 
-    async def doorman(self, hub: LinkHub, links: list[str], *, tls: bool = False) -> int:
+    async def acceptor(self, hub: LinkHub, links: list[str], *, tls: bool = False) -> int:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         sender = HandoverSender(ours)
         self.stack.callback(sender.close)
         receiver = HandoverReceiver(theirs, hub.adopt)
         self.stack.push_async_callback(receiver.close)
-        doorman = Doorman(TIMEOUTS, tls=tls)
-        self.stack.push_async_callback(doorman.close)
-        await doorman.assign(sender, links)
-        return await doorman.listen("127.0.0.1", 0)
+        acceptor = LinkAcceptor(TIMEOUTS, tls=tls)
+        self.stack.push_async_callback(acceptor.close)
+        await acceptor.assign(sender, links)
+        return await acceptor.listen("127.0.0.1", 0)
 
     async def pair(
         self, way: str, limits: LinkLimits | None = None, **timeouts: float

@@ -90,7 +90,7 @@ async def test_limit_changes_while_it_is_reached(rig: Rig, way: str, outward: bo
         assert isinstance(carrier, SocketCarrier)
         a.fakes["i1"].port.send(b"settled")
         await b.fakes["i1"].received.get()
-        assert carrier._valve is None, "without a limit nobody asks for one"
+        assert carrier._flow is None, "without a limit nobody asks for one"
 
 
 async def test_limit_that_is_reached_drops_the_senders_own_oldest(rig: Rig) -> None:

@@ -121,7 +121,7 @@ async def test_first_login_beside_an_attacker_at_the_same_address(run_site: RunS
     guessed = itertools.repeat("victim") if names == "one user's" else inventions
     async with run_site(log_in=False) as site:
         victim = User(name="victim", role=UserRole.USER, password=HASHER.hash("secret"), created=0.0)
-        await site.master.realm.submit(AddUser(user=victim))
+        await site.master.state_service.submit(AddUser(user=victim))
         attackers = asyncio.create_task(attack(site.url, guessed, 20))
         try:
             while await password_checks(site.url) < (FREE if names == "one user's" else FREE_OF_ADDRESS):

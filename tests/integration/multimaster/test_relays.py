@@ -11,7 +11,7 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 import pytest
-from support.multimaster import STRING, Neighbourhood, node
+from support.multimaster import STRING, DiscoveryNetwork, node
 
 from rce.ros.core import Core
 from rce.ros.errors import ServiceFault
@@ -112,11 +112,11 @@ async def test_a_throttled_relay_holds_back(core: Core) -> None:
         assert relay.passed == 1
 
 
-async def test_a_namespace_for_a_master(neighbourhood: Neighbourhood) -> None:
+async def test_a_namespace_for_a_master(network: DiscoveryNetwork) -> None:
     lists = SyncLists.read({"ignore_topics": ["/secret"]})
     async with (
-        neighbourhood.machine(name="robot") as robot,
-        neighbourhood.machine(namespaces={"robot": "Robot1"}, lists=lists) as station,
+        network.machine(name="robot") as robot,
+        network.machine(namespaces={"robot": "Robot1"}, lists=lists) as station,
         node("amcl", robot.uri) as amcl,
         node("planner", station.uri) as planner,
     ):

@@ -13,7 +13,7 @@ from rce_container.exceptions import LimitError
 from rce_container.limits import Cell, CellUsage, Limits, RlimitLimiter, limits_of
 from rce_container.limits.base import Troubles, in_megabytes
 from rce_container.limits.cgroup1 import parse_io
-from rce_container.limits.warden import Warden
+from rce_container.limits.enforcer import LimitEnforcer
 from rce_container.settings import ContainerSettings
 
 MB = 1 << 20
@@ -101,49 +101,49 @@ OUT_OF_MEMORY = (
 
 
 def test_a_kill_is_claimed_once(cell: PaperCell) -> None:
-    warden = Warden("box", cell, SETTINGS)
-    assert warden.claim() == ""
+    enforcer = LimitEnforcer("box", cell, SETTINGS)
+    assert enforcer.claim() == ""
     cell.struck = Troubles(oom_kills=2)
-    assert [warden.claim() for _ in range(3)] == [OUT_OF_MEMORY, OUT_OF_MEMORY, ""]
-    assert [warden.review() for _ in range(3)] == [[], [], []]
+    assert [enforcer.claim() for _ in range(3)] == [OUT_OF_MEMORY, OUT_OF_MEMORY, ""]
+    assert [enforcer.review() for _ in range(3)] == [[], [], []]
 
 
 def test_kills_before_an_adoption_are_nobodys(cell: PaperCell) -> None:
     cell.struck = Troubles(oom_kills=2)
-    assert Warden("box", cell, SETTINGS).claim() == ""
+    assert LimitEnforcer("box", cell, SETTINGS).claim() == ""
 
 
 def test_a_kill_that_nobody_claims_is_told_after_a_while(cell: PaperCell) -> None:
-    warden = Warden("box", cell, SETTINGS)
+    enforcer = LimitEnforcer("box", cell, SETTINGS)
     cell.struck = Troubles(oom_kills=1)
-    assert warden.review() == [], "the node's end may be reported yet"
-    assert warden.review() == [f"a process that a node started was killed: {OUT_OF_MEMORY}"]
-    assert warden.review() == []
-    assert warden.claim() == ""
+    assert enforcer.review() == [], "the node's end may be reported yet"
+    assert enforcer.review() == [f"a process that a node started was killed: {OUT_OF_MEMORY}"]
+    assert enforcer.review() == []
+    assert enforcer.claim() == ""
 
 
 def test_a_claim_in_the_meantime_is_not_told_twice(cell: PaperCell) -> None:
-    warden = Warden("box", cell, SETTINGS)
+    enforcer = LimitEnforcer("box", cell, SETTINGS)
     cell.struck = Troubles(oom_kills=1)
-    warden.review()
-    assert warden.claim() == OUT_OF_MEMORY
-    assert warden.review() == []
+    enforcer.review()
+    assert enforcer.claim() == OUT_OF_MEMORY
+    assert enforcer.review() == []
 
 
 def test_memory_of_the_machine_is_told_from_that_of_the_container(cell: PaperCell) -> None:
     cell.peak = 10 * MB
-    warden = Warden("box", cell, SETTINGS)
+    enforcer = LimitEnforcer("box", cell, SETTINGS)
     cell.struck = Troubles(oom_kills=3)
-    assert warden.claim_all() == "out of memory: its machine has no more"
-    assert warden.claim() == ""
+    assert enforcer.claim_all() == "out of memory: its machine has no more"
+    assert enforcer.claim() == ""
 
 
 def test_refused_processes_are_told_once_for_each_spell(cell: PaperCell) -> None:
-    warden = Warden("box", cell, SETTINGS)
+    enforcer = LimitEnforcer("box", cell, SETTINGS)
     texts = []
     for count in (0, 5, 9, 9, 10):
         cell.struck = Troubles(refused_forks=count)
-        texts.append(warden.review())
+        texts.append(enforcer.review())
     text = (
         "its limit of 50 processes and threads is reached, so it cannot start more; "
         "ask for more slots with `rce resize box --size 2`"
@@ -152,19 +152,19 @@ def test_refused_processes_are_told_once_for_each_spell(cell: PaperCell) -> None
 
 
 async def test_limits_that_cannot_be_are_told_once(cell: PaperCell) -> None:
-    warden = Warden("box", cell, SETTINGS)
+    enforcer = LimitEnforcer("box", cell, SETTINGS)
     cell.refusal = "it is too full"
-    assert await warden.apply(Resources()) == "it is too full; the limits stay as they were"
-    assert await warden.apply(Resources()) == ""
+    assert await enforcer.apply(Resources()) == "it is too full; the limits stay as they were"
+    assert await enforcer.apply(Resources()) == ""
     assert cell.limits.memory == 64 * MB
     cell.refusal = ""
-    assert await warden.apply(Resources()) == ""
+    assert await enforcer.apply(Resources()) == ""
     assert cell.limits == limits_of(Resources(), SETTINGS)
 
 
 async def test_the_newest_limits_win(cell: PaperCell) -> None:
-    warden = Warden("box", cell, SETTINGS)
+    enforcer = LimitEnforcer("box", cell, SETTINGS)
     async with asyncio.TaskGroup() as tasks:
         for size in (1, 2, 3):
-            tasks.create_task(warden.apply(Resources(size=size)))
+            tasks.create_task(enforcer.apply(Resources(size=size)))
     assert cell.limits.memory == 300 * MB

@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from rce.ros.multimaster.heartbeat import Heartbeat, Kind, Stamp
-from rce.ros.multimaster.neighbourhood import (
+from rce.ros.multimaster.peer_table import (
     MAX_PEERS,
     Contact,
-    Neighbourhood,
     Patience,
     PeerChange,
     PeerKey,
+    PeerTable,
     Step,
 )
 
@@ -26,8 +26,8 @@ def beat(secs: int = 1, *, rate: float = 1.0, kind: Kind = Kind.STATE, local: in
     return Heartbeat(kind, PORT, rate, Stamp(secs, 0), Stamp(local, 0))
 
 
-def known(**patience: float) -> Neighbourhood:
-    found = Neighbourhood(Patience(**patience))
+def known(**patience: float) -> PeerTable:
+    found = PeerTable(Patience(**patience))
     assert found.received(HOST, beat(), 0.0).ask_contact == [KEY]
     step = found.contacted(KEY, CONTACT, 0.0)
     assert changes(step) == [(PeerChange.NEW, True)]
@@ -39,7 +39,7 @@ def changes(step: Step) -> list[tuple[PeerChange, bool]]:
 
 
 def test_a_master_is_told_of_once_it_said_its_name() -> None:
-    found = Neighbourhood()
+    found = PeerTable()
     assert found.received(HOST, beat(), 0.0).events == []
     assert found.masters == []
     found.contacted(KEY, CONTACT, 0.1)
@@ -52,7 +52,7 @@ def test_a_master_is_told_of_once_it_said_its_name() -> None:
 
 
 def test_a_name_that_is_not_answered_is_asked_for_again() -> None:
-    found = Neighbourhood()
+    found = PeerTable()
     found.received(HOST, beat(), 0.0)
     assert found.tick(1.0).ask_contact == []
     assert found.tick(2.0).ask_contact == [KEY]
@@ -107,7 +107,7 @@ def test_a_lost_master_is_forgotten_later() -> None:
 
 
 def test_rare_heartbeats_lead_to_questions_and_then_to_a_loss() -> None:
-    found = Neighbourhood()
+    found = PeerTable()
     found.received(HOST, beat(rate=0.0), 0.0)
     found.contacted(KEY, CONTACT, 0.0)
     assert found.tick(60.0).request_state == []
@@ -117,7 +117,7 @@ def test_rare_heartbeats_lead_to_questions_and_then_to_a_loss() -> None:
 
 
 def test_an_answer_ends_the_questions() -> None:
-    found = Neighbourhood()
+    found = PeerTable()
     found.received(HOST, beat(rate=0.0), 0.0)
     found.contacted(KEY, CONTACT, 0.0)
     assert found.tick(61.0).request_state == [HOST]
@@ -137,7 +137,7 @@ def test_the_quality_of_a_link() -> None:
 
 
 def test_inventing_masters_has_an_end() -> None:
-    found = Neighbourhood()
+    found = PeerTable()
     for number in range(MAX_PEERS + 10):
         found.received(f"10.1.{number // 256}.{number % 256}", beat(), 0.0)
     assert len(found.hosts) == MAX_PEERS
@@ -148,7 +148,7 @@ class Masters(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.core = Neighbourhood(Patience(remove_after=20))
+        self.core = PeerTable(Patience(remove_after=20))
         self.now = 0.0
         self.believed: dict[str, bool] = {}
 

@@ -8,7 +8,7 @@ import logging
 from rce.ros.errors import RosError
 from rce.ros.multimaster import messages
 from rce.ros.multimaster.filters import SyncFilter
-from rce.ros.multimaster.neighbourhood import Neighbour
+from rce.ros.multimaster.peer_table import Neighbour
 from rce.ros.multimaster.relay.exporter import Exporter
 from rce.ros.multimaster.relay.frames import Frame
 from rce.ros.multimaster.relay.importer import Importer

@@ -1,4 +1,4 @@
-"""The realm, the reconciler and the desk, with task sets that live in the test."""
+"""The state service, the reconciler and the desk, with task sets that live in the test."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from rce.control.messages import (
 )
 from rce.control.model import EndpointState, EndpointStatus, LinkAddress
 from rce_master.auth import Authenticator, client_digest
-from rce_master.desk import Desk
+from rce_master.control_handler import ControlHandler
 from rce_master.exceptions import MasterError, NotFound, StoreError, TaskSetAway
-from rce_master.realm import Realm
 from rce_master.reconciler import Reconciler
 from rce_master.state import commands
 from rce_master.state.records import User, UserRole
+from rce_master.state_service import StateService
 from rce_master.store import MemoryStore, Row
 
 M = TypeVar("M")
@@ -94,7 +94,7 @@ class FakePeer:
                     return message
 
     async def hello(self, *endpoints: EndpointStatus) -> Sync:
-        await self.cloud.desk.on_hello(
+        await self.cloud.control_handler.on_hello(
             self,
             Hello(
                 version=CONTROL_VERSION,
@@ -108,7 +108,7 @@ class FakePeer:
         return await self.get(Sync)
 
     async def say(self, message: Any) -> None:
-        await self.cloud.desk.on_message(self, message)
+        await self.cloud.control_handler.on_message(self, message)
 
     async def login(self, robot: str = "rob", password: str = PASSWORD) -> LoginReply:
         self.requests += 1
@@ -126,12 +126,12 @@ class FakePeer:
 
 
 class Cloud:
-    def __init__(self, realm: Realm, store: FragileStore) -> None:
-        self.realm = realm
+    def __init__(self, state_service: StateService, store: FragileStore) -> None:
+        self.state_service = state_service
         self.store = store
-        self.reconciler = Reconciler(realm)
-        self.auth = Authenticator(realm.tables, hasher=HASHER)
-        self.desk = Desk(realm, self.reconciler, self.auth)
+        self.reconciler = Reconciler(state_service)
+        self.auth = Authenticator(state_service.tables, hasher=HASHER)
+        self.control_handler = ControlHandler(state_service, self.reconciler, self.auth)
 
     def robots(self, process: str = "r1") -> FakePeer:
         return FakePeer(self, process, TaskSetKind.ROBOT)
@@ -141,21 +141,24 @@ class Cloud:
 
     async def flush(self) -> None:
         """Wait until all that was sent before is done."""
-        await self.realm.submit(commands.Tick())
+        await self.state_service.submit(commands.Tick())
 
 
 @asynccontextmanager
 async def running(store: FragileStore) -> AsyncIterator[Cloud]:
-    cloud = Cloud(await Realm.open(store), store)
+    cloud = Cloud(await StateService.open(store), store)
     async with asyncio.TaskGroup() as group:
-        workers = [group.create_task(cloud.realm.run()), group.create_task(cloud.desk.run())]
+        workers = [
+            group.create_task(cloud.state_service.run()),
+            group.create_task(cloud.control_handler.run()),
+        ]
         await asyncio.sleep(0)
-        if "anna" not in cloud.realm.tables.users:
+        if "anna" not in cloud.state_service.tables.users:
             user = User(name="anna", role=UserRole.USER, password=HASHER.hash(PASSWORD), created=0.0)
-            await cloud.realm.submit(commands.AddUser(user=user))
+            await cloud.state_service.submit(commands.AddUser(user=user))
         try:
             yield cloud
-            cloud.realm.state.validate()
+            cloud.state_service.state.validate()
         finally:
             for worker in workers:
                 worker.cancel()
@@ -196,19 +199,19 @@ async def wire(robots: FakePeer) -> None:
     assert await robots.ask("CX", CX) == ()
 
 
-# Realm
+# StateService
 
 
 async def test_nothing_changes_if_it_cannot_be_stored(cloud: Cloud) -> None:
     heard: list[object] = []
-    cloud.realm.listeners.append(heard.append)
+    cloud.state_service.listeners.append(heard.append)
     cloud.store.broken = True
     with pytest.raises(StoreError, match="disk full"):
-        await cloud.realm.submit(commands.CreateContainer(user="anna", tag="c"))
+        await cloud.state_service.submit(commands.CreateContainer(user="anna", tag="c"))
     assert heard == []
-    assert len(cloud.realm.tables.endpoints) == 0
+    assert len(cloud.state_service.tables.endpoints) == 0
     cloud.store.broken = False
-    await cloud.realm.submit(commands.CreateContainer(user="anna", tag="c"))
+    await cloud.state_service.submit(commands.CreateContainer(user="anna", tag="c"))
     assert len(heard) == 1
 
 
@@ -217,25 +220,27 @@ async def test_reports_do_not_suffer_from_a_broken_store(cloud: Cloud) -> None:
     await robots.hello()
     cloud.store.broken = True
     cloud.store.free.clear()
-    creating = asyncio.ensure_future(cloud.realm.submit(commands.CreateContainer(user="anna", tag="a")))
+    creating = asyncio.ensure_future(
+        cloud.state_service.submit(commands.CreateContainer(user="anna", tag="a"))
+    )
     await asyncio.sleep(0)
-    more = asyncio.ensure_future(cloud.realm.submit(commands.CreateContainer(user="anna", tag="b")))
-    leaving = asyncio.ensure_future(cloud.desk.on_gone(robots))
+    more = asyncio.ensure_future(cloud.state_service.submit(commands.CreateContainer(user="anna", tag="b")))
+    leaving = asyncio.ensure_future(cloud.control_handler.on_gone(robots))
     await asyncio.sleep(0)
     cloud.store.free.set()
     await leaving
-    assert not cloud.realm.tables.is_connected("r1")
+    assert not cloud.state_service.tables.is_connected("r1")
     for refused in (creating, more):
         with pytest.raises(StoreError, match="disk full"):
             await refused
-    assert len(cloud.realm.tables.endpoints) == 0
+    assert len(cloud.state_service.tables.endpoints) == 0
     cloud.store.broken = False
 
 
 async def test_changes_are_stored_before_anybody_hears_of_them(cloud: Cloud) -> None:
     stored: list[bool] = []
-    cloud.realm.listeners.append(lambda _: stored.append("anna/c" in cloud.store.tables["endpoints"]))
-    await cloud.realm.submit(commands.CreateContainer(user="anna", tag="c"))
+    cloud.state_service.listeners.append(lambda _: stored.append("anna/c" in cloud.store.tables["endpoints"]))
+    await cloud.state_service.submit(commands.CreateContainer(user="anna", tag="c"))
     assert stored == [True]
 
 
@@ -243,7 +248,7 @@ async def test_a_storm_is_stored_at_once(cloud: Cloud) -> None:
     cloud.store.free.clear()
     saves = cloud.store.saves
     made = [
-        asyncio.ensure_future(cloud.realm.submit(commands.CreateContainer(user="anna", tag=f"c{i}")))
+        asyncio.ensure_future(cloud.state_service.submit(commands.CreateContainer(user="anna", tag=f"c{i}")))
         for i in range(100)
     ]
     await asyncio.sleep(0)
@@ -254,7 +259,7 @@ async def test_a_storm_is_stored_at_once(cloud: Cloud) -> None:
 
 
 async def test_of_several_commands_only_the_bad_ones_are_refused(cloud: Cloud) -> None:
-    outcomes = await cloud.realm.submit_all(
+    outcomes = await cloud.state_service.submit_all(
         [
             commands.CreateContainer(user="anna", tag="c"),
             commands.DestroyContainer(user="anna", tag="none"),
@@ -262,14 +267,14 @@ async def test_of_several_commands_only_the_bad_ones_are_refused(cloud: Cloud) -
         ]
     )
     assert [type(outcome) for outcome in outcomes] == [type(None), NotFound, type(None)]
-    assert await cloud.realm.submit_all([]) == []
+    assert await cloud.state_service.submit_all([]) == []
 
 
 async def test_a_fault_of_ours_is_no_end(cloud: Cloud, caplog: pytest.LogCaptureFixture) -> None:
     with pytest.raises(MasterError, match="internal error"):
-        await cloud.realm.submit("nonsense")  # type: ignore[arg-type]
+        await cloud.state_service.submit("nonsense")  # type: ignore[arg-type]
     assert "could not apply 'nonsense'" in caplog.text
-    await cloud.realm.submit(commands.CreateContainer(user="anna", tag="c"))
+    await cloud.state_service.submit(commands.CreateContainer(user="anna", tag="c"))
 
 
 # Reconciling
@@ -364,7 +369,7 @@ async def test_every_bad_item_is_told_and_the_others_are_done(cloud: Cloud) -> N
     assert any("addNodes[2].nodeTag" in error for error in errors)
     assert any("there is no container 'none'" in error for error in errors)
     assert any("32 bits" in error for error in errors)
-    assert {n.tag for n in cloud.realm.spec("anna/c").nodes} == {"n", "good"}
+    assert {n.tag for n in cloud.state_service.spec("anna/c").nodes} == {"n", "good"}
     assert len(await robots.ask("XX", {})) == 1
     assert len(await robots.ask("CN", "nonsense")) == 1
     assert "connect again" in (await robots.ask("CC", {"containerTag": "d"}, robot="stranger"))[0]
@@ -377,7 +382,7 @@ async def test_one_message_can_replace_something(cloud: Cloud) -> None:
     new = {"containerTag": "c", "nodeTag": "n", "pkg": "Test", "exe": "other.py"}
     old = {"containerTag": "c", "nodeTag": "n"}
     assert await robots.ask("CN", {"addNodes": [new], "removeNodes": [old]}) == ()
-    assert [n.exe for n in cloud.realm.spec("anna/c").nodes] == ["other.py"]
+    assert [n.exe for n in cloud.state_service.spec("anna/c").nodes] == ["other.py"]
 
 
 async def test_requests_of_one_channel_are_done_in_order(cloud: Cloud) -> None:
@@ -413,7 +418,7 @@ async def test_a_task_set_that_left_hears_nothing_until_it_is_back(cloud: Cloud)
     await wire(robots)
     await containers.say(Usage(cpu_s=1.0, memory=2, endpoints={}))
     assert "c1" in cloud.reconciler.usage
-    await cloud.desk.on_gone(containers)
+    await cloud.control_handler.on_gone(containers)
     assert "c1" not in cloud.reconciler.usage
     while not containers.inbox.empty():
         containers.inbox.get_nowait()
@@ -423,8 +428,8 @@ async def test_a_task_set_that_left_hears_nothing_until_it_is_back(cloud: Cloud)
     status = EndpointStatus(id="anna/c", revision=1, state=EndpointState.RUNNING)
     (spec,) = (await again.hello(status)).endpoints
     assert spec.nodes == ()
-    await cloud.desk.on_gone(containers)
-    assert cloud.realm.tables.is_connected("c1"), "the former channel's end is no loss"
+    await cloud.control_handler.on_gone(containers)
+    assert cloud.state_service.tables.is_connected("c1"), "the former channel's end is no loss"
 
 
 async def test_a_container_made_again_is_put_when_its_former_self_is_gone(cloud: Cloud) -> None:
@@ -474,7 +479,7 @@ async def test_a_restarted_master_takes_over_what_runs() -> None:
         await wire(robots)
         await containers.say(Status(status=running_c))
         await cloud.flush()
-        before = cloud.realm.spec("anna/rob"), cloud.realm.spec("anna/c")
+        before = cloud.state_service.spec("anna/rob"), cloud.state_service.spec("anna/c")
     async with running(store) as cloud:
         robots, containers = cloud.robots(), cloud.containers()
         status = EndpointStatus(id="anna/rob", revision=before[0].revision, state=EndpointState.RUNNING)
@@ -499,5 +504,5 @@ async def test_a_request_of_many_parts_is_stored_and_sent_once(cloud: Cloud) -> 
     assert await robots.ask("CN", {"setParam": parts}) == ()
     put = await containers.get(Put)
     assert len(put.endpoint.parameters) == 50
-    assert put.endpoint.revision == cloud.realm.spec("anna/c").revision
+    assert put.endpoint.revision == cloud.state_service.spec("anna/c").revision
     assert containers.inbox.empty()

@@ -13,8 +13,8 @@ _REACHED = 0.9
 """A container whose memory never came near its limit did not die of that limit."""
 
 
-class Warden:
-    """The warden of one cell.
+class LimitEnforcer:
+    """Enforces the limits of one cell.
 
     The kernel counts the processes that it kills for want of memory before it kills them, and says no more.
     So whoever finds a process killed asks :meth:`claim`, and kills that nobody claims come out of
@@ -22,7 +22,7 @@ class Warden:
 
     Args:
         tag: The container's tag, for texts.
-        cell: The cell; it belongs to this warden.
+        cell: The cell; it belongs to this object.
         settings: How much a slot is.
     """
 

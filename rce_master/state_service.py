@@ -1,4 +1,4 @@
-"""The realm: takes commands one after the other, keeps what they change, and tells who has to act on it."""
+"""The owner of the state: takes commands one by one, keeps what they change, and tells who acts on it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class _Job:
     outcomes: list[Outcome] = field(default_factory=list)
 
 
-class Realm:
+class StateService:
     """Owns the state. Every change goes core -> store -> listeners, in this order.
 
     Commands that wait at the same time are stored in one transaction, so that a storm of logins costs one
@@ -70,7 +70,7 @@ class Realm:
         settings: StateSettings | None = None,
         clock: Callable[[], float] = time.monotonic,
         revision: int | None = None,
-    ) -> Realm:
+    ) -> StateService:
         """Go on from what a store holds.
 
         Args:

@@ -104,13 +104,13 @@ class Timing:
 
 
 class Listener(Protocol):
-    """What a courier tells of. Called in the event loop; must not block."""
+    """What an engine transport tells of. Called in the event loop; must not block."""
 
     def on_connecting(self) -> None:
         """An attempt to connect begins."""
 
     def on_failure(self, error: ClientError) -> None:
-        """It failed; another one follows, or :meth:`Courier.run` ends with this error."""
+        """It failed; another one follows, or :meth:`EngineTransport.run` ends with this error."""
 
     def on_connected(self) -> None:
         """The connection is there; what is posted from now on is sent."""
@@ -122,7 +122,7 @@ class Listener(Protocol):
         """Something came."""
 
 
-class Courier:
+class EngineTransport:
     """One robot's way to the engine, through any number of connections."""
 
     def __init__(

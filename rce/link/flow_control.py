@@ -23,7 +23,7 @@ _NO_LIMIT = 2**64 - 1
 
 
 class Stream(Protocol):
-    """The connection that a valve belongs to.
+    """The connection that a flow control belongs to.
 
     Attributes:
         sent: Bytes since its beginning.
@@ -46,7 +46,7 @@ class Stream(Protocol):
         """Take :meth:`pause_reading` back."""
 
 
-class Valve:
+class FlowControl:
     """The limits of one connection.
 
     Invariant: every byte up to the granted offset was paid for when it was granted.

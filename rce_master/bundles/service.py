@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
     from rce.bundles.contents import Contents
     from rce_master.bundles.contents import ContentStore, Incoming
-    from rce_master.realm import Realm
     from rce_master.state.changes import Changes
+    from rce_master.state_service import StateService
 
 logger = logging.getLogger(__name__)
 
@@ -50,17 +50,19 @@ class Wish:
     """In hex, over :func:`rce.bundles.signing.statement`."""
 
 
-class PackageOffice:
+class PackageService:
     """Where packages come in.
 
     Args:
-        realm: Knows the versions and the keys.
+        state_service: Knows the versions and the keys.
         store: Keeps what they hold.
         clock: Seconds since 1970.
     """
 
-    def __init__(self, realm: Realm, store: ContentStore, clock: Callable[[], float] = time.time) -> None:
-        self._realm = realm
+    def __init__(
+        self, state_service: StateService, store: ContentStore, clock: Callable[[], float] = time.time
+    ) -> None:
+        self._state_service = state_service
         self._store = store
         self._clock = clock
         self._uploads = Uploads()
@@ -68,7 +70,7 @@ class PackageOffice:
         # Held while contents are there of which the state does not know yet, or any more.
         self._lock = asyncio.Lock()
         self._dirty = asyncio.Event()
-        realm.listeners.append(self._note)
+        state_service.listeners.append(self._note)
 
     async def run(self) -> None:
         """Let go of contents that nobody needs, until cancelled."""
@@ -78,7 +80,7 @@ class PackageOffice:
             await self._dirty.wait()
             self._dirty.clear()
             async with self._lock:
-                known = {bundle.sha256 for bundle in self._realm.tables.bundles}
+                known = {bundle.sha256 for bundle in self._state_service.tables.bundles}
                 try:
                     await asyncio.to_thread(self._store.sweep, known)
                 except OSError as error:
@@ -104,7 +106,7 @@ class PackageOffice:
         self._check_early(wish, size)
         async with self._uploads.one(wish.user) as upload:
             bundle, contents = await self._take(wish, upload.counted(chunks))
-        kept = self._realm.tables.bundles.get(bundle.id) or bundle
+        kept = self._state_service.tables.bundles.get(bundle.id) or bundle
         return kept, (*contents.warnings, *self._warnings(contents))
 
     async def _take(self, wish: Wish, chunks: AsyncIterator[bytes]) -> tuple[Bundle, Contents]:
@@ -112,11 +114,11 @@ class PackageOffice:
             _verify(wish, incoming)
             contents = await self._inspect(wish.user, incoming)
             bundle = self._bundle(wish, incoming, contents)
-            packages.check_new(self._realm.tables, bundle)
+            packages.check_new(self._state_service.tables, bundle)
             async with self._lock:
                 try:
                     await self._store.keep(incoming)
-                    await self._realm.submit(commands.AddBundle(bundle=bundle))
+                    await self._state_service.submit(commands.AddBundle(bundle=bundle))
                 finally:
                     self._dirty.set()
         return bundle, contents
@@ -130,7 +132,7 @@ class PackageOffice:
 
     def _check_early(self, wish: Wish, size: int) -> None:
         """Refuse what is to be refused anyway before all of it has come."""
-        tables, settings = self._realm.tables, self._realm.state.settings
+        tables, settings = self._state_service.tables, self._state_service.state.settings
         if package_key_key(wish.user, wish.key) not in tables.package_keys:
             raise Forbidden("the key is not registered with your account; run: rce package key register")
         if bundle_key(wish.user, wish.name, wish.version) not in tables.bundles:
@@ -159,7 +161,7 @@ class PackageOffice:
     def _warnings(self, contents: Contents) -> tuple[str, ...]:
         if not contents.requirements:
             return ()
-        tables = self._realm.tables
+        tables = self._state_service.tables
         if any(
             task_set.machine.requirements
             for task_set in tables.task_sets

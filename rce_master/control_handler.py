@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from rce.control.messages import Hello, ToMaster
     from rce_master.audit import AuditLog
     from rce_master.auth import Authenticator
-    from rce_master.realm import Outcome, Realm
     from rce_master.reconciler import Peer, Reconciler
+    from rce_master.state_service import Outcome, StateService
 
 logger = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ _UNAUTHORIZED, _FORBIDDEN, _CONFLICT, _TOO_MANY, _UNAVAILABLE = 401, 403, 409, 4
 
 
 @dataclass(eq=False, slots=True)
-class _Visit:
+class _PendingLogin:
     """A login in work."""
 
     process: str
@@ -54,7 +54,7 @@ class _Visit:
     """Whether the robot left meanwhile."""
 
 
-class Desk:
+class ControlHandler:
     """Takes what task sets send: reports go on to the reconciler, questions are answered here.
 
     Reports and requests are taken in the order of arrival; answers wait for the store without holding up what
@@ -63,7 +63,7 @@ class Desk:
 
     def __init__(
         self,
-        realm: Realm,
+        state_service: StateService,
         reconciler: Reconciler,
         authenticator: Authenticator,
         tokens: Tokens | None = None,
@@ -71,14 +71,14 @@ class Desk:
         audit: AuditLog | None = None,
     ) -> None:
         self._audit = audit
-        self._tokens = Tokens(realm.tables) if tokens is None else tokens
-        self._realm = realm
+        self._tokens = Tokens(state_service.tables) if tokens is None else tokens
+        self._state_service = state_service
         self._reconciler = reconciler
         self._authenticator = authenticator
         self._quotas = quotas or Quotas()
         self._pending = asyncio.Semaphore(MAX_PENDING)
         self._group = asyncio.TaskGroup()
-        self._visits: set[_Visit] = set()
+        self._logins: set[_PendingLogin] = set()
 
     async def run(self) -> None:
         """Answer until cancelled."""
@@ -120,28 +120,30 @@ class Desk:
     # Logins
 
     def _take_login(self, peer: Peer, login: Login) -> None:
-        if len(self._visits) >= MAX_LOGINS:
+        if len(self._logins) >= MAX_LOGINS:
             reason = str(TooManyLogins())
             peer.send(LoginReply(request=login.request, status=_UNAVAILABLE, reason=reason))
             return
-        visit = _Visit(peer.process, f"{login.user}/{login.robot}")
-        self._visits.add(visit)
-        self._group.create_task(self._guard(self._login(peer, login, visit)))
+        pending_login = _PendingLogin(peer.process, f"{login.user}/{login.robot}")
+        self._logins.add(pending_login)
+        self._group.create_task(self._guard(self._login(peer, login, pending_login)))
 
-    async def _login(self, peer: Peer, login: Login, visit: _Visit) -> None:
+    async def _login(self, peer: Peer, login: Login, pending_login: _PendingLogin) -> None:
         try:
-            reply = await self._answer_login(visit.process, visit.id, login)
+            reply = await self._answer_login(pending_login.process, pending_login.id, login)
         finally:
-            self._visits.discard(visit)
+            self._logins.discard(pending_login)
         peer.send(reply)
-        if visit.left and reply.endpoint is not None:
-            gone = commands.RobotLeft(process=visit.process, id=visit.id, reason="it left while it logged in")
-            await self._realm.enqueue([gone])
+        if pending_login.left and reply.endpoint is not None:
+            gone = commands.RobotLeft(
+                process=pending_login.process, id=pending_login.id, reason="it left while it logged in"
+            )
+            await self._state_service.enqueue([gone])
 
     async def _answer_login(self, process: str, id_: str, login: Login) -> LoginReply:
         reply = await self._try_login(process, id_, login)
         if self._audit is not None:
-            user = login.user if login.user in self._realm.tables.users else ""
+            user = login.user if login.user in self._state_service.tables.users else ""
             if reply.endpoint is not None:
                 by = "its own token" if login.token else "the password"
                 self._audit.add(user, "connect_robot", id_, detail=f"by {by}", address=login.address)
@@ -152,8 +154,8 @@ class Desk:
 
     async def _try_login(self, process: str, id_: str, login: Login) -> LoginReply:
         try:
-            await self._realm.submit(await self._admission(process, id_, login))
-            return LoginReply(request=login.request, endpoint=self._realm.spec(id_))
+            await self._state_service.submit(await self._admission(process, id_, login))
+            return LoginReply(request=login.request, endpoint=self._state_service.spec(id_))
         except WrongCredentials as error:
             status, reason = _UNAUTHORIZED, str(error)
         except TooManyFailures as error:
@@ -162,7 +164,7 @@ class Desk:
             status, reason = _FORBIDDEN, str(error)
         except Refused as error:
             status, reason = _CONFLICT, str(error)
-            self._doubt(process, id_)
+            self._probe_previous(process, id_)
         except MasterError as error:
             status, reason = _UNAVAILABLE, str(error)
         except KeyError:
@@ -186,13 +188,13 @@ class Desk:
             raise Forbidden("this token is good for another robot; make one for this: rce robot add ROBOT")
         return commands.RobotLogin(process=process, id=id_, credential=token.digest)
 
-    def _doubt(self, process: str, id_: str) -> None:
+    def _probe_previous(self, process: str, id_: str) -> None:
         """Look after a robot that wants to come in while it is connected at another task set.
 
         Its former connection may be dead without anybody having noticed; then the robot's next attempt finds
         its place free, and not only after the WebSocket's own pings gave up.
         """
-        robot = self._realm.tables.robot(id_)
+        robot = self._state_service.tables.robot(id_)
         if robot is not None and robot.task_set != process:
             self._reconciler.probe(id_)
 
@@ -200,26 +202,28 @@ class Desk:
         """A robot may go before its login is done; its session must not stay connected for ever then."""
         if not isinstance(message, Left):
             return
-        for visit in self._visits:
-            if (visit.process, visit.id) == (process, message.id):
-                visit.left = True
+        for pending_login in self._logins:
+            if (pending_login.process, pending_login.id) == (process, message.id):
+                pending_login.left = True
 
     # Requests
 
     async def _request(self, peer: Peer, request: ClientRequest) -> None:
         user = request.id.partition("/")[0]
-        if self._realm.tables.robot(request.id) is None:
+        if self._state_service.tables.robot(request.id) is None:
             error = f"robot {request.id!r} is not known any more; connect again"
             peer.send(ClientReply(request=request.request, errors=(error,)))
             return
         try:
-            self._quotas.robot_request(self._realm.tables.users[user], requests.count_items(request.data))
+            self._quotas.robot_request(
+                self._state_service.tables.users[user], requests.count_items(request.data)
+            )
         except TooMuch as error:
             peer.send(ClientReply(request=request.request, errors=(f"{request.type}: {error}",)))
             return
         wanted, faults = requests.read(user, request.type, request.data)
         parts = [wanted[first : first + MAX_TOGETHER] for first in range(0, len(wanted), MAX_TOGETHER)]
-        outcomes = [await self._realm.enqueue(part) for part in parts]
+        outcomes = [await self._state_service.enqueue(part) for part in parts]
         if self._audit is not None and wanted:
             self._audit.add(user, f"request_{request.type.lower()}", detail=describe(wanted), via=request.id)
         await self._spawn(self._answer(peer, request, outcomes, faults))

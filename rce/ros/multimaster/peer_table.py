@@ -91,7 +91,7 @@ class Step:
 
     events: list[PeerEvent] = field(default_factory=list)
     ask_contact: list[PeerKey] = field(default_factory=list)
-    """Whose RPC server to ask for its name; the answer goes to :meth:`Neighbourhood.contacted`."""
+    """Whose RPC server to ask for its name; the answer goes to :meth:`PeerTable.contacted`."""
     request_state: list[str] = field(default_factory=list)
     """Hosts to send a request to."""
 
@@ -139,7 +139,7 @@ class _Peer:
         return self.heard.rate >= QUALITY_HZ
 
 
-class Neighbourhood:
+class PeerTable:
     """The masters that were heard of, this machine's own among them."""
 
     def __init__(self, patience: Patience | None = None) -> None:
