@@ -71,12 +71,12 @@ def _round_trips(rows: list[dict[str, Any]]) -> Iterator[str]:
     yield f"| bytes | {' | '.join(_PATHS)} | {' | '.join(f'{path}, x bare' for path in engine)} |"
     yield "|" + "---:|" * (1 + len(_PATHS) + len(engine))
     for size in dict.fromkeys(row["bytes"] for row in rows):
-        cells = [str(size)]
+        control_groups = [str(size)]
         for path in _PATHS:
             row = found.get((path, size))
-            cells.append(f"{row['p10_ms']:.2f} / {row['p50_ms']:.2f}" if row else "")
-        cells += [_shown(found.get((path, size), {}).get("x bare", "")) for path in engine]
-        yield f"| {' | '.join(cells)} |"
+            control_groups.append(f"{row['p10_ms']:.2f} / {row['p50_ms']:.2f}" if row else "")
+        control_groups += [_shown(found.get((path, size), {}).get("x bare", "")) for path in engine]
+        yield f"| {' | '.join(control_groups)} |"
 
 
 def _targets(summary: dict[str, Any]) -> Iterator[str]:
@@ -89,11 +89,11 @@ def _targets(summary: dict[str, Any]) -> Iterator[str]:
 
 
 def _judged(target: Target, figure: float | None) -> str:
-    wanted = f"{'≥' if target.at_least else '≤'} {target.limit:g} {target.unit}"
+    wanted = f"{'≥' if target.at_least else '≤'} {target.limit:g} {target.incarnation}"
     if figure is None:
         return f"not measured | {wanted} | "
     verdict = "met" if target.is_met(figure) else "**missed**"
-    return f"{figure:g} {target.unit} | {wanted} | {verdict}"
+    return f"{figure:g} {target.incarnation} | {wanted} | {verdict}"
 
 
 def _shown(value: Any) -> str:

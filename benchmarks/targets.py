@@ -25,7 +25,7 @@ class Target:
     read: Callable[[Rows], float | None]
     """Finds the figure; None: the rows do not hold it."""
     limit: float
-    unit: str
+    incarnation: str
     at_least: bool = False
 
     def is_met(self, figure: float) -> bool:

@@ -20,7 +20,7 @@ from rce.protocol.stream import ProtocolStream
 from rce_client.backoff import Backoff, judge
 from rce_client.discovery import VERSION, locate
 from rce_client.exceptions import InUseError, LostError, RefusedError, UntrustedError
-from rce_client.sendqueue import Parcel, QueueLimits, SendQueue
+from rce_client.sendqueue import QueuedMessage, QueueLimits, SendQueue
 from rce_client.socket import EngineSocket
 
 if TYPE_CHECKING:
@@ -176,7 +176,7 @@ class EngineTransport:
         """Send a topic's message when its turn comes; False if there is no connection."""
         if self.connected:
             self._idle.clear()
-            self._queue.put_data(tag, Parcel.of(frames, key))
+            self._queue.put_data(tag, QueuedMessage.of(frames, key))
         return self.connected
 
     def post_control(self, frames: Sequence[Frame]) -> bool:
@@ -189,7 +189,7 @@ class EngineTransport:
     def post_request(self, frames: Sequence[Frame]) -> None:
         """Send a message even if much waits already. For what the program waits for, or asks once."""
         self._idle.clear()
-        self._queue.put_control(Parcel.of(frames))
+        self._queue.put_control(QueuedMessage.of(frames))
 
     async def deliver(self, frames: Sequence[Frame]) -> None:
         """Send a message and wait until it was handed to the network.
@@ -199,11 +199,11 @@ class EngineTransport:
         """
         if not self.connected:
             raise LostError("not connected")
-        parcel = Parcel.of(frames)
-        parcel.sent = asyncio.get_running_loop().create_future()
+        queued = QueuedMessage.of(frames)
+        queued.sent = asyncio.get_running_loop().create_future()
         self._idle.clear()
-        self._queue.put_control(parcel)
-        await parcel.sent
+        self._queue.put_control(queued)
+        await queued.sent
 
     async def flush(self) -> None:
         """Wait until nothing waits to be sent, at most :attr:`Timing.flush`."""
@@ -278,16 +278,16 @@ class EngineTransport:
 
     async def _write(self, socket: EngineSocket) -> None:
         while True:
-            parcel = self._queue.pop()
-            if parcel is None:
+            queued = self._queue.pop()
+            if queued is None:
                 self._idle.set()
-                parcel = await self._queue.get()
+                queued = await self._queue.get()
             try:
-                await socket.send_frames(parcel.frames)
-                if parcel.sent is not None and not parcel.sent.done():
-                    parcel.sent.set_result(None)
+                await socket.send_frames(queued.frames)
+                if queued.sent is not None and not queued.sent.done():
+                    queued.sent.set_result(None)
             except ConnectionClosed:
                 return
             finally:
-                if parcel.sent is not None and not parcel.sent.done():
-                    parcel.sent.set_exception(LostError("the connection ended while the message was sent"))
+                if queued.sent is not None and not queued.sent.done():
+                    queued.sent.set_exception(LostError("the connection ended while the message was sent"))

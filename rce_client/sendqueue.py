@@ -26,7 +26,7 @@ class QueueLimits:
 
 
 @dataclass(eq=False, slots=True)
-class Parcel:
+class QueuedMessage:
     """The frames of one message."""
 
     frames: Sequence[Frame]
@@ -37,8 +37,8 @@ class Parcel:
     """Completed when the message was handed to the network, or could not be."""
 
     @classmethod
-    def of(cls, frames: Sequence[Frame], key: str | None = None) -> Parcel:
-        """Make a parcel of frames as :mod:`rce.protocol.codec` writes them."""
+    def of(cls, frames: Sequence[Frame], key: str | None = None) -> QueuedMessage:
+        """Make a queued message of frames as :mod:`rce.protocol.codec` writes them."""
         return cls(frames, sum(map(len, frames)), key)
 
 
@@ -50,8 +50,8 @@ class SendQueue:
 
     def __init__(self, limits: QueueLimits) -> None:
         self._limits = limits
-        self._control: deque[Parcel] = deque()
-        self._topics: OrderedDict[str, deque[Parcel]] = OrderedDict()
+        self._control: deque[QueuedMessage] = deque()
+        self._topics: OrderedDict[str, deque[QueuedMessage]] = OrderedDict()
         self._bytes: Counter[str] = Counter()
         self._filled = asyncio.Event()
         self.dropped: Counter[str] = Counter()
@@ -65,60 +65,60 @@ class SendQueue:
         """Whether the control lane holds as much as it should."""
         return len(self._control) >= self._limits.control_messages
 
-    def put_control(self, parcel: Parcel) -> None:
+    def put_control(self, queued: QueuedMessage) -> None:
         """Add a message that must arrive."""
-        self._control.append(parcel)
+        self._control.append(queued)
         self._filled.set()
 
-    def put_data(self, tag: str, parcel: Parcel) -> None:
+    def put_data(self, tag: str, queued: QueuedMessage) -> None:
         """Add a message of a topic; where the queue is full the oldest is dropped and counted."""
         queue = self._topics.setdefault(tag, deque())
         limits = self._limits
-        while len(queue) >= limits.topic_messages or self._bytes[tag] + parcel.size > limits.topic_bytes:
-            index = _oldest_to_drop(queue, parcel.key)
+        while len(queue) >= limits.topic_messages or self._bytes[tag] + queued.size > limits.topic_bytes:
+            index = _oldest_to_drop(queue, queued.key)
             if index is None:
                 break
             self._bytes[tag] -= queue[index].size
             del queue[index]
             self.dropped[tag] += 1
-        queue.append(parcel)
-        self._bytes[tag] += parcel.size
+        queue.append(queued)
+        self._bytes[tag] += queued.size
         self._filled.set()
 
-    def pop(self) -> Parcel | None:
+    def pop(self) -> QueuedMessage | None:
         """Take what is to be sent next, None if nothing waits."""
         if self._control:
             return self._control.popleft()
         if not self._topics:
             return None
         tag, queue = self._topics.popitem(last=False)
-        parcel = queue.popleft()
-        self._bytes[tag] -= parcel.size
+        queued = queue.popleft()
+        self._bytes[tag] -= queued.size
         if queue:
             self._topics[tag] = queue
         else:
             del self._bytes[tag]
-        return parcel
+        return queued
 
-    async def get(self) -> Parcel:
+    async def get(self) -> QueuedMessage:
         """Wait for what is to be sent next."""
-        while (parcel := self.pop()) is None:
+        while (queued := self.pop()) is None:
             self._filled.clear()
             await self._filled.wait()
-        return parcel
+        return queued
 
     def clear(self) -> None:
         """Throw away everything, because there is no connection to send it on."""
-        while (parcel := self.pop()) is not None:
-            if parcel.sent is not None and not parcel.sent.done():
-                parcel.sent.set_exception(LostError("the connection ended before the message was sent"))
+        while (queued := self.pop()) is not None:
+            if queued.sent is not None and not queued.sent.done():
+                queued.sent.set_exception(LostError("the connection ended before the message was sent"))
 
 
-def _oldest_to_drop(queue: Sequence[Parcel], key: str | None) -> int | None:
+def _oldest_to_drop(queue: Sequence[QueuedMessage], key: str | None) -> int | None:
     """Return the oldest message that has no key, or one that a newer message or the next one has too."""
-    newest = {parcel.key: index for index, parcel in enumerate(queue)}
+    newest = {queued.key: index for index, queued in enumerate(queue)}
     if key is not None:
         newest.pop(key, None)
     return next(
-        (i for i, parcel in enumerate(queue) if parcel.key is None or newest.get(parcel.key) != i), None
+        (i for i, queued in enumerate(queue) if queued.key is None or newest.get(queued.key) != i), None
     )

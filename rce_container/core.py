@@ -33,7 +33,7 @@ from rce_container.events import (
     Tell,
     Wait,
 )
-from rce_container.life import ALIVE, Happening, Phase, after
+from rce_container.life import ALIVE, LifeEvent, Phase, after
 
 BACKOFF_S = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
 """Pauses before a container that ended is made again: the first, second, ... time."""
@@ -163,7 +163,7 @@ class ManagerCore:
             return
         container.desired = spec
         was = container.phase
-        container.phase = after(was, Happening.DESIRE)
+        container.phase = after(was, LifeEvent.DESIRE)
         if was is Phase.GONE:
             self._start(container)
         elif container.phase in {*ALIVE, Phase.STARTING} and container.mark:
@@ -195,7 +195,7 @@ class ManagerCore:
 
     def _release(self, container: Container, reason: str) -> None:
         was = container.phase
-        container.phase = after(was, Happening.RELEASE)
+        container.phase = after(was, LifeEvent.RELEASE)
         if container.phase is Phase.GONE:
             self._forget(container)
         elif was in {*ALIVE, Phase.STARTING}:
@@ -245,7 +245,7 @@ class ManagerCore:
     def _report(self, container: Container, status: EndpointStatus) -> None:
         was = container.phase
         is_ill = status.state is EndpointState.DEGRADED
-        container.phase = after(was, Happening.ILLNESS if is_ill else Happening.REPORT)
+        container.phase = after(was, LifeEvent.ILLNESS if is_ill else LifeEvent.REPORT)
         container.reported = status
         if was is Phase.STARTING:
             container.running_since = self._now
@@ -257,7 +257,7 @@ class ManagerCore:
         was = container.phase
         if was is Phase.CLEANING:
             return
-        container.phase = after(was, Happening.LOSS)
+        container.phase = after(was, LifeEvent.LOSS)
         if container.phase is not Phase.CLEANING:
             return
         if container.running_since is not None and self._now - container.running_since >= STABLE_S:
@@ -268,7 +268,7 @@ class ManagerCore:
     def _removed(self, container: Container) -> None:
         if container.phase not in (Phase.STOPPING, Phase.CLEANING):
             self._lost(container, "its processes ended")
-        container.phase = after(container.phase, Happening.REMOVED)
+        container.phase = after(container.phase, LifeEvent.REMOVED)
         container.mark = ""
         container.address = LinkAddress()
         container.reported = None
@@ -295,7 +295,7 @@ class ManagerCore:
         container = self.containers.get(id_)
         if container is None or container.phase is not Phase.WAITING or container.ticket != ticket:
             return
-        container.phase = after(container.phase, Happening.DUE)
+        container.phase = after(container.phase, LifeEvent.DUE)
         self._start(container)
 
     # What is done about it
@@ -313,7 +313,7 @@ class ManagerCore:
         if container.desired is None or self._quitting:
             self._forget(container)
             return
-        container.phase = after(Phase.GONE, Happening.DESIRE)
+        container.phase = after(Phase.GONE, LifeEvent.DESIRE)
         container.detail = ""
         self._start(container)
 

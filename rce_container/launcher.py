@@ -14,7 +14,7 @@ from rce_container.environment import messages as m
 from rce_container.environment import proc
 from rce_container.exceptions import ContainerError, StartError, StateError
 from rce_container.folder import ContainerFolder, Record
-from rce_container.limits import Cell, limits_of
+from rce_container.limits import ControlGroup, limits_of
 from rce_container.runtimes.base import Handle, Order
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ class Launched(NamedTuple):
     """What there is of a container whose processes were started."""
 
     handle: Handle
-    cell: Cell
+    control_group: ControlGroup
     isolated: bool
     """See :attr:`rce_container.runtimes.base.Runtime.isolated`."""
 
@@ -78,9 +78,9 @@ class Launcher:
             OSError: The machine has no more of something.
         """
         runtime = self._runtime_for(resources)
-        cell = self._limiter.create(folder.mark, limits_of(resources, self._settings))
+        control_group = self._limiter.create(folder.mark, limits_of(resources, self._settings))
         seat = self._enroll(id_, folder, resources)
-        boot = self._boot(id_, folder, resources, runtime, cell, seat)
+        boot = self._boot(id_, folder, resources, runtime, control_group, seat)
         with folder.listen(folder.control_socket) as control, folder.listen(folder.link_socket) as links:
             order = Order(
                 EndpointId.parse(id_).tag,
@@ -89,7 +89,7 @@ class Launcher:
                 self._settings.packages,
                 control.fileno(),
                 links.fileno(),
-                join=cell.join,
+                join=control_group.join,
                 host_network=resources.network is Network.HOST,
                 switch=seat.path if seat else "",
                 image=resources.image or runtime.image,
@@ -110,14 +110,14 @@ class Launcher:
         except StateError:
             proc.kill(process)  # all of the container ends with it
             raise
-        return Launched(handle, cell, runtime.isolated)
+        return Launched(handle, control_group, runtime.isolated)
 
     async def undo(self, mark: str) -> None:
         """Remove a container's cell, with all that is in it, and its place in a network."""
-        cell = self._limiter.adopt(mark)
+        control_group = self._limiter.adopt(mark)
         try:
-            await asyncio.to_thread(cell.kill)
-            await asyncio.to_thread(cell.remove)
+            await asyncio.to_thread(control_group.kill)
+            await asyncio.to_thread(control_group.remove)
         except ContainerError as error:
             log.error("a container that did not start: %s", error)  # noqa: TRY400 - its text says it all
         await self._networks.detach(mark)
@@ -150,7 +150,7 @@ class Launcher:
         folder: ContainerFolder,
         resources: Resources,
         runtime: Runtime,
-        cell: Cell,
+        control_group: ControlGroup,
         seat: Membership | None,
     ) -> m.Boot:
         settings = self._settings
@@ -165,7 +165,7 @@ class Launcher:
             ros_port=ROS_PORT if own_network else 0,
             isolated=runtime.isolated,
             address=str(seat.address.ip) if seat else LOOPBACK,
-            rlimits=_rlimits(cell, isolated=runtime.isolated),
+            rlimits=_rlimits(control_group, isolated=runtime.isolated),
             packages=tuple(map(str, settings.packages)),
             bundles=runtime.bundles(folder),
             grace=settings.grace,
@@ -174,9 +174,9 @@ class Launcher:
         )
 
 
-def _rlimits(cell: Cell, *, isolated: bool) -> dict[int, int]:
+def _rlimits(control_group: ControlGroup, *, isolated: bool) -> dict[int, int]:
     """What the container's processes limit themselves."""
-    rlimits = dict(cell.rlimits)
+    rlimits = dict(control_group.rlimits)
     if not isolated:
         rlimits.pop(resource.RLIMIT_NPROC, None)  # would count all processes of this user
     return rlimits

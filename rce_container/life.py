@@ -27,7 +27,7 @@ class Phase(Enum):
     """Nothing of it is there, and it is not desired. The manager forgets it."""
 
 
-class Happening(Enum):
+class LifeEvent(Enum):
     """What can happen to a container."""
 
     REPORT = "report"
@@ -46,51 +46,51 @@ class Happening(Enum):
     """It waited long enough."""
 
 
-NEXT: dict[Phase, dict[Happening, Phase]] = {
+NEXT: dict[Phase, dict[LifeEvent, Phase]] = {
     Phase.STARTING: {
-        Happening.REPORT: Phase.RUNNING,
-        Happening.ILLNESS: Phase.DEGRADED,
-        Happening.LOSS: Phase.CLEANING,
-        Happening.RELEASE: Phase.STOPPING,
-        Happening.DESIRE: Phase.STARTING,
+        LifeEvent.REPORT: Phase.RUNNING,
+        LifeEvent.ILLNESS: Phase.DEGRADED,
+        LifeEvent.LOSS: Phase.CLEANING,
+        LifeEvent.RELEASE: Phase.STOPPING,
+        LifeEvent.DESIRE: Phase.STARTING,
     },
     Phase.RUNNING: {
-        Happening.REPORT: Phase.RUNNING,
-        Happening.ILLNESS: Phase.DEGRADED,
-        Happening.LOSS: Phase.CLEANING,
-        Happening.RELEASE: Phase.STOPPING,
-        Happening.DESIRE: Phase.RUNNING,
+        LifeEvent.REPORT: Phase.RUNNING,
+        LifeEvent.ILLNESS: Phase.DEGRADED,
+        LifeEvent.LOSS: Phase.CLEANING,
+        LifeEvent.RELEASE: Phase.STOPPING,
+        LifeEvent.DESIRE: Phase.RUNNING,
     },
     Phase.DEGRADED: {
-        Happening.REPORT: Phase.RUNNING,
-        Happening.ILLNESS: Phase.DEGRADED,
-        Happening.LOSS: Phase.CLEANING,
-        Happening.RELEASE: Phase.STOPPING,
-        Happening.DESIRE: Phase.DEGRADED,
+        LifeEvent.REPORT: Phase.RUNNING,
+        LifeEvent.ILLNESS: Phase.DEGRADED,
+        LifeEvent.LOSS: Phase.CLEANING,
+        LifeEvent.RELEASE: Phase.STOPPING,
+        LifeEvent.DESIRE: Phase.DEGRADED,
     },
     Phase.STOPPING: {
-        Happening.REPORT: Phase.STOPPING,
-        Happening.ILLNESS: Phase.STOPPING,
-        Happening.LOSS: Phase.STOPPING,
-        Happening.REMOVED: Phase.GONE,
-        Happening.RELEASE: Phase.STOPPING,
-        Happening.DESIRE: Phase.STOPPING,
+        LifeEvent.REPORT: Phase.STOPPING,
+        LifeEvent.ILLNESS: Phase.STOPPING,
+        LifeEvent.LOSS: Phase.STOPPING,
+        LifeEvent.REMOVED: Phase.GONE,
+        LifeEvent.RELEASE: Phase.STOPPING,
+        LifeEvent.DESIRE: Phase.STOPPING,
     },
     Phase.CLEANING: {
-        Happening.REPORT: Phase.CLEANING,
-        Happening.ILLNESS: Phase.CLEANING,
-        Happening.REMOVED: Phase.WAITING,
-        Happening.RELEASE: Phase.STOPPING,
-        Happening.DESIRE: Phase.CLEANING,
+        LifeEvent.REPORT: Phase.CLEANING,
+        LifeEvent.ILLNESS: Phase.CLEANING,
+        LifeEvent.REMOVED: Phase.WAITING,
+        LifeEvent.RELEASE: Phase.STOPPING,
+        LifeEvent.DESIRE: Phase.CLEANING,
     },
     Phase.WAITING: {
-        Happening.DUE: Phase.STARTING,
-        Happening.RELEASE: Phase.GONE,
-        Happening.DESIRE: Phase.WAITING,
+        LifeEvent.DUE: Phase.STARTING,
+        LifeEvent.RELEASE: Phase.GONE,
+        LifeEvent.DESIRE: Phase.WAITING,
     },
     Phase.GONE: {
-        Happening.DESIRE: Phase.STARTING,
-        Happening.RELEASE: Phase.GONE,
+        LifeEvent.DESIRE: Phase.STARTING,
+        LifeEvent.RELEASE: Phase.GONE,
     },
 }
 
@@ -98,13 +98,13 @@ ALIVE = frozenset({Phase.RUNNING, Phase.DEGRADED})
 """The phases in which a container's environment reports, and is to go on."""
 
 
-def after(phase: Phase, happening: Happening) -> Phase:
+def after(phase: Phase, life_event: LifeEvent) -> Phase:
     """The phase that follows.
 
     Raises:
         ValueError: This cannot happen in that phase.
     """
-    found = NEXT[phase].get(happening)
+    found = NEXT[phase].get(life_event)
     if found is None:
-        raise ValueError(f"{happening.value} cannot happen to a container that is {phase.value}")
+        raise ValueError(f"{life_event.value} cannot happen to a container that is {phase.value}")
     return found

@@ -41,15 +41,15 @@ from rce_container.environment.process import kill_marked
 from rce_container.exceptions import ContainerError, ExecutionError, NetworkError, StateError
 from rce_container.executions import Executions
 from rce_container.folder import ContainerFolder
+from rce_container.incarnation import Incarnation, IncarnationContext
 from rce_container.launcher import Launcher
 from rce_container.life import Phase
-from rce_container.limits import Cell
+from rce_container.limits import ControlGroup
 from rce_container.limits.enforcer import LimitEnforcer
 from rce_container.log_reads import LogReads
 from rce_container.network import Networks
 from rce_container.reading import read_for
 from rce_container.runtimes.base import Handle
-from rce_container.unit import Office, Unit
 from rce_container.usage import Subject, UsageMeter
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ class Manager:
             limiter=limiter,
             networks=self._networks,
         )
-        self._office = Office(
+        self._context = IncarnationContext(
             settings=settings,
             acceptor=acceptor,
             feed=self._feed,
@@ -126,11 +126,11 @@ class Manager:
             library=library,
         )
         self._executions = Executions(dialer, self._execute) if dialer is not None else None
-        self._units: dict[str, Unit] = {}
+        self._incarnations: dict[str, Incarnation] = {}
         """All lives of which something may be left, by mark."""
         self._queue: deque[str] = deque()
         """Containers that are to be started when fewer are starting."""
-        self._starting: set[Unit] = set()
+        self._starting: set[Incarnation] = set()
         self._tasks: asyncio.TaskGroup
         self._empty = asyncio.Event()
         self._meter = UsageMeter()
@@ -167,10 +167,10 @@ class Manager:
 
     def _execute(self, id_: str, command: Command, sock: socket.socket) -> None:
         container = self._core.containers.get(id_)
-        unit = self._units.get(container.mark) if container is not None else None
-        if unit is None:
+        incarnation = self._incarnations.get(container.mark) if container is not None else None
+        if incarnation is None:
             raise ExecutionError("the container is not running here")
-        unit.execute(command, sock)
+        incarnation.execute(command, sock)
 
     @property
     def statuses(self) -> tuple[EndpointStatus, ...]:
@@ -197,7 +197,7 @@ class Manager:
                 await quit_.wait()
                 self._feed(events.Quit())
                 self._start_waiting()
-                if self._units:
+                if self._incarnations:
                     await self._empty.wait()
                 usage.cancel()
                 pruning.cancel()
@@ -205,8 +205,8 @@ class Manager:
 
     def kill_all(self) -> None:
         """End all containers at once; for a quit that takes too long."""
-        for unit in self._units.values():
-            unit.kill()
+        for incarnation in self._incarnations.values():
+            incarnation.kill()
 
     async def _deal_with_the_past(self) -> None:
         folders = await asyncio.to_thread(self._state.existing)
@@ -230,17 +230,21 @@ class Manager:
             except NetworkError as error:
                 log.warning("container %s has lost its group: %s", record.id, error)
         handle = runtime.adopt(process, record)
-        cell = self._limiter.adopt(folder.mark)
-        unit = self._own(record.id, folder, handle, cell, isolated=runtime.isolated)
+        control_group = self._limiter.adopt(folder.mark)
+        incarnation = self._own(record.id, folder, handle, control_group, isolated=runtime.isolated)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._settings.adopt_timeout):
-                await unit.reported.wait()
-        if unit.status is None or unit.mark not in self._units or record.id in self._core.containers:
+                await incarnation.reported.wait()
+        if (
+            incarnation.status is None
+            or incarnation.mark not in self._incarnations
+            or record.id in self._core.containers
+        ):
             log.warning("container %s of an earlier manager does not answer; it is removed", record.id)
-            unit.kill()
+            incarnation.kill()
             return
         log.info("adopted container %s", record.id)
-        self._feed(events.Adopted(unit.mark, unit.status, self._address(folder)))
+        self._feed(events.Adopted(incarnation.mark, incarnation.status, self._address(folder)))
 
     async def _prune(self, folder: ContainerFolder) -> None:
         """Remove what a dead container left."""
@@ -266,7 +270,7 @@ class Manager:
             await asyncio.sleep(self._settings.prune_interval)
 
     async def _sweep_cells(self, keep: set[str]) -> None:
-        """Remove the cells of containers of which nothing else is left."""
+        """Remove the control groups of containers of which nothing else is left."""
         try:
             await asyncio.to_thread(self._limiter.sweep, keep)
         except (ContainerError, OSError) as error:
@@ -286,9 +290,9 @@ class Manager:
                 self._queue.append(id_)
                 self._start_waiting()
             case events.Apply(mark=mark, spec=spec):
-                self._units[mark].apply(spec)
+                self._incarnations[mark].apply(spec)
             case events.Stop(mark=mark, reason=reason):
-                self._units[mark].stop(reason)
+                self._incarnations[mark].stop(reason)
             case events.Wait(id=id_, ticket=ticket, delay=delay):
                 asyncio.get_running_loop().call_later(delay, self._feed, events.Due(id_, ticket))
 
@@ -311,35 +315,43 @@ class Manager:
             self._feed(events.Lost(id_, "", str(error)))
             return
         try:
-            handle, cell, isolated = self._launcher.launch(id_, folder, self._core.resources(id_))
+            handle, control_group, isolated = self._launcher.launch(id_, folder, self._core.resources(id_))
         except (ContainerError, OSError) as error:  # disk, descriptors or memory of this machine ran out
             self._tasks.create_task(self._launcher.undo(folder.mark), name=f"what was made of {id_}")
             folder.remove()
             self._state.archive.end(id_, folder.mark, f"cannot be started: {error}", time.time())
             self._feed(events.Lost(id_, "", str(error)))
             return
-        unit = self._own(id_, folder, handle, cell, isolated=isolated)
-        self._starting.add(unit)
-        self._tasks.create_task(self._await_start(unit), name=f"start of {id_}")
+        incarnation = self._own(id_, folder, handle, control_group, isolated=isolated)
+        self._starting.add(incarnation)
+        self._tasks.create_task(self._await_start(incarnation), name=f"start of {id_}")
         self._feed(events.Made(id_, folder.mark, self._address(folder)))
 
-    async def _await_start(self, unit: Unit) -> None:
-        await unit.reported.wait()
-        self._starting.discard(unit)
+    async def _await_start(self, incarnation: Incarnation) -> None:
+        await incarnation.reported.wait()
+        self._starting.discard(incarnation)
         self._start_waiting()
 
-    def _own(self, id_: str, folder: ContainerFolder, handle: Handle, cell: Cell, *, isolated: bool) -> Unit:
-        enforcer = LimitEnforcer(EndpointId.parse(id_).tag, cell, self._settings)
-        unit = Unit(id_, folder, handle, enforcer, self._office, isolated=isolated)
-        self._units[unit.mark] = unit
-        self._tasks.create_task(self._run_unit(unit), name=f"container {id_}")
-        return unit
+    def _own(
+        self,
+        id_: str,
+        folder: ContainerFolder,
+        handle: Handle,
+        control_group: ControlGroup,
+        *,
+        isolated: bool,
+    ) -> Incarnation:
+        enforcer = LimitEnforcer(EndpointId.parse(id_).tag, control_group, self._settings)
+        incarnation = Incarnation(id_, folder, handle, enforcer, self._context, isolated=isolated)
+        self._incarnations[incarnation.mark] = incarnation
+        self._tasks.create_task(self._run_incarnation(incarnation), name=f"container {id_}")
+        return incarnation
 
-    async def _run_unit(self, unit: Unit) -> None:
-        await unit.run()
-        del self._units[unit.mark]
-        self._feed(events.Removed(unit.id, unit.mark))
-        if not self._units:
+    async def _run_incarnation(self, incarnation: Incarnation) -> None:
+        await incarnation.run()
+        del self._incarnations[incarnation.mark]
+        self._feed(events.Removed(incarnation.id, incarnation.mark))
+        if not self._incarnations:
             self._empty.set()
 
     def _address(self, folder: ContainerFolder) -> LinkAddress:
@@ -365,11 +377,16 @@ class Manager:
     async def _report_usage(self) -> None:
         while True:
             await asyncio.sleep(self._settings.usage_interval)
-            for unit in self._units.values():
-                unit.poll()
+            for incarnation in self._incarnations.values():
+                incarnation.poll()
             wanted = {
-                unit.id: Subject(unit.handle, unit.enforcer.cell, unit.node_pids, unit.counters)
-                for unit in self._units.values()
+                incarnation.id: Subject(
+                    incarnation.handle,
+                    incarnation.enforcer.control_group,
+                    incarnation.node_pids,
+                    incarnation.counters,
+                )
+                for incarnation in self._incarnations.values()
             }
             usage = await asyncio.to_thread(self._meter.measure, wanted)
             self.send(Usage(cpu_s=cpu_seconds(), memory=resident_bytes(), endpoints=usage))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from rce.control.model import EndpointUsage, NodeUsage
 from rce_container.environment import proc
 from rce_container.environment.messages import Counters
-from rce_container.limits import Cell
+from rce_container.limits import ControlGroup
 from rce_container.runtimes.base import Handle
 
 _PSS_EVERY = 5
@@ -19,7 +19,7 @@ class Subject(NamedTuple):
     """A container that is to be measured."""
 
     handle: Handle
-    cell: Cell
+    control_group: ControlGroup
     nodes: Mapping[str, int]
     """The pid of each node's first process, as the machine sees it, by tag."""
     counters: Counters
@@ -42,7 +42,7 @@ class UsageMeter:
 
         Returns:
             The usage by id. A node's memory is its proportional share (PSS), or the resident size where that
-            may not be read; so is the container's, if its cell does not count.
+            may not be read; so is the container's, if its control group does not count.
         """
         self._round += 1
         self._table, self._fresh = None, {}
@@ -51,9 +51,9 @@ class UsageMeter:
         return usage
 
     def _measure(self, subject: Subject) -> EndpointUsage:
-        cell = subject.cell
+        control_group = subject.control_group
         own = self._processes(subject)
-        counted = cell.usage()
+        counted = control_group.usage()
         cpu_s, memory = counted.cpu_s, counted.memory
         if cpu_s is None:
             cpu_s = sum(process.cpu_s for process in own)
@@ -66,9 +66,9 @@ class UsageMeter:
             throttled_s=round(counted.throttled_s, 3),
             memory=memory,
             memory_peak=counted.memory_peak,
-            memory_limit=0 if counted.memory is None else cell.limits.memory,
-            cpu_limit=cell.limits.cpu,
-            oom_kills=cell.troubles().oom_kills,
+            memory_limit=0 if counted.memory is None else control_group.limits.memory,
+            cpu_limit=control_group.limits.cpu,
+            oom_kills=control_group.troubles().oom_kills,
             io_read=counted.io_read,
             io_written=counted.io_written,
             link_in=subject.counters.traffic[0],
@@ -77,7 +77,7 @@ class UsageMeter:
         )
 
     def _processes(self, subject: Subject) -> list[proc.Process]:
-        if pids := subject.cell.pids():
+        if pids := subject.control_group.pids():
             return [process for pid in pids if (process := proc.read(pid)) is not None]
         if self._table is None:
             self._table = proc.table()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from msgspec import Struct
 
 if TYPE_CHECKING:
-    from rce_master.state.changes import Happening
+    from rce_master.state.changes import StateEvent
 
 CAPACITY = 10_000
 
@@ -54,15 +54,15 @@ class EventLog:
         """Id of the newest event."""
         return self._next_id - 1
 
-    def add(self, happening: Happening, time: float) -> None:
+    def add(self, state_event: StateEvent, time: float) -> None:
         """Add an event and wake all followers."""
         event = Event(
             id=self._next_id,
             time=time,
-            kind=happening.kind,
-            user=happening.user,
-            subject=happening.subject,
-            text=happening.text,
+            kind=state_event.kind,
+            user=state_event.user,
+            subject=state_event.subject,
+            text=state_event.text,
         )
         self._next_id += 1
         self._events.setdefault(event.user, deque()).append(event)

@@ -217,6 +217,6 @@ def _log_events(events: EventLog, changes: Changes) -> None:
     now = time.time()
     if any(table in _ACCESS for table, _ in changes.written()):
         events.wake()
-    for happening in changes.happenings:
-        events.add(happening, now)
-        logger.info("%s %s %s", happening.kind, happening.subject, happening.text)
+    for state_event in changes.events:
+        events.add(state_event, now)
+        logger.info("%s %s %s", state_event.kind, state_event.subject, state_event.text)

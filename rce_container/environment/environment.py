@@ -39,12 +39,12 @@ from rce_container.environment.nodes.causes import Causes
 from rce_container.environment.nodes.fork_server import NodeForkServer
 from rce_container.environment.nodes.heartbeats import Heartbeats
 from rce_container.environment.nodes.launch import OWN_NODE
-from rce_container.environment.nodes.node_life import Workshop
+from rce_container.environment.nodes.node_life import NodeContext
 from rce_container.environment.nodes.node_set import NodeSet
 from rce_container.environment.nodes.reaper import Reaper
 from rce_container.environment.parameters import Values, difference, evaluate_all
 from rce_container.environment.process import kill_marked
-from rce_container.environment.reach import Operator
+from rce_container.environment.reach import DialProxy
 
 log = logging.getLogger(__name__)
 
@@ -93,7 +93,7 @@ class Environment:
         self._handover: HandoverReceiver | None = None
         self._bundles = Bundles(boot.bundles, boot.packages)
         self._packages = self._bundles.index
-        self._operator = Operator(self._ask)
+        self._dial_proxy = DialProxy(self._ask)
         self._causes = Causes(self._ask)
 
     async def run(self) -> None:
@@ -106,14 +106,14 @@ class Environment:
             node = await stack.enter_async_context(
                 Node(OWN_NODE, argv=[f"__ip:={self._boot.address}"], master_uri=self._core.uri, types=types)
             )
-            dial = self._operator.connect if self._boot.isolated else None
+            dial = self._dial_proxy.connect if self._boot.isolated else None
             hub = LinkHub(self._boot.machine, dial=dial, tls=self._boot.tls)
             stack.push_async_callback(hub.close)
             await hub.listen_socket(self._links)
             self._hub = hub
             async with asyncio.TaskGroup() as tasks:
                 self._tasks = tasks
-                self._nodes = NodeSet(self._workshop(reaper), tasks)
+                self._nodes = NodeSet(self._context(reaper), tasks)
                 self._rosout = stack.enter_context(contextlib.closing(self._keep_records()))
                 await node.subscribe_serialized(AGGREGATE, TypeName(KIND, MD5SUM), self._rosout.take)
                 self._heartbeats = Heartbeats(node, self._nodes.beat, self._fault)
@@ -166,8 +166,8 @@ class Environment:
     def _keep_records(self) -> RosoutLog:
         return RosoutLog(Path(self._boot.logs), self._nodes.log_of, self._loop.time)
 
-    def _workshop(self, reaper: Reaper) -> Workshop:
-        return Workshop(
+    def _context(self, reaper: Reaper) -> NodeContext:
+        return NodeContext(
             reaper=reaper,
             outfit=lambda node: self._bundles.outfit(node, self._environ()),
             mark=self._boot.mark,
@@ -340,7 +340,7 @@ class Environment:
                 counters = m.Counters(interfaces=self._endpoint.usage(), traffic=self._endpoint.traffic)
                 channel.send(m.encode(counters))
             case m.Dialed(request=request, error=error):
-                self._operator.answered(request, error or socket.socket(fileno=channel.take_fd()))
+                self._dial_proxy.answered(request, error or socket.socket(fileno=channel.take_fd()))
             case m.Cause(request=request, text=text):
                 self._causes.answered(request, text)
             case m.Handover():

@@ -16,7 +16,7 @@ from rce_container.environment.messages import Dial
 _TIMEOUT_S = 10.0
 
 
-class Operator:
+class DialProxy:
     """Asks the manager for connections to peers, which a container cannot make by itself.
 
     Args:

@@ -60,8 +60,8 @@ def in_megabytes(size: int) -> str:
     return f"{-(-size // MEGABYTE)} MB"
 
 
-class CellUsage(NamedTuple):
-    """What all processes of a cell consume, or consumed since it was made. None: nobody counts."""
+class ControlGroupUsage(NamedTuple):
+    """What all processes of a control group consume, or consumed since it was made. None: nobody counts."""
 
     cpu_s: float | None = None
     throttled_s: float = 0.0
@@ -76,7 +76,7 @@ class CellUsage(NamedTuple):
 
 
 class Troubles(NamedTuple):
-    """How often a cell's limits struck since it was made."""
+    """How often a control group's limits struck since it was made."""
 
     oom_kills: int = 0
     """Processes that were killed because memory ran out."""
@@ -84,7 +84,7 @@ class Troubles(NamedTuple):
     """Processes and threads that could not be started."""
 
 
-class Cell(ABC):
+class ControlGroup(ABC):
     """The place of one container. Its methods do short, blocking file I/O."""
 
     limits: Limits
@@ -93,7 +93,7 @@ class Cell(ABC):
     @property
     @abstractmethod
     def join(self) -> tuple[str, ...]:
-        """Files into which a process writes its pid to get into the cell, before anything else of it runs."""
+        """Files into which a process writes its pid to join the group, before anything else of it runs."""
 
     @property
     @abstractmethod
@@ -109,7 +109,7 @@ class Cell(ABC):
         """
 
     @abstractmethod
-    def usage(self) -> CellUsage:
+    def usage(self) -> ControlGroupUsage:
         """What its processes consume."""
 
     @abstractmethod
@@ -130,7 +130,7 @@ class Cell(ABC):
 
     @abstractmethod
     def remove(self) -> None:
-        """Remove the cell, which has to be empty. Removing what is gone already does nothing.
+        """Remove the control group, which has to be empty. Removing what is gone already does nothing.
 
         Raises:
             LimitError: Something is left in it.
@@ -158,20 +158,20 @@ class Limiter(ABC):
         """What of ``cpu``, ``memory``, ``processes`` and ``io`` it cannot limit or count here."""
 
     @abstractmethod
-    def create(self, mark: str, limits: Limits) -> Cell:
-        """Make the cell of one life of a container.
+    def create(self, mark: str, limits: Limits) -> ControlGroup:
+        """Make the control group of one life of a container.
 
         Raises:
             LimitError: It cannot be made with these limits; nothing is left of it.
         """
 
     @abstractmethod
-    def adopt(self, mark: str) -> Cell:
-        """The cell of a container that an earlier manager started; an empty shell if it has none."""
+    def adopt(self, mark: str) -> ControlGroup:
+        """The control group of a container that an earlier manager started; an empty shell if it has none."""
 
     @abstractmethod
     def sweep(self, keep: Collection[str]) -> None:
-        """End and remove what earlier managers of this task set left, but for the cells of these marks."""
+        """End and remove what earlier managers of this task set left, but for the groups of these marks."""
 
     @abstractmethod
     def close(self) -> None:

@@ -18,7 +18,7 @@ from typing import ClassVar
 
 from rce_container.exceptions import KillError, LimitError
 from rce_container.limits import files, hierarchy
-from rce_container.limits.base import Cell, Limiter, Limits, in_megabytes
+from rce_container.limits.base import ControlGroup, Limiter, Limits, in_megabytes
 from rce_container.limits.rlimit import rlimits_of
 from rce_container.writing import write_whole
 
@@ -33,7 +33,7 @@ _PAUSE_S = 0.01
 _ATTEMPTS = 3
 
 
-class CgroupCell(Cell):
+class CgroupControlGroup(ControlGroup):
     """One cgroup, or one in each of several hierarchies of version 1.
 
     Which of them holds a control file is found by looking for it.
@@ -170,12 +170,12 @@ class CgroupLimiter(Limiter):
 
     Args:
         token: Names the task set on this machine, for ever.
-        ledger: A file of the task set; holds where its cells were, since the next manager may be started
-            in another cgroup.
+        ledger: A file of the task set; holds where its control groups were, since the next manager may be
+            started in another cgroup.
         proc: See :func:`rce_container.limits.hierarchy.find`.
     """
 
-    cell: ClassVar[type[CgroupCell]]
+    control_group: ClassVar[type[CgroupControlGroup]]
 
     def __init__(self, token: str, ledger: Path, proc: Path = hierarchy.PROC) -> None:
         self._folder = f"rce-{token}"
@@ -191,7 +191,7 @@ class CgroupLimiter(Limiter):
         """What no controller is there for."""
         return self._missing
 
-    def create(self, mark: str, limits: Limits) -> Cell:
+    def create(self, mark: str, limits: Limits) -> ControlGroup:
         """Make its folders and write its limits."""
         folders = [parent / mark for parent in self._parents]
         try:
@@ -201,27 +201,27 @@ class CgroupLimiter(Limiter):
                 with contextlib.suppress(OSError):
                     files.drop(folder)
             raise LimitError(f"its cgroup cannot be made: {error}") from error
-        cell = self.cell(folders)
+        control_group = self.control_group(folders)
         try:
-            cell.apply(limits)
+            control_group.apply(limits)
         except LimitError:
-            cell.remove()
+            control_group.remove()
             raise
-        return cell
+        return control_group
 
-    def adopt(self, mark: str) -> Cell:
+    def adopt(self, mark: str) -> ControlGroup:
         """Find its folders, also where an earlier manager made them."""
         folders = [parent / mark for parent in self._all_parents()]
-        return self.cell([folder for folder in folders if folder.is_dir()])
+        return self.control_group([folder for folder in folders if folder.is_dir()])
 
     def sweep(self, keep: Collection[str]) -> None:
         """Look where this and earlier managers made cells."""
         parents = self._all_parents()
         marks = {child.name for parent in parents for child in files.children(parent)}
         for mark in sorted(marks - set(keep)):
-            cell = self.adopt(mark)
-            cell.kill()
-            cell.remove()
+            control_group = self.adopt(mark)
+            control_group.kill()
+            control_group.remove()
         for parent in parents:
             if parent not in self._parents:
                 _drop_if_empty(parent)
@@ -236,7 +236,7 @@ class CgroupLimiter(Limiter):
     def ceiling(self) -> Limits:
         """The least of what is set from this program's own cgroup up."""
         found = [
-            self.cell([folder]).limits
+            self.control_group([folder]).limits
             for base, mount in zip(self._bases, self._mounts, strict=True)
             for folder in _up(base, mount)
         ]

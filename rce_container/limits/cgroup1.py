@@ -8,8 +8,8 @@ from pathlib import Path
 
 from rce_container.exceptions import LimitsUnavailableError
 from rce_container.limits import files, hierarchy
-from rce_container.limits.base import WEIGHT_PER_SLOT, CellUsage, Limits, Troubles
-from rce_container.limits.cgroup import PERIOD_US, CgroupCell, CgroupLimiter, quota
+from rce_container.limits.base import WEIGHT_PER_SLOT, ControlGroupUsage, Limits, Troubles
+from rce_container.limits.cgroup import PERIOD_US, CgroupControlGroup, CgroupLimiter, quota
 
 CONTROLLERS = {"memory": "memory", "pids": "processes", "cpu": "cpu", "cpuacct": "", "blkio": "io"}
 """The controllers that are used, the most important first, and what is missing without them."""
@@ -23,19 +23,19 @@ _SHARES_PER_CORE = 4 * _SHARES
 """What all containers together weigh against the single processes beside them, the engine's among them."""
 
 
-class Cell1(CgroupCell):
+class ControlGroupV1(CgroupControlGroup):
     """A folder in each hierarchy."""
 
     _memory_file = "memory.limit_in_bytes"
 
-    def usage(self) -> CellUsage:
+    def usage(self) -> ControlGroupUsage:
         """Read the counters."""
         memory = None
         if self._has("memory.usage_in_bytes"):
             idle = files.keyed(self._read("memory.stat")).get("total_inactive_file", 0)
             memory = max(0, self._number("memory.usage_in_bytes") - idle)
         io = parse_io(self._read("blkio.throttle.io_service_bytes_recursive"))
-        return CellUsage(
+        return ControlGroupUsage(
             cpu_s=self._number("cpuacct.usage") / 1e9 if self._has("cpuacct.usage") else None,
             throttled_s=files.keyed(self._read("cpu.stat")).get("throttled_time", 0) / 1e9,
             memory=memory,
@@ -89,7 +89,7 @@ class Cgroup1(CgroupLimiter):
     """Needs one of the controllers memory, pids and cpu; usually that means root."""
 
     name = "cgroup1"
-    cell = Cell1
+    control_group = ControlGroupV1
 
     def probe(self) -> None:
         """Try to make this task set's folder in each hierarchy."""

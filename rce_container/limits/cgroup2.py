@@ -14,8 +14,8 @@ from pathlib import Path
 
 from rce_container.exceptions import LimitsUnavailableError
 from rce_container.limits import files, hierarchy
-from rce_container.limits.base import WEIGHT_PER_SLOT, CellUsage, Limits, Troubles
-from rce_container.limits.cgroup import PERIOD_US, CgroupCell, CgroupLimiter, quota
+from rce_container.limits.base import WEIGHT_PER_SLOT, ControlGroupUsage, Limits, Troubles
+from rce_container.limits.cgroup import PERIOD_US, CgroupControlGroup, CgroupLimiter, quota
 
 ENGINE = "rce-engine"
 CONTROLLERS = {"memory": "memory", "pids": "processes", "cpu": "cpu", "io": "io"}
@@ -27,12 +27,12 @@ _WEIGHT_PER_CORE = 400
 _HINT = "give it one: a systemd unit with Delegate=yes, or `systemd-run --scope -p Delegate=yes ...`"
 
 
-class Cell2(CgroupCell):
+class ControlGroupV2(CgroupControlGroup):
     """One folder."""
 
     _memory_file = "memory.max"
 
-    def usage(self) -> CellUsage:
+    def usage(self) -> ControlGroupUsage:
         """Read the counters."""
         cpu = files.keyed(self._read("cpu.stat"))
         memory = None
@@ -40,7 +40,7 @@ class Cell2(CgroupCell):
             idle = files.keyed(self._read("memory.stat")).get("inactive_file", 0)
             memory = max(0, self._number("memory.current") - idle)
         io = parse_io(self._read("io.stat"))
-        return CellUsage(
+        return ControlGroupUsage(
             cpu_s=cpu["usage_usec"] / 1e6 if "usage_usec" in cpu else None,
             throttled_s=cpu.get("throttled_usec", 0) / 1e6,
             memory=memory,
@@ -84,7 +84,7 @@ class Cgroup2(CgroupLimiter):
     """Needs a subtree that is this user's own: as root, or delegated."""
 
     name = "cgroup2"
-    cell = Cell2
+    control_group = ControlGroupV2
 
     def probe(self) -> None:
         """Have controllers given to the cgroups below, and try to make this task set's folder."""

@@ -1,4 +1,4 @@
-"""Looks after the cell of one life of one container: its limits, and what it tells of deaths in there."""
+"""Keeps the limits of one life of one container, and tells of deaths in its control group."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import asyncio
 from rce.control.limits import MEGABYTE
 from rce.control.model import Resources
 from rce_container.exceptions import LimitError
-from rce_container.limits.base import Cell, SlotSettings, in_megabytes, limits_of
+from rce_container.limits.base import ControlGroup, SlotSettings, in_megabytes, limits_of
 
 _REACHED = 0.9
 """A container whose memory never came near its limit did not die of that limit."""
 
 
 class LimitEnforcer:
-    """Enforces the limits of one cell.
+    """Enforces the limits of one control group.
 
     The kernel counts the processes that it kills for want of memory before it kills them, and says no more.
     So whoever finds a process killed asks :meth:`claim`, and kills that nobody claims come out of
@@ -22,15 +22,15 @@ class LimitEnforcer:
 
     Args:
         tag: The container's tag, for texts.
-        cell: The cell; it belongs to this object.
+        control_group: The control group; it belongs to this object.
         settings: How much a slot is.
     """
 
-    def __init__(self, tag: str, cell: Cell, settings: SlotSettings) -> None:
-        self.cell = cell
+    def __init__(self, tag: str, control_group: ControlGroup, settings: SlotSettings) -> None:
+        self.control_group = control_group
         self._tag = tag
         self._settings = settings
-        self._claimed, self._refused = cell.troubles()
+        self._claimed, self._refused = control_group.troubles()
         self._unclaimed = 0
         self._is_refusing = False
         self._told = ""
@@ -47,7 +47,7 @@ class LimitEnforcer:
         async with self._applying:
             self._size = max(1, resources.size)
             try:
-                await asyncio.to_thread(self.cell.apply, limits_of(resources, self._settings))
+                await asyncio.to_thread(self.control_group.apply, limits_of(resources, self._settings))
             except LimitError as error:
                 text = f"{error}; the limits stay as they were"
             else:
@@ -57,7 +57,7 @@ class LimitEnforcer:
 
     def claim(self) -> str:
         """Say why the kernel killed a process, if the reason is memory; each kill is claimed once."""
-        if self.cell.troubles().oom_kills <= self._claimed:
+        if self.control_group.troubles().oom_kills <= self._claimed:
             return ""
         self._claimed += 1
         self._unclaimed = 0
@@ -66,7 +66,7 @@ class LimitEnforcer:
     def claim_all(self) -> str:
         """Say why the whole container died, if a reason is memory."""
         text = self.claim()
-        self._claimed = max(self._claimed, self.cell.troubles().oom_kills)
+        self._claimed = max(self._claimed, self.control_group.troubles().oom_kills)
         return text
 
     def review(self) -> list[str]:
@@ -75,7 +75,7 @@ class LimitEnforcer:
         Returns:
             Texts for the user.
         """
-        troubles = self.cell.troubles()
+        troubles = self.control_group.troubles()
         texts = []
         unclaimed = troubles.oom_kills - self._claimed
         if settled := min(unclaimed, self._unclaimed):
@@ -90,24 +90,24 @@ class LimitEnforcer:
         return texts
 
     async def end(self) -> None:
-        """Kill all that is in the cell.
+        """Kill all that is in the control group.
 
         Raises:
             KillError: Something does not die.
         """
-        await asyncio.to_thread(self.cell.kill)
+        await asyncio.to_thread(self.control_group.kill)
 
     async def remove(self) -> None:
-        """Remove the cell.
+        """Remove the control group.
 
         Raises:
             LimitError: Something is left in it.
         """
-        await asyncio.to_thread(self.cell.remove)
+        await asyncio.to_thread(self.control_group.remove)
 
     def _out_of_memory(self) -> str:
-        limit = self.cell.limits.memory
-        peak = self.cell.usage().memory_peak
+        limit = self.control_group.limits.memory
+        peak = self.control_group.usage().memory_peak
         if not limit or 0 < peak < _REACHED * limit:
             return "out of memory: its machine has no more"
         more = 2 * -(-limit // MEGABYTE)
@@ -117,7 +117,8 @@ class LimitEnforcer:
         )
 
     def _out_of_processes(self) -> str:
+        limit = self.control_group.limits.processes
         return (
-            f"its limit of {self.cell.limits.processes} processes and threads is reached, so it cannot "
-            f"start more; ask for more slots with `rce resize {self._tag} --size {self._size + 1}`"
+            f"its limit of {limit} processes and threads is reached, so it cannot start more;"
+            f" ask for more slots with `rce resize {self._tag} --size {self._size + 1}`"
         )

@@ -10,7 +10,7 @@ import resource
 from collections.abc import Collection, Mapping
 
 from rce_container.exceptions import LimitError
-from rce_container.limits.base import Cell, CellUsage, Limiter, Limits, Troubles
+from rce_container.limits.base import ControlGroup, ControlGroupUsage, Limiter, Limits, Troubles
 
 _DETAIL = (
     "limits of containers are weak: no cgroup can be used, so memory is limited for each process only, "
@@ -28,7 +28,7 @@ def rlimits_of(limits: Limits) -> dict[int, int]:
     return {number: limit for number, limit in found.items() if limit}
 
 
-class RlimitCell(Cell):
+class RlimitControlGroup(ControlGroup):
     """Exists on paper only.
 
     Args:
@@ -59,9 +59,9 @@ class RlimitCell(Cell):
                 "destroy it and create it again"
             )
 
-    def usage(self) -> CellUsage:
+    def usage(self) -> ControlGroupUsage:
         """Nobody counts."""
-        return CellUsage()
+        return ControlGroupUsage()
 
     def troubles(self) -> Troubles:
         """Nobody counts."""
@@ -97,13 +97,13 @@ class RlimitLimiter(Limiter):
         """It counts nothing."""
         return frozenset({"cpu", "memory", "processes", "io"})
 
-    def create(self, mark: str, limits: Limits) -> RlimitCell:  # noqa: ARG002
+    def create(self, mark: str, limits: Limits) -> RlimitControlGroup:  # noqa: ARG002
         """Note the limits."""
-        return RlimitCell(limits)
+        return RlimitControlGroup(limits)
 
-    def adopt(self, mark: str) -> RlimitCell:  # noqa: ARG002
+    def adopt(self, mark: str) -> RlimitControlGroup:  # noqa: ARG002
         """Take the next limits that are asked for as those that it has."""
-        return RlimitCell(None)
+        return RlimitControlGroup(None)
 
     def sweep(self, keep: Collection[str]) -> None:
         """Nothing is ever left."""

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(slots=True)
-class FleetBooks:
+class FleetState:
     """The fleet's state.
 
     Attributes:

@@ -28,7 +28,7 @@ from rce_fleet.coordination.events import (
     StateChanged,
     Tick,
 )
-from rce_fleet.coordination.fleet_state import FleetBooks
+from rce_fleet.coordination.fleet_state import FleetState
 from rce_fleet.coordination.progress import arrived_index, standing_cell
 from rce_fleet.coordination.replanning import plan_together
 from rce_fleet.coordination.robot import Cause, Phase, RobotRecord
@@ -54,7 +54,7 @@ class FleetPlanner:
     def __init__(
         self, grid: GridMap, settings: FleetSettings | None = None, *, first_revision: int = 0
     ) -> None:
-        self.books = FleetBooks(grid)
+        self.books = FleetState(grid)
         self.settings = settings or FleetSettings()
         self._first_revision = first_revision
         self._deaf_until: dict[str, float] = {}

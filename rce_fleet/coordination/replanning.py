@@ -9,11 +9,11 @@ from rce_fleet.coordination.targets import assign_targets
 from rce_fleet.planning.lacam import JointPlan, plan
 
 if TYPE_CHECKING:
-    from rce_fleet.coordination.fleet_state import FleetBooks
+    from rce_fleet.coordination.fleet_state import FleetState
     from rce_fleet.coordination.settings import FleetSettings
 
 
-def plan_together(books: FleetBooks, settings: FleetSettings, attempt: int) -> JointPlan:
+def plan_together(books: FleetState, settings: FleetSettings, attempt: int) -> JointPlan:
     """Plan for all active robots and enter the routes into the ledger.
 
     Cells claimed by robots that are not active are obstacles. Cells granted already are driven through in any

@@ -58,7 +58,7 @@ class Notice:
 
 
 @dataclass(frozen=True, slots=True)
-class Happening:
+class StateEvent:
     """Something that people want to know of; becomes an event of the API."""
 
     kind: str
@@ -84,7 +84,7 @@ class Changes:
     """Ids of the endpoints whose spec changed and that are still desired."""
     withdrawals: list[Withdrawal] = field(default_factory=list)
     notices: list[Notice] = field(default_factory=list)
-    happenings: list[Happening] = field(default_factory=list)
+    events: list[StateEvent] = field(default_factory=list)
     arrived: str = ""
     """Process name of the task set that is to be synchronised."""
     answered: str = ""
@@ -207,7 +207,7 @@ class Transaction:
     def happen(self, kind: str, subject: str, text: str = "", *, user: str | None = None) -> None:
         """Note an event. Without ``user``, the subject is an endpoint id that tells it."""
         owner = subject.partition("/")[0] if user is None else user
-        self.changes.happenings.append(Happening(kind, owner, subject, text))
+        self.changes.events.append(StateEvent(kind, owner, subject, text))
 
     def seal(self) -> Changes:
         """Give every touched endpoint its new revision and hand out what was done."""

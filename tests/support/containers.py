@@ -342,9 +342,9 @@ class Machine:
         folder = self.folder / "state" / "containers"
         return list(folder.iterdir()) if folder.is_dir() else []
 
-    def cells(self) -> list[Path]:
+    def control_groups(self) -> list[Path]:
         """The cgroups of this machine's containers."""
-        return [cell for parent in self.cell_parents() for cell in children(parent)]
+        return [control_group for parent in self.cell_parents() for control_group in children(parent)]
 
     def cell_parents(self) -> list[Path]:
         lines = self.cgroups.read_text().splitlines() if self.cgroups.exists() else ()
@@ -356,7 +356,7 @@ class Machine:
         found += [f"process {one.pid}" for one in self.processes()]
         found += [f"process {one.pid}" for mark in self.marks for one in proc.marked(mark)]
         found += map(str, self.containers)
-        found += map(str, [*self.cells(), *self.cell_parents()])
+        found += map(str, [*self.control_groups(), *self.cell_parents()])
         found += [str(path) for path in (self.folder / "run").rglob("*") if path.is_socket()]
         found += [line for line in Path("/proc/mounts").read_text().splitlines() if str(self.folder) in line]
         return found

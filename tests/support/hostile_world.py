@@ -85,9 +85,13 @@ class World:
 
     def environment(self, id_: str) -> proc.Process:
         """The environment of a container."""
-        (unit,) = (unit for unit in self.machine.manager._units.values() if unit.id == id_)
-        assert unit.handle.environment is not None
-        return unit.handle.environment
+        (incarnation,) = (
+            incarnation
+            for incarnation in self.machine.manager._incarnations.values()
+            if incarnation.id == id_
+        )
+        assert incarnation.handle.environment is not None
+        return incarnation.handle.environment
 
     async def say(self, id_: str, node: str) -> Any:
         """Wait for a line of JSON from a node."""
@@ -166,15 +170,15 @@ class Bait:
 
 def _write_facts(world: World, bait: Bait) -> list[str]:
     """Tell the attacker where to look; returns words that would give the neighbour away."""
-    (unit,) = world.machine.manager._units.values()
+    (incarnation,) = world.machine.manager._incarnations.values()
     environment = world.environment(NEIGHBOUR)
-    shim = unit.handle.process.pid
+    shim = incarnation.handle.process.pid
     facts = {
         "unix": {
             "abstract": bait.abstract,
             "bound": bait.path,
-            "control": str(unit.folder.control_socket),
-            "link": str(unit.folder.link_socket),
+            "control": str(incarnation.folder.control_socket),
+            "link": str(incarnation.folder.link_socket),
             "docker": "/run/docker.sock",
             "podman": "/run/podman/podman.sock",
             "bus": "/run/dbus/system_bus_socket",
@@ -189,7 +193,7 @@ def _write_facts(world: World, bait: Bait) -> list[str]:
             "configuration": "/etc/fstab",
             "state": str(world.folder / "state"),
             "logs": str(world.folder / "state" / "logs"),
-            "neighbour's folder": str(unit.folder.path),
+            "neighbour's folder": str(incarnation.folder.path),
             "users": "/run/rce/uids",
             "neighbour's process": f"/proc/{environment.pid}/status",
             "treasure": "/home/rce/treasure",
@@ -208,7 +212,7 @@ def _write_facts(world: World, bait: Bait) -> list[str]:
         },
     }
     world.facts.write_text(json.dumps(facts))
-    return [*NEIGHBOUR.split("/"), unit.mark]
+    return [*NEIGHBOUR.split("/"), incarnation.mark]
 
 
 def _try_outside(world: World) -> dict[str, str]:

@@ -107,7 +107,7 @@ class Link(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Patience:
+class LivenessSettings:
     """When a silent master is given up; names and meanings are those of master_discovery."""
 
     measurement_intervals: float = 5.0
@@ -142,8 +142,8 @@ class _Peer:
 class PeerTable:
     """The masters that were heard of, this machine's own among them."""
 
-    def __init__(self, patience: Patience | None = None) -> None:
-        self._patience = patience or Patience()
+    def __init__(self, patience: LivenessSettings | None = None) -> None:
+        self._patience = patience or LivenessSettings()
         self._peers: dict[PeerKey, _Peer] = {}
 
     # ------------------------------------------------------------------ questions

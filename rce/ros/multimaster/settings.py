@@ -13,10 +13,10 @@ from rce.ros.multimaster.addresses import (
     RPC_PORT_OFFSET,
 )
 from rce.ros.multimaster.heartbeat import MAX_RATE
-from rce.ros.multimaster.peer_table import Patience
+from rce.ros.multimaster.peer_table import LivenessSettings
 from rce.ros.node.settings import DEFAULT_MASTER_URI
 
-_PATIENCE = Patience()
+_PATIENCE = LivenessSettings()
 
 
 def local_master(uri: str = "") -> str:
@@ -61,9 +61,9 @@ class DiscoverySettings:
             raise ValueError(f"rosmaster_hz must be above 0, not {self.rosmaster_hz:g}")
 
     @property
-    def patience(self) -> Patience:
+    def patience(self) -> LivenessSettings:
         """When a silent master is given up."""
-        return Patience(
+        return LivenessSettings(
             self.measurement_intervals,
             self.timeout_factor,
             self.active_request_after,

@@ -41,7 +41,7 @@ def find_neighbour(uri: str) -> Topics | None:
     return topics if loop is asyncio.get_running_loop() else None
 
 
-class Parcel:
+class LocalMessage:
     """A published message, as an object, as bytes, or both; each is made of the other when asked for."""
 
     __slots__ = ("_kind", "_message", "_payload")
@@ -73,10 +73,10 @@ class Parcel:
         return self._message
 
 
-class Taker(Protocol):
+class LocalListener(Protocol):
     """What a local link's messages are given to."""
 
-    def deliver_parcel(self, parcel: Parcel, latched: bool, uri: str) -> None:
+    def deliver_local(self, local_message: LocalMessage, latched: bool, uri: str) -> None:
         """Take a message of the node with this slave API; must neither wait nor raise."""
 
 
@@ -97,18 +97,20 @@ class LocalLink:
     is_greeted = True
     transport = TRANSPORT
 
-    def __init__(self, taker: Taker, *, uri: str, publisher: str, subscriber: str, queue_size: int) -> None:
+    def __init__(
+        self, listener: LocalListener, *, uri: str, publisher: str, subscriber: str, queue_size: int
+    ) -> None:
         self.uri = uri
         self.publisher = publisher
         self.subscriber = subscriber
         self.messages = 0
         self.bytes_in = 0
-        self.kept: Parcel | None = None
+        self.kept: LocalMessage | None = None
         loop = asyncio.get_running_loop()
         self.ended: asyncio.Future[None] = loop.create_future()
         self._loop = loop
-        self._taker = taker
-        self._queue: DropOldest[tuple[Parcel, bool]] = DropOldest(queue_size)
+        self._listener = listener
+        self._queue: DropOldest[tuple[LocalMessage, bool]] = DropOldest(queue_size)
 
     @property
     def bytes_out(self) -> int:
@@ -125,11 +127,11 @@ class LocalLink:
         """What the slave API says of the connection."""
         return f"{TRANSPORT} {self.publisher} to {self.subscriber}"
 
-    def send(self, parcel: Parcel, *, latched: bool) -> None:
+    def send(self, local_message: LocalMessage, *, latched: bool) -> None:
         """Queue a message; it is delivered as soon as the event loop is free."""
         if not self._queue:
             self._loop.call_soon(self._deliver)
-        self._queue.put((parcel, latched), len(parcel))
+        self._queue.put((local_message, latched), len(local_message))
 
     def end(self) -> None:
         """End the link from the publisher's side; what waits is delivered still."""
@@ -138,9 +140,9 @@ class LocalLink:
 
     def _deliver(self) -> None:
         while self._queue:
-            parcel, latched = self._queue.take()
+            local_message, latched = self._queue.take()
             self.messages += 1
-            self.bytes_in += len(parcel)
+            self.bytes_in += len(local_message)
             if latched:
-                self.kept = parcel
-            self._taker.deliver_parcel(parcel, latched, self.uri)
+                self.kept = local_message
+            self._listener.deliver_local(local_message, latched, self.uri)

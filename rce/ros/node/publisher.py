@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from rce.ros.errors import HandshakeRefused, NodeClosed, TypeMismatch
-from rce.ros.node.local import LocalLink, Parcel
+from rce.ros.node.local import LocalLink, LocalMessage
 from rce.ros.node.queue import DropOldest
 from rce.ros.node.runtime import Runtime
 from rce.ros.tcpros.connection import Connection
@@ -139,15 +139,15 @@ class TopicOutput:
                 f"{self.topic} is of type {self.kind.name} there, which does not have md5 sum {md5sum}"
             )
         for chunks in self._latched():
-            link.send(Parcel(self.kind, payload=payload_of(chunks)), latched=True)
+            link.send(LocalMessage(self.kind, payload=payload_of(chunks)), latched=True)
         self.local_links.append(link)
         self._joined()
 
-    def send_locally(self, parcel: Parcel) -> None:
+    def send_locally(self, local_message: LocalMessage) -> None:
         """Give a message to the subscribers of this process."""
         latched = self.is_latching
         for link in self.local_links:
-            link.send(parcel, latched=latched)
+            link.send(local_message, latched=latched)
 
     def drop(self, link: Link | LocalLink) -> None:
         """Forget a subscriber that is gone."""
@@ -262,7 +262,7 @@ class Publisher:
         output = self._output
         self._send(payload, latch, source)
         if output.local_links:
-            output.send_locally(Parcel(output.known_kind, payload=bytes(payload)))
+            output.send_locally(LocalMessage(output.known_kind, payload=bytes(payload)))
 
     def unlatch(self, source: str = "") -> None:
         """Forget the message that is remembered of a source; no later subscriber gets it."""
@@ -284,10 +284,10 @@ class Publisher:
         output = self._output
         if self._closed:
             raise NodeClosed(f"the publisher of {self.topic} is closed")
-        parcel = Parcel(kind, message)
+        local_message = LocalMessage(kind, message)
         if output.links or self.latch:
-            self._send(parcel.payload(), False)
-        output.send_locally(parcel)
+            self._send(local_message.payload(), False)
+        output.send_locally(local_message)
 
     async def wait_for_subscribers(self, count: int = 1, *, timeout: float | None = None) -> None:
         """Wait until at least ``count`` subscribers are connected.

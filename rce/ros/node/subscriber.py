@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rce.ros.errors import NodeClosed
-from rce.ros.node.local import Parcel
+from rce.ros.node.local import LocalMessage
 from rce.ros.node.queue import DropOldest
 from rce.ros.node.runtime import TypeName
 from rce.ros.tasks import TaskScope
@@ -23,7 +23,7 @@ _log = logging.getLogger(__name__)
 MessageCallback = Callable[[Any], Awaitable[None] | None]
 SerializedCallback = Callable[[bytes, bool], Awaitable[None] | None]
 
-Item = bytes | Parcel
+Item = bytes | LocalMessage
 """A message that arrived: over a connection, or from a publisher of this process."""
 
 ItemCallback = Callable[[Any, bool], Awaitable[None] | None]
@@ -102,7 +102,7 @@ class ListenerSink:
 
     def deliver(self, payload: Item, latched: bool, source: str) -> None:
         """Hand over."""
-        data = payload.payload() if isinstance(payload, Parcel) else payload
+        data = payload.payload() if isinstance(payload, LocalMessage) else payload
         try:
             if latched:
                 self._sources.add(source)
@@ -189,7 +189,7 @@ def sink_for(callback: ItemCallback, queue_size: int, topic: str, tasks: TaskSco
 
 def decode(kind: MessageType, payload: Item) -> Message:
     """Read a message. Fields cut out of a view are copied once, out of bytes twice."""
-    if isinstance(payload, Parcel):
+    if isinstance(payload, LocalMessage):
         return payload.message(kind)
     return kind.deserialize(memoryview(payload) if len(payload) >= LARGE else payload)
 

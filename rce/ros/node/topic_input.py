@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from rce.ros.dialing import open_peer_socket
 from rce.ros.errors import HandshakeRefused, RosError, TcprosError, TypeMismatch
-from rce.ros.node.local import LocalLink, Parcel, find_neighbour
+from rce.ros.node.local import LocalLink, LocalMessage, find_neighbour
 from rce.ros.node.runtime import Runtime
 from rce.ros.node.subscriber import Subscriber
 from rce.ros.tcpros.connection import Connection
@@ -69,12 +69,14 @@ class TopicInput:
             if subscriber.hears_own or not own:
                 subscriber.sink.deliver(payload, latched, uri)
 
-    def deliver_parcel(self, parcel: Parcel, latched: bool, uri: str) -> None:
+    def deliver_local(self, local_message: LocalMessage, latched: bool, uri: str) -> None:
         """Give a message of a publisher of this process to all subscribers."""
         own = uri == self._own_uri
         for subscriber in self.subscribers:
             if subscriber.hears_own or not own:
-                subscriber.sink.deliver(parcel if subscriber.decodes else parcel.payload(), latched, uri)
+                subscriber.sink.deliver(
+                    local_message if subscriber.decodes else local_message.payload(), latched, uri
+                )
 
     def lose(self, uri: str) -> None:
         """Tell all subscribers that the connection to a publisher ended."""
@@ -87,7 +89,7 @@ class TopicInput:
         for link in self.links:
             if link.uri == self._own_uri and not subscriber.hears_own:
                 continue
-            if isinstance(link.kept, Parcel) and not subscriber.decodes:
+            if isinstance(link.kept, LocalMessage) and not subscriber.decodes:
                 subscriber.sink.deliver(link.kept.payload(), True, link.uri)
             elif link.kept is not None:
                 subscriber.sink.deliver(link.kept, True, link.uri)

@@ -28,7 +28,7 @@ from rce_container.environment.nodes.events import (
     Tell,
     Tick,
 )
-from rce_container.environment.nodes.life import Happening, after
+from rce_container.environment.nodes.life import LifeEvent, after
 from rce_container.environment.nodes.order import StartOrder, levels, ready_to_end
 from rce_container.environment.nodes.record import LAST_CHANCE_S, Node
 
@@ -155,7 +155,7 @@ class NodesCore:
             if not node.has_process:
                 self._forget(node)
         elif not node.has_process:
-            self._renew(node, Happening.RENEW)
+            self._renew(node, LifeEvent.RENEW)
         elif node.state is NodeState.STOPPING:
             node.failing = False
         elif not node.is_leaving:  # its process is as desired, only how it is watched changes
@@ -180,7 +180,7 @@ class NodesCore:
         if node.registered_at is None:
             node.registered_at = self._now
         if node.state is NodeState.STARTING:
-            self._become(node, Happening.REGISTER)
+            self._become(node, LifeEvent.REGISTER)
 
     def _beat(self, tag: str) -> bool:
         """Take a heartbeat; whether it changes anything."""
@@ -191,7 +191,7 @@ class NodesCore:
         if node.state is not NodeState.STUCK:
             return False
         node.ill_at = math.inf
-        self._become(node, Happening.BEAT)
+        self._become(node, LifeEvent.BEAT)
         self._note(node, "its heartbeat is there again")
         return True
 
@@ -207,7 +207,7 @@ class NodesCore:
 
     def _stuck(self, node: Node) -> None:
         node.ill_at = self._now
-        self._become(node, Happening.SILENCE, detail=f"no message on {node.spec.heartbeat} any more")
+        self._become(node, LifeEvent.SILENCE, detail=f"no message on {node.spec.heartbeat} any more")
         again = "; it is restarted" if node.restarts_after(failed=True) else ""
         self._note(node, f"stuck: {node.detail}")
         self._tell(node, f"is stuck: {node.detail}{again}")
@@ -221,7 +221,7 @@ class NodesCore:
         if node.desired is None:
             self._forget(node)
         elif stopped and not node.failing:
-            self._renew(node, Happening.PAUSE)
+            self._renew(node, LifeEvent.PAUSE)
         elif code == 0 and not stopped:
             self._end_well(node)
         elif hopeless or not node.restarts_after(failed=True):
@@ -234,7 +234,7 @@ class NodesCore:
         if node.restarts_after(failed=False):
             self._again(node, "ended by itself", failed=False)
         else:
-            self._become(node, Happening.DONE, detail="ended by itself")
+            self._become(node, LifeEvent.DONE, detail="ended by itself")
 
     def _again(self, node: Node, reason: str, *, failed: bool) -> None:
         """Start a node that ended again, after a pause, unless that was done too often."""
@@ -251,7 +251,7 @@ class NodesCore:
         delay = BACKOFF_S[min(node.in_a_row, len(BACKOFF_S) - 1)]
         node.in_a_row += 1
         node.pausing, node.failing, node.due = True, failed, self._now + delay
-        self._become(node, Happening.PAUSE, detail=f"{reason}; starts again after {delay:g} s")
+        self._become(node, LifeEvent.PAUSE, detail=f"{reason}; starts again after {delay:g} s")
         self._note(node, f"starts again after {delay:g} s")
         if failed:
             if node.in_a_row == 1:
@@ -260,7 +260,7 @@ class NodesCore:
 
     def _fail(self, node: Node, reason: str) -> None:
         node.failing = True
-        self._become(node, Happening.FAIL, detail=reason.removeprefix("cannot be started: "))
+        self._become(node, LifeEvent.FAIL, detail=reason.removeprefix("cannot be started: "))
         node.told = ""
         self._tell(node, _failure(reason))
 
@@ -314,17 +314,17 @@ class NodesCore:
         node.pausing = node.failing = node.is_done = False
         node.started_at, node.registered_at, node.ill_at = self._now, None, math.inf
         node.silent_at = self._now + FIRST_BEAT_WITHIN_S
-        self._become(node, Happening.LAUNCH)
+        self._become(node, LifeEvent.LAUNCH)
         self._out.append(Launch(spec.tag, node.life, spec))
 
     def _halt(self, node: Node, detail: str = "") -> None:
-        self._become(node, Happening.HALT, detail=detail)
+        self._become(node, LifeEvent.HALT, detail=detail)
         self._out.append(Halt(node.spec.tag, node.life, node.share))
 
-    def _renew(self, node: Node, happening: Happening) -> None:
+    def _renew(self, node: Node, life_event: LifeEvent) -> None:
         """Begin anew with what is desired."""
         assert node.desired is not None
-        self._become(node, happening)
+        self._become(node, life_event)
         node.spec = node.desired
         node.exit_code, node.told = None, ""
         node.restarts = node.in_a_row = 0
@@ -334,8 +334,8 @@ class NodesCore:
         del self._nodes[node.spec.tag]
         self._out.append(Forget(node.spec.tag))
 
-    def _become(self, node: Node, happening: Happening, *, detail: str = "") -> None:
-        node.state = after(node.state, happening)
+    def _become(self, node: Node, life_event: LifeEvent, *, detail: str = "") -> None:
+        node.state = after(node.state, life_event)
         node.detail = detail
 
     def _note(self, node: Node, text: str) -> None:

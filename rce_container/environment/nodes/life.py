@@ -11,7 +11,7 @@ from enum import Enum
 from rce.control.model import NodeState
 
 
-class Happening(Enum):
+class LifeEvent(Enum):
     """What can happen to a node."""
 
     LAUNCH = "launch"
@@ -34,56 +34,56 @@ class Happening(Enum):
     """It ended for good, and is another one now."""
 
 
-NEXT: dict[NodeState, dict[Happening, NodeState]] = {
+NEXT: dict[NodeState, dict[LifeEvent, NodeState]] = {
     NodeState.WAITING: {
-        Happening.LAUNCH: NodeState.STARTING,
-        Happening.RENEW: NodeState.WAITING,
+        LifeEvent.LAUNCH: NodeState.STARTING,
+        LifeEvent.RENEW: NodeState.WAITING,
     },
     NodeState.STARTING: {
-        Happening.REGISTER: NodeState.RUNNING,
-        Happening.SILENCE: NodeState.STUCK,
-        Happening.HALT: NodeState.STOPPING,
-        Happening.DONE: NodeState.EXITED,
-        Happening.FAIL: NodeState.FAILED,
-        Happening.PAUSE: NodeState.WAITING,
+        LifeEvent.REGISTER: NodeState.RUNNING,
+        LifeEvent.SILENCE: NodeState.STUCK,
+        LifeEvent.HALT: NodeState.STOPPING,
+        LifeEvent.DONE: NodeState.EXITED,
+        LifeEvent.FAIL: NodeState.FAILED,
+        LifeEvent.PAUSE: NodeState.WAITING,
     },
     NodeState.RUNNING: {
-        Happening.SILENCE: NodeState.STUCK,
-        Happening.HALT: NodeState.STOPPING,
-        Happening.DONE: NodeState.EXITED,
-        Happening.FAIL: NodeState.FAILED,
-        Happening.PAUSE: NodeState.WAITING,
+        LifeEvent.SILENCE: NodeState.STUCK,
+        LifeEvent.HALT: NodeState.STOPPING,
+        LifeEvent.DONE: NodeState.EXITED,
+        LifeEvent.FAIL: NodeState.FAILED,
+        LifeEvent.PAUSE: NodeState.WAITING,
     },
     NodeState.STUCK: {
-        Happening.BEAT: NodeState.RUNNING,
-        Happening.HALT: NodeState.STOPPING,
-        Happening.DONE: NodeState.EXITED,
-        Happening.FAIL: NodeState.FAILED,
-        Happening.PAUSE: NodeState.WAITING,
+        LifeEvent.BEAT: NodeState.RUNNING,
+        LifeEvent.HALT: NodeState.STOPPING,
+        LifeEvent.DONE: NodeState.EXITED,
+        LifeEvent.FAIL: NodeState.FAILED,
+        LifeEvent.PAUSE: NodeState.WAITING,
     },
     NodeState.STOPPING: {
-        Happening.FAIL: NodeState.FAILED,
-        Happening.PAUSE: NodeState.WAITING,
+        LifeEvent.FAIL: NodeState.FAILED,
+        LifeEvent.PAUSE: NodeState.WAITING,
     },
     NodeState.EXITED: {
-        Happening.RENEW: NodeState.WAITING,
+        LifeEvent.RENEW: NodeState.WAITING,
     },
     NodeState.FAILED: {
-        Happening.RENEW: NodeState.WAITING,
+        LifeEvent.RENEW: NodeState.WAITING,
     },
 }
 
-WITH_PROCESS = frozenset(state for state, row in NEXT.items() if Happening.PAUSE in row)
+WITH_PROCESS = frozenset(state for state, row in NEXT.items() if LifeEvent.PAUSE in row)
 """The states in which a node has a process."""
 
 
-def after(state: NodeState, happening: Happening) -> NodeState:
+def after(state: NodeState, life_event: LifeEvent) -> NodeState:
     """The state that follows.
 
     Raises:
         ValueError: This cannot happen in that state.
     """
-    found = NEXT[state].get(happening)
+    found = NEXT[state].get(life_event)
     if found is None:
-        raise ValueError(f"{happening.value} cannot happen to a node that is {state.value}")
+        raise ValueError(f"{life_event.value} cannot happen to a node that is {state.value}")
     return found

@@ -28,7 +28,7 @@ _LONGEST_FIRST_LINE = 256
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Workshop:
+class NodeContext:
     """What nodes are made with."""
 
     reaper: Reaper
@@ -53,13 +53,13 @@ class NodeLife:
     Args:
         spec: The node.
         life: The life's number.
-        workshop: What it is made with.
+        context: What it is made with.
         log: Where its output goes.
         feed: Takes what happens.
     """
 
     def __init__(
-        self, spec: NodeSpec, life: int, workshop: Workshop, log: NodeLog, feed: Callable[[Event], None]
+        self, spec: NodeSpec, life: int, context: NodeContext, log: NodeLog, feed: Callable[[Event], None]
     ) -> None:
         self.pid = 0
         """The process, which is also its group and its session; 0 while there is none."""
@@ -67,7 +67,7 @@ class NodeLife:
         """The global ROS name that it was told to take; empty if it chooses by itself."""
         self.life = life
         self._spec = spec
-        self._workshop = workshop
+        self._context = context
         self._log = log
         self._feed = feed
         self._halted: asyncio.Future[float] = asyncio.get_running_loop().create_future()
@@ -79,9 +79,9 @@ class NodeLife:
 
     async def run(self) -> None:
         """Live. Tells of the beginning when it is known, and of the end when nothing is left."""
-        mark = f"{self._workshop.mark}.{self._spec.tag}.{self.life}"
+        mark = f"{self._context.mark}.{self._spec.tag}.{self.life}"
         try:
-            launch = prepare(self._workshop.outfit(self._spec), mark)
+            launch = prepare(self._context.outfit(self._spec), mark)
             event = await self._live(launch)
         except NodeError as error:
             event = Refused(self._spec.tag, self.life, str(error), hopeless=True)
@@ -108,8 +108,8 @@ class NodeLife:
         with ExitStack() as ends:
             stdout = _pipe(self._log.stdout, pumps, ends)
             stderr = _pipe(self._log.stderr, pumps, ends)
-            child = self._workshop.reaper.spawn(
-                launch.argv, env=launch.env, cwd=self._workshop.home, stdout=stdout, stderr=stderr
+            child = self._context.reaper.spawn(
+                launch.argv, env=launch.env, cwd=self._context.home, stdout=stdout, stderr=stderr
             )
         self.pid, self.ros_name = child.pid, launch.ros_name
         self._feed(Made(self._spec.tag, self.life, child.pid))
@@ -121,13 +121,13 @@ class NodeLife:
         if not child.ended.done():
             return await self._escalate(child, self._halted.result())
         code = child.ended.result()
-        cause = await self._workshop.why_killed() if code == -signal.SIGKILL else ""
+        cause = await self._context.why_killed() if code == -signal.SIGKILL else ""
         return code, cause or describe_exit(code)
 
     async def _escalate(self, child: Child, share: float) -> tuple[int, str]:
         for number, patience in (
-            (signal.SIGINT, self._workshop.interrupt_timeout),
-            (signal.SIGTERM, self._workshop.terminate_timeout),
+            (signal.SIGINT, self._context.interrupt_timeout),
+            (signal.SIGTERM, self._context.terminate_timeout),
         ):
             child.signal_group(number)
             done, _ = await asyncio.wait((child.ended,), timeout=patience * share)

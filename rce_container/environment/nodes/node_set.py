@@ -13,7 +13,7 @@ from rce_container.environment.logs.files import remove_log
 from rce_container.environment.logs.node_log import NodeLog
 from rce_container.environment.nodes import events as e
 from rce_container.environment.nodes.core import NodesCore
-from rce_container.environment.nodes.node_life import NodeLife, Workshop
+from rce_container.environment.nodes.node_life import NodeContext, NodeLife
 
 MAX_DEPARTED = 50
 """How many logs are kept of nodes that are gone, while their container lives."""
@@ -23,12 +23,12 @@ class NodeSet:
     """All nodes of a container, made like the desired ones.
 
     Args:
-        workshop: What nodes are made with.
+        context: What nodes are made with.
         tasks: Where the nodes' lives run.
     """
 
-    def __init__(self, workshop: Workshop, tasks: asyncio.TaskGroup) -> None:
-        self._workshop = workshop
+    def __init__(self, context: NodeContext, tasks: asyncio.TaskGroup) -> None:
+        self._context = context
         self._tasks = tasks
         self._loop = asyncio.get_running_loop()
         self._core = NodesCore()
@@ -111,7 +111,7 @@ class NodeSet:
             self._perform(instruction)
         self._set_timer()
         if instructions or not isinstance(event, e.Beat):
-            self._workshop.on_change()
+            self._context.on_change()
 
     def _perform(self, instruction: e.Instruction) -> None:
         match instruction:
@@ -126,19 +126,19 @@ class NodeSet:
                 if tag in self._logs:
                     self._logs[tag].note(text)
             case e.Tell(text=text):
-                self._workshop.on_fault(text)
+                self._context.on_fault(text)
             case e.Forget(tag=tag):
                 self._forget(tag)
 
     def _launch(self, tag: str, number: int, spec: NodeSpec) -> None:
         try:
-            log = self._logs.get(tag) or NodeLog(self._workshop.logs, tag)
+            log = self._logs.get(tag) or NodeLog(self._context.logs, tag)
         except OSError as error:
             text = f"its log cannot be opened: {error.strerror}"
             self._loop.call_soon(self._feed, e.Refused(tag, number, text, hopeless=False))
             return
         self._logs[tag] = log
-        life = self._lives[tag] = NodeLife(spec, number, self._workshop, log, self._feed)
+        life = self._lives[tag] = NodeLife(spec, number, self._context, log, self._feed)
         self._tasks.create_task(life.run(), name=f"node {tag}")
 
     def _forget(self, tag: str) -> None:
@@ -149,7 +149,7 @@ class NodeSet:
         while len(self._departed) > MAX_DEPARTED:
             oldest = self._departed.popleft()
             if oldest not in self._logs and oldest not in self._departed:
-                remove_log(self._workshop.logs, oldest)
+                remove_log(self._context.logs, oldest)
         self._lives.pop(tag, None)
         self._ros_names = {name: owner for name, owner in self._ros_names.items() if owner != tag}
         if not self._core.statuses:

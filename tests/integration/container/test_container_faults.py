@@ -153,7 +153,9 @@ async def test_a_full_disk_is_told_and_nothing_else_is_lost(machine: Machine, sm
         text = await fault(machine, "container box", "cannot be started", os.strerror(errno.ENOSPC))
         assert f"{machine.folder}/state" in text, text
         assert len(machine.containers) == 1, "a container that cannot be started left its folder"
-        assert {cell.name for cell in machine.cells()} <= {path.name for path in machine.containers}
+        assert {control_group.name for control_group in machine.control_groups()} <= {
+            path.name for path in machine.containers
+        }
         assert (await machine.node_is("user/first", "echo", NodeState.RUNNING)).restarts == 0
         ballast.unlink()
         await machine.node_is(BOX, "echo", NodeState.RUNNING)

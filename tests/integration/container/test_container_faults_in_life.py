@@ -17,8 +17,8 @@ from rce.control.messages import Drop
 from rce.control.model import EndpointState, NodeSpec, NodeState, Resources
 from rce_container.environment import proc
 from rce_container.folder import ContainerFolder
+from rce_container.incarnation import Incarnation
 from rce_container.runtimes.namespace import NamespaceRuntime
-from rce_container.unit import Unit
 
 BOX = "user/box"
 MB = 1 << 20
@@ -38,9 +38,9 @@ class Stage:
         self._stopped: list[int] = []
 
     @property
-    def unit(self) -> Unit:
-        (unit,) = self.machine.manager._units.values()
-        return unit
+    def incarnation(self) -> Incarnation:
+        (incarnation,) = self.machine.manager._incarnations.values()
+        return incarnation
 
     async def reach(self, step: str) -> None:
         """Let the container come to a step, and hold it there."""
@@ -49,14 +49,16 @@ class Stage:
             case "spawned":
                 self._hold_bubblewrap()
                 await machine.put(BOX)
-                await until(lambda: self._children(self.unit.handle.process.pid), what="bubblewrap is held")
+                await until(
+                    lambda: self._children(self.incarnation.handle.process.pid), what="bubblewrap is held"
+                )
             case "held":
                 self._stop(self.runtime._fork_server.pid)
                 await machine.put(BOX)
-                await until(lambda: self.unit.handle.namespaces_pid, what="the holder is there")
+                await until(lambda: self.incarnation.handle.namespaces_pid, what="the holder is there")
             case "born":
                 await machine.put(BOX)
-                environment = await until(lambda: self.unit.handle.environment, what="its start")
+                environment = await until(lambda: self.incarnation.handle.environment, what="its start")
                 self._stop(environment.pid)
             case "running" | "resizing":
                 await machine.put(BOX, nodes=(STUBBORN,))
@@ -72,7 +74,7 @@ class Stage:
         machine.note_processes()
 
     def pid_of(self, part: str) -> int:
-        handle = self.unit.handle
+        handle = self.incarnation.handle
         shim = handle.process.pid
         environment = handle.environment.pid if handle.environment is not None else 0
         node_servers = (pid for pid in self._children(environment) if program_of(pid) == "rce-node-server")
@@ -132,7 +134,7 @@ async def test_what_is_wanted_comes_to_life_again(stage: Stage, step: str, part:
     machine = stage.machine
     async with machine.engine(interrupt_timeout=0.2, terminate_timeout=0.2):
         await stage.reach(step)
-        mark = stage.unit.mark
+        mark = stage.incarnation.mark
         old = dict(machine.pids)
         os.kill(stage.pid_of(part), signal.SIGKILL)
         stage.go_on()
@@ -149,7 +151,7 @@ async def test_what_is_not_wanted_any_more_is_gone(
     stage: Stage, part: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     machine = stage.machine
-    monkeypatch.setattr("rce_container.unit._SHIM_TIMEOUT_S", 0.5)
+    monkeypatch.setattr("rce_container.incarnation._SHIM_TIMEOUT_S", 0.5)
     async with machine.engine(interrupt_timeout=1.0, terminate_timeout=0.2):
         await stage.reach("stopping")
         os.kill(stage.pid_of(part), signal.SIGKILL)
@@ -194,8 +196,8 @@ async def test_nodes_and_their_fork_server_may_die_while_a_container_is_resized(
     machine = stage.machine
     async with machine.engine(interrupt_timeout=0.2, terminate_timeout=0.2):
         await stage.reach("resizing")
-        mark = stage.unit.mark
+        mark = stage.incarnation.mark
         os.kill(stage.pid_of("node fork server"), signal.SIGKILL)
         os.kill(stage.pid_of("node"), signal.SIGKILL)
         await machine.node_is(BOX, "node", NodeState.FAILED)
-        assert stage.unit.mark == mark
+        assert stage.incarnation.mark == mark

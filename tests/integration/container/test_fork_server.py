@@ -46,8 +46,8 @@ async def test_a_container_that_lost_a_part_is_made_again(namespaces: Machine, v
         await running(machine, nodes=(ECHO,))
         await machine.node_is(BOX, "echo", NodeState.RUNNING)
         first = machine.status(BOX)
-        (unit,) = machine.manager._units.values()
-        handle = unit.handle
+        (incarnation,) = machine.manager._incarnations.values()
+        handle = incarnation.handle
         assert isinstance(handle, HeldHandle)
         assert handle.environment is not None
         machine.note_processes()
@@ -95,11 +95,14 @@ async def test_a_start_survives_the_fork_server(namespaces: Machine) -> None:
 
 
 def _waits_for_request(machine: Machine) -> bool:
-    return any(unit.handle.namespaces_pid and not unit.handle.environment for unit in _units(machine))
+    return any(
+        incarnation.handle.namespaces_pid and not incarnation.handle.environment
+        for incarnation in _incarnations(machine)
+    )
 
 
-def _units(machine: Machine) -> list[object]:
-    return list(machine.manager._units.values())
+def _incarnations(machine: Machine) -> list[object]:
+    return list(machine.manager._incarnations.values())
 
 
 async def test_a_manager_that_dies_before_a_birth_leaves_nothing(namespaces: Machine) -> None:

@@ -179,9 +179,9 @@ async def test_no_cgroup_is_left_by_a_container_that_ended(packages: Machine) ->
     async with machine.engine():
         await machine.put(BOX, nodes=(NodeSpec(tag="talk", pkg="own", exe="talk.py"),))
         await machine.log_holds(BOX, "talk", "hello")
-        assert machine.cells()
+        assert machine.control_groups()
         await machine.drop(BOX)
-        assert not machine.cells()
+        assert not machine.control_groups()
         assert machine.of(Gone)
     assert not machine.cell_parents()
 
@@ -193,9 +193,9 @@ async def test_the_next_manager_removes_the_cgroups_of_all_that_was_killed(packa
         await machine.log_holds(BOX, "talk", "hello")
     for process in machine.processes():
         proc.kill(process)
-    assert machine.cells()
+    assert machine.control_groups()
     async with machine.engine():
-        await until(lambda: not machine.cells(), what=machine.cells)
+        await until(lambda: not machine.control_groups(), what=machine.control_groups)
 
 
 async def test_the_next_manager_keeps_the_limits_of_what_it_adopts(packages: Machine) -> None:
@@ -203,9 +203,9 @@ async def test_the_next_manager_keeps_the_limits_of_what_it_adopts(packages: Mac
     async with machine.managed():
         await machine.put(BOX, resources=SMALL, nodes=(greedy("hog", "10"),))
         await machine.log_holds(BOX, "hog", "has all")
-        cells = machine.cells()
+        control_groups = machine.control_groups()
     async with machine.engine():
-        assert machine.cells() == cells
+        assert machine.control_groups() == control_groups
         seen = await until(lambda: usage(machine, BOX))
         assert seen.memory_limit == 64 * MB
         nodes = (greedy("hog", "200"),)
@@ -218,14 +218,14 @@ async def test_cells_of_which_nothing_else_is_left_are_swept_with_their_processe
     with StateFolder(folder / "state", folder / "run") as state:
         limiter = choose_limiter(state.token, state.cgroups)
         limiter.sweep(())
-        cell = limiter.create("0123456789ab", Limits(memory=64 * MB))
+        control_group = limiter.create("0123456789ab", Limits(memory=64 * MB))
         script = 'for file; do echo $$ >"$file"; done; exec sleep 600'
-        lost = subprocess.Popen(["/bin/sh", "-c", script, "sh", *cell.join])
-        await until(cell.pids)
+        lost = subprocess.Popen(["/bin/sh", "-c", script, "sh", *control_group.join])
+        await until(control_group.pids)
         machine = Machine(folder, "process")
     async with machine.engine():
         assert lost.wait() == -signal.SIGKILL
-        assert not machine.cells()
+        assert not machine.control_groups()
 
 
 async def test_nodes_die_before_their_environment_and_both_before_the_engine(packages: Machine) -> None:

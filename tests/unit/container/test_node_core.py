@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rce.control.model import NodeSpec, NodeState, NodeStatus, RestartPolicy
 from rce_container.environment.nodes import events as e
 from rce_container.environment.nodes.core import BACKOFF_S, FIRST_BEAT_WITHIN_S, NodesCore
-from rce_container.environment.nodes.life import NEXT, WITH_PROCESS, Happening, after
+from rce_container.environment.nodes.life import NEXT, WITH_PROCESS, LifeEvent, after
 from rce_container.environment.nodes.order import StartOrder, levels, ready_to_end
 from rce_container.environment.nodes.record import LAST_CHANCE_S, WELL_S
 
@@ -512,7 +512,7 @@ def test_the_table_knows_every_state_and_leads_out_of_each() -> None:
     assert set(NEXT) == set(NodeState)
     for state in NodeState:
         with pytest.raises(ValueError, match=state.value):
-            after(state, next(one for one in Happening if one not in NEXT[state]))
+            after(state, next(one for one in LifeEvent if one not in NEXT[state]))
         assert NEXT[state]
     assert {state.value for state in WITH_PROCESS} == {"starting", "running", "stuck", "stopping"}
 

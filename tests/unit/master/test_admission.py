@@ -217,7 +217,7 @@ def test_a_container_is_resized_while_it_runs(world: World) -> None:
     world.run()
     changes = resize(world, cpu=0.5, memory=256 * MB)
     assert list(changes.touched) == ["anna/c"]  # type: ignore[attr-defined]
-    assert [(h.kind, h.text) for h in changes.happenings] == [  # type: ignore[attr-defined]
+    assert [(h.kind, h.text) for h in changes.events] == [  # type: ignore[attr-defined]
         ("container_resized", "size 1, cpu 0.5, memory 256 MB, bandwidth 5B/s")
     ]
     wish = world.spec("c").resources

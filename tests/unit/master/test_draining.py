@@ -34,7 +34,7 @@ def moves(world: World) -> dict[str, str]:
 
 
 def kinds(changes: Changes) -> list[str]:
-    return [happening.kind for happening in changes.happenings]
+    return [state_event.kind for state_event in changes.events]
 
 
 @pytest.fixture
@@ -119,7 +119,7 @@ def test_what_has_room_nowhere_stays_and_the_operator_is_told_once(two: World) -
     two.container("large", size=4)
     assert at(two, "large") == "c2"
     changes = drain(two)
-    (first, second) = [h for h in changes.happenings if h.kind == "container_stays"]
+    (first, second) = [h for h in changes.events if h.kind == "container_stays"]
     assert (first.subject, first.user) == ("anna/c", "")
     assert "m2 has 0 of 4 slots free, 1 needed" in first.text
     assert second.subject == "anna/d"
@@ -134,7 +134,7 @@ def test_a_copy_that_fails_is_dropped_and_tried_again_later(two: World) -> None:
     drain(two)
     changes = report(two, "c", "c2", EndpointState.FAILED, detail="no such package")
     assert [(w.process, w.id) for w in changes.withdrawals] == [("c2", "anna/c")]
-    stays = [h.text for h in changes.happenings if h.kind == "container_stays"]
+    stays = [h.text for h in changes.events if h.kind == "container_stays"]
     assert "failed there: no such package" in stays[0]
     assert at(two, "c") == "c1"
     two.do(commands.EndpointGone(process="c2", id="anna/c"))
@@ -144,7 +144,7 @@ def test_a_copy_that_fails_is_dropped_and_tried_again_later(two: World) -> None:
     two.tick(30)
     assert moves(two) == {"c": "c2"}
     changes = two.tick(60)
-    assert "did not come up there within 60 s" in changes.happenings[0].text
+    assert "did not come up there within 60 s" in changes.events[0].text
 
 
 def test_a_copy_waits_until_its_former_one_is_gone_there(two: World) -> None:
@@ -218,7 +218,7 @@ def test_a_group_moves_as_a_whole(world: World) -> None:
         report(world, tag, "c1")
     world.container_set("c2", name="m2", slots=1, **machine)
     changes = drain(world)
-    texts = [h.text for h in changes.happenings if h.kind == "container_stays"]
+    texts = [h.text for h in changes.events if h.kind == "container_stays"]
     assert "it moves with 1 others of its group; no machine has room for all of them" in texts[0]
     world.container_set("c3", name="m3", slots=2, **machine)
     world.tick(1)

@@ -34,7 +34,7 @@ def status(
 
 
 def kinds(changes: object) -> list[str]:
-    return [h.kind for h in changes.happenings]  # type: ignore[attr-defined]
+    return [h.kind for h in changes.events]  # type: ignore[attr-defined]
 
 
 def test_lifecycles_refuse_what_cannot_happen() -> None:
@@ -130,7 +130,7 @@ def test_what_happens_to_nodes_becomes_events(world: World) -> None:
     up = world.run(nodes=(NodeStatus(tag="n", state=NodeState.RUNNING, pid=1),))
     assert kinds(up) == ["container_running", "node_running"]
     down = world.run(nodes=(NodeStatus(tag="n", state=NodeState.FAILED, exit_code=-9),))
-    assert [(h.kind, h.subject, h.text) for h in down.happenings] == [
+    assert [(h.kind, h.subject, h.text) for h in down.events] == [
         ("node_failed", "anna/c/n", "ended by signal 9")
     ]
     assert kinds(world.run(nodes=(NodeStatus(tag="n", state=NodeState.FAILED, exit_code=-9),))) == []
@@ -269,7 +269,7 @@ def test_containers_of_a_machine_that_stays_away_move(world: World) -> None:
     world.run()
     world.container_set("c2")
     world.leave("c1")
-    assert world.tick(29).happenings == []
+    assert world.tick(29).events == []
     assert world.phase() == "running"
     changes = world.tick(1)
     assert world.state.tables.endpoints["anna/c"].task_set == "c2"
@@ -407,7 +407,7 @@ def test_nodes_that_start_again_are_events(world: World) -> None:
     assert kinds(degraded) == ["container_degraded", "node_waiting"]
     assert world.phase() == "degraded"
     again = world.run(nodes=(NodeStatus(tag="n", state=NodeState.RUNNING, pid=2, restarts=1),))
-    assert [(h.kind, h.text) for h in again.happenings] == [
+    assert [(h.kind, h.text) for h in again.events] == [
         ("container_running", ""),
         ("node_restarted", "for the 1st time"),
         ("node_running", ""),

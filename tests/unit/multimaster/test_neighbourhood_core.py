@@ -10,7 +10,7 @@ from rce.ros.multimaster.heartbeat import Heartbeat, Kind, Stamp
 from rce.ros.multimaster.peer_table import (
     MAX_PEERS,
     Contact,
-    Patience,
+    LivenessSettings,
     PeerChange,
     PeerKey,
     PeerTable,
@@ -27,7 +27,7 @@ def beat(secs: int = 1, *, rate: float = 1.0, kind: Kind = Kind.STATE, local: in
 
 
 def known(**patience: float) -> PeerTable:
-    found = PeerTable(Patience(**patience))
+    found = PeerTable(LivenessSettings(**patience))
     assert found.received(HOST, beat(), 0.0).ask_contact == [KEY]
     step = found.contacted(KEY, CONTACT, 0.0)
     assert changes(step) == [(PeerChange.NEW, True)]
@@ -148,7 +148,7 @@ class Masters(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.core = PeerTable(Patience(remove_after=20))
+        self.core = PeerTable(LivenessSettings(remove_after=20))
         self.now = 0.0
         self.believed: dict[str, bool] = {}
 

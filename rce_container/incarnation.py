@@ -51,7 +51,7 @@ _DIAL_TIMEOUT_S = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Office:
+class IncarnationContext:
     """What all lives of all containers share."""
 
     settings: ContainerSettings
@@ -62,15 +62,15 @@ class Office:
     library: Library
 
 
-class Unit:
+class Incarnation:
     """One life of one container, from the first process to the removal of the last file.
 
     Args:
         id: The container.
         folder: Belongs to this life.
         handle: Its outermost process.
-        enforcer: Looks after its cell.
-        office: What all lives share.
+        enforcer: Looks after its control group.
+        context: What all lives share.
         isolated: Whether pids that the environment reports are those of a namespace of its own.
     """
 
@@ -80,7 +80,7 @@ class Unit:
         folder: ContainerFolder,
         handle: Handle,
         enforcer: LimitEnforcer,
-        office: Office,
+        context: IncarnationContext,
         *,
         isolated: bool,
     ) -> None:
@@ -94,7 +94,7 @@ class Unit:
         """What the environment reported last."""
         self.reported = asyncio.Event()
         """Set by the first report, and by an end without one."""
-        self._office = office
+        self._context = context
         self._isolated = isolated
         self._channel: Channel | None = None
         self._sender: HandoverSender | None = None
@@ -109,9 +109,9 @@ class Unit:
         self._supply = Supply(
             self.mark,
             EndpointId.parse(id).user,
-            office.library,
+            context.library,
             Shelf(folder.bundles, link=isolated),
-            tell=lambda text: office.feed(events.Faulted(id, folder.mark, text)),
+            tell=lambda text: context.feed(events.Faulted(id, folder.mark, text)),
             on_arrival=self._tell_of_arrival,
         )
 
@@ -167,7 +167,7 @@ class Unit:
             return
         self._channel.send(m.encode(m.Poll()))
         for text in self.enforcer.review():
-            self._office.feed(events.Faulted(self.id, self.mark, text))
+            self._context.feed(events.Faulted(self.id, self.mark, text))
 
     def stop(self, reason: str = "") -> None:
         """Tell the environment to end; if it does not, it is killed.
@@ -179,7 +179,7 @@ class Unit:
         self._stop_reason = reason or self._stop_reason
         if self._channel is not None:
             self._channel.send(m.encode(m.Stop()))
-            self._limit(self._office.settings.stop_timeout)
+            self._limit(self._context.settings.stop_timeout)
 
     def kill(self) -> None:
         """End at once."""
@@ -194,7 +194,7 @@ class Unit:
                 reason = self.enforcer.claim_all() or reason
                 reason += await asyncio.to_thread(self._last_words)
                 log.warning("container %s: %s", self.id, reason)
-            self._office.feed(events.Lost(self.id, self.mark, reason))
+            self._context.feed(events.Lost(self.id, self.mark, reason))
             await asyncio.to_thread(self._note_end, reason)
             await self._clean(_SHIM_TIMEOUT_S if self._stopping and not self._hurry else 0.0)
         except asyncio.CancelledError:
@@ -206,7 +206,7 @@ class Unit:
     async def _live(self) -> str:
         """Talk with the environment until it is gone; returns why."""
         try:
-            async with asyncio.timeout(self._office.settings.start_timeout) as self._deadline:
+            async with asyncio.timeout(self._context.settings.start_timeout) as self._deadline:
                 await self._launch()
                 self._channel = await connect(str(self.folder.control_socket))
                 self._open_handover(self._channel)
@@ -251,7 +251,7 @@ class Unit:
         )
 
     async def _prepare(self, pid: int) -> None:
-        await self._office.networks.attach(self.mark, pid)
+        await self._context.networks.attach(self.mark, pid)
 
     async def _hang_up(self) -> None:
         self._deadline = None
@@ -262,7 +262,7 @@ class Unit:
             self._channel.close()
             self._channel = None
         if sender is not None:
-            self._office.acceptor.forget(sender)
+            self._context.acceptor.forget(sender)
             sender.close()
 
     async def _converse(self, channel: Channel) -> None:
@@ -275,7 +275,7 @@ class Unit:
                     self._report(self._sound(status), pace)
                 case m.Fault(text=text):
                     pace.pay(intake.PER_FAULT)
-                    self._office.feed(events.Faulted(self.id, self.mark, intake.sound_text(text)))
+                    self._context.feed(events.Faulted(self.id, self.mark, intake.sound_text(text)))
                 case m.Counters() as counters:
                     self.counters = intake.sound_counters(counters)
                 case m.Killed(request=number):
@@ -299,13 +299,15 @@ class Unit:
             status = msgspec.structs.replace(status, nodes=self._with_outer_pids(status, pace))
         self.status = status
         self.reported.set()
-        self._office.feed(events.Reported(self.id, self.mark, status))
+        self._context.feed(events.Reported(self.id, self.mark, status))
 
     def _with_outer_pids(self, status: EndpointStatus, pace: intake.Pace) -> tuple[NodeStatus, ...]:
         """Replace the nodes' pids inside the container by those outside."""
         if any(node.pid and node.pid not in self._pids for node in status.nodes):
             pace.pay(intake.PER_LOOK)
-            pids = self.enforcer.cell.pids() or [one.pid for one in self.handle.members(proc.table())]
+            pids = self.enforcer.control_group.pids() or [
+                one.pid for one in self.handle.members(proc.table())
+            ]
             self._pids = {proc.inner_pid(pid): pid for pid in pids}
         return tuple(
             msgspec.structs.replace(node, pid=self._pids.get(node.pid, 0)) if node.pid else node
@@ -319,7 +321,7 @@ class Unit:
 
     async def _resize(self, spec: EndpointSpec) -> None:
         if text := await self.enforcer.apply(spec.resources):
-            self._office.feed(events.Faulted(self.id, self.mark, text))
+            self._context.feed(events.Faulted(self.id, self.mark, text))
 
     # Links
 
@@ -330,7 +332,7 @@ class Unit:
             channel.send(m.encode(m.Handover()), theirs.fileno())
 
     async def _route(self, sender: HandoverSender, spec: EndpointSpec) -> None:
-        await self._office.acceptor.assign(sender, [link.id for link in spec.links if not link.dial])
+        await self._context.acceptor.assign(sender, [link.id for link in spec.links if not link.dial])
 
     async def _dial(self, channel: Channel, request: m.Dial) -> None:
         """Connect to a peer of this container, and to nothing else."""
@@ -339,7 +341,7 @@ class Unit:
             if request.address not in allowed:
                 raise ConnectionError("the container has no link to there")
             async with asyncio.timeout(_DIAL_TIMEOUT_S):
-                settings = self._office.settings
+                settings = self._context.settings
                 sock = await dial(request.address, settings.machine, tls=settings.tls)
         except OSError as error:
             text = str(error) or type(error).__name__
@@ -353,7 +355,7 @@ class Unit:
     def _note_end(self, reason: str) -> None:
         if self._stopping:
             reason = "; ".join(filter(None, (self._stop_reason, reason if self._hurry else "")))
-        self._office.archive.end(self.id, self.mark, reason, time.time())
+        self._context.archive.end(self.id, self.mark, reason, time.time())
 
     def _last_words(self) -> str:
         words = last_line(self.folder.logs)[:_LAST_WORDS_LENGTH]
@@ -369,7 +371,7 @@ class Unit:
             await self.handle.kill()
         except KillError as error:
             log.error("container %s: %s", self.id, error)  # noqa: TRY400 - its text says it all
-        await self._office.networks.detach(self.mark)
+        await self._context.networks.detach(self.mark)
         await asyncio.to_thread(self.folder.remove)
         try:
             await self.enforcer.remove()
