@@ -17,14 +17,14 @@ import uvloop
 from rce.cli.program_files import from_file
 from rce.config.settings import Runtime
 from rce.supervision.signals import end_signals
+from rce_fleet.demo.config import CoreKind, DemoConfig, Machines, Mode
 from rce_fleet.demo.exceptions import DemoError
 from rce_fleet.demo.floor import draw
 from rce_fleet.demo.folder import run_folder
 from rce_fleet.demo.headless import run_headless
-from rce_fleet.demo.play import CoreKind, Machines, Mode, Play
 from rce_fleet.demo.ports import ANY, Ports
 from rce_fleet.demo.roaming import roam
-from rce_fleet.demo.stage import set_stage
+from rce_fleet.demo.running import start_demo
 from rce_fleet.demo.station import StationApi
 
 ROBOTS, ROBOTS_OF_SCEN = 3, 4
@@ -95,7 +95,7 @@ def demo(
         scenario = draw(robots or (ROBOTS if scen is None else ROBOTS_OF_SCEN), seed, world=world, scen=scen)
         ports = _choose_ports(headless, given, _needed_ports(mode, core_uri))
         with run_folder(state_dir) as folder:
-            play = Play(
+            config = DemoConfig(
                 scenario,
                 seed,
                 ports,
@@ -109,9 +109,9 @@ def demo(
             )
             show = typer.echo if verbose else _show_warning
             if headless:
-                code = _run(_headless(play, timeout, report, show), stopped=1)
+                code = _run(_headless(config, timeout, report, show), stopped=1)
             else:
-                code = _run(_with_page(play, show, auto=auto), stopped=0)
+                code = _run(_with_page(config, show, auto=auto), stopped=0)
     except DemoError as error:
         typer.echo(f"rce demo: {error}", err=True)
         raise typer.Exit(1) from None
@@ -123,9 +123,13 @@ def say(text: str) -> None:
     typer.echo(f"rce demo: {text}")
 
 
-async def _headless(play: Play, timeout: float, report: Path | None, show: Callable[[str], None]) -> int:
-    say(f"{len(play.scenario.robots)} robots, mode {play.mode}, seed {play.seed}, at most {timeout:g} s")
-    result = await run_headless(play, timeout, say, show)
+async def _headless(
+    config: DemoConfig, timeout: float, report: Path | None, show: Callable[[str], None]
+) -> int:
+    say(
+        f"{len(config.scenario.robots)} robots, mode {config.mode}, seed {config.seed}, at most {timeout:g} s"
+    )
+    result = await run_headless(config, timeout, say, show)
     if report is not None:
         result.write(report)
     for fault in result.faults:
@@ -135,14 +139,14 @@ async def _headless(play: Play, timeout: float, report: Path | None, show: Calla
     return 0 if result.ok else 1
 
 
-async def _with_page(play: Play, show: Callable[[str], None], *, auto: bool) -> int:
-    say(f"starting the fleet, mode {play.mode}")
-    async with set_stage(play, show) as stage, aiohttp.ClientSession() as session:
-        stage.children.revive(say)
-        typer.echo(f"RCE demo: {stage.page}")
-        station = StationApi(session, stage.page)
-        rng = Random(play.seed)  # noqa: S311 - draws goals, keeps no secret
-        await stage.children.while_alive(roam(station, rng, say) if auto else _for_ever())
+async def _with_page(config: DemoConfig, show: Callable[[str], None], *, auto: bool) -> int:
+    say(f"starting the fleet, mode {config.mode}")
+    async with start_demo(config, show) as demo, aiohttp.ClientSession() as session:
+        demo.children.revive(say)
+        typer.echo(f"RCE demo: {demo.page}")
+        station = StationApi(session, demo.page)
+        rng = Random(config.seed)  # noqa: S311 - draws goals, keeps no secret
+        await demo.children.while_alive(roam(station, rng, say) if auto else _for_ever())
     return 0
 
 

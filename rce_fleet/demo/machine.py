@@ -10,7 +10,7 @@ from typing import Any
 
 from rce.ros.packages import PackageIndex
 from rce_fleet.demo.children import Children, Program
-from rce_fleet.demo.play import Play
+from rce_fleet.demo.config import DemoConfig
 
 RCE = (sys.executable, "-c", "from rce.cli import main; main()")
 """The program ``rce`` of this installation."""
@@ -48,9 +48,9 @@ class Machine:
         return {"ROS_MASTER_URI": self.core_uri, "ROS_NAMESPACE": ""}
 
 
-def planner_argv(play: Play, **more: Any) -> list[str]:
+def planner_argv(config: DemoConfig, **more: Any) -> list[str]:
     """The planner, told of the floor by private parameters, and of ``more``."""
-    return [*_executable("fleet_planner.py"), *_parameters({**play.planner_parameters, **more})]
+    return [*_executable("fleet_planner.py"), *_parameters({**config.planner_parameters, **more})]
 
 
 def move_client_argv(robot: str, **parameters: Any) -> list[str]:
@@ -58,22 +58,22 @@ def move_client_argv(robot: str, **parameters: Any) -> list[str]:
     return [*_executable("move_client.py"), f"__ns:={robot}", *_parameters(parameters)]
 
 
-def station_argv(play: Play, planner_core: str) -> list[str]:
+def station_argv(config: DemoConfig, planner_core: str) -> list[str]:
     """The operator station, in the planner's graph."""
     station = [sys.executable, "-m", "rce_fleet.station"]
-    return [*station, "--ros-master", planner_core, "--port", str(play.ports.page)]
+    return [*station, "--ros-master", planner_core, "--port", str(config.ports.page)]
 
 
-def world_argv(play: Play, planner_core: str, cores: Mapping[str, str]) -> list[str]:
+def world_argv(config: DemoConfig, planner_core: str, cores: Mapping[str, str]) -> list[str]:
     """The world, whose robots join the graphs of ``cores`` (robot to URI)."""
-    program = [sys.executable, "-m", "rce_fleet.drivers", str(play.scene), "--report", str(play.report)]
+    program = [sys.executable, "-m", "rce_fleet.drivers", str(config.scene), "--report", str(config.report)]
     joins = [part for robot, uri in cores.items() for part in ("--core", f"{robot}={uri}")]
     return [*program, "--planner-core", planner_core, *joins]
 
 
-def node_names(play: Play) -> frozenset[str]:
+def node_names(config: DemoConfig) -> frozenset[str]:
     """Global names of all nodes of the demo; a graph may have others."""
-    robots = [f"/{robot}/{node}" for robot in play.scenario.robots for node in ("robot", "move_client")]
+    robots = [f"/{robot}/{node}" for robot in config.scenario.robots for node in ("robot", "move_client")]
     return frozenset((*robots, "/fleet_planner", "/operator_station", "/world"))
 
 

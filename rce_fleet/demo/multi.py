@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from rce.ros.multimaster.addresses import DEFAULT_GROUP
 from rce_fleet.demo.bus import read_bus
 from rce_fleet.demo.children import Children, Program
+from rce_fleet.demo.config import DemoConfig
 from rce_fleet.demo.counters import Counters
 from rce_fleet.demo.machine import (
     RCE,
@@ -19,8 +20,7 @@ from rce_fleet.demo.machine import (
     world_argv,
 )
 from rce_fleet.demo.network import Network, Site, make_network
-from rce_fleet.demo.play import Play
-from rce_fleet.demo.setting import START_TIMEOUT
+from rce_fleet.demo.programs import START_TIMEOUT
 
 PLANNER = "planner"
 """Name of the planner's machine."""
@@ -36,29 +36,29 @@ class MultiMaster:
     The world has none: what it simulates is each robot's hardware, a node that joins the robot's core.
     """
 
-    def __init__(self, play: Play) -> None:
-        self._play = play
+    def __init__(self, config: DemoConfig) -> None:
+        self._config = config
         self._cores: list[str] = []
 
     async def start(self, children: Children) -> str:
         """Start everything; returns the URL of the page."""
-        play, robots = self._play, self._play.scenario.robots
-        play.write_scene()
-        network = await make_network(play.machines, [PLANNER, *robots], children)
+        config, robots = self._config, self._config.scenario.robots
+        config.write_scene()
+        network = await make_network(config.machines, [PLANNER, *robots], children)
         self._cores = [site.core_uri for site in network.sites]
         await _start_cores(network, children)
         planner, *others = network.sites
         uris = {site.name: site.core_uri for site in others}
         outside = Machine("outside", planner.core_uri)
         floor = Machine("floor", planner.core_uri, enter=network.enter_world)
-        world = await floor.start(children, "world", world_argv(play, planner.core_uri, uris))
+        world = await floor.start(children, "world", world_argv(config, planner.core_uri, uris))
         station = await outside.start(
-            children, "station", station_argv(play, planner.core_uri), revivable=True
+            children, "station", station_argv(config, planner.core_uri), revivable=True
         )
-        argv = planner_argv(play, answers=True)
+        argv = planner_argv(config, answers=True)
         await _machine_of(planner).start(children, "planner", argv, revivable=True)
         for number, site in enumerate(others, start=1):
-            argv = move_client_argv(site.name, answers=True, **play.map_parameters)
+            argv = move_client_argv(site.name, answers=True, **config.map_parameters)
             await _machine_of(site).start(children, f"move_client{number}", argv, revivable=True)
         await _join_machines(network, robots, children)
         page = await children.wait_line(station, "rce ui ready:", START_TIMEOUT)
@@ -67,7 +67,7 @@ class MultiMaster:
 
     async def count(self) -> Counters:
         """Ask all nodes."""
-        return await read_bus(self._cores, node_names(self._play))
+        return await read_bus(self._cores, node_names(self._config))
 
 
 def sync_argv(machine: str, robots: Iterable[str]) -> list[str]:

@@ -15,8 +15,8 @@ import psutil
 
 from rce.ros.multimaster.addresses import DEFAULT_MASTER_PORT, DEFAULT_PORT, RPC_PORT_OFFSET
 from rce_fleet.demo.children import Children
+from rce_fleet.demo.config import Machines
 from rce_fleet.demo.exceptions import NetworkError
-from rce_fleet.demo.play import Machines
 from rce_fleet.demo.ports import LOOPBACK, free_ports
 
 HOST, WORLD, FIRST = 1, 2, 10

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rce_fleet.demo.config import Mode
 from rce_fleet.demo.counters import Counters
 from rce_fleet.demo.mission import Mission
-from rce_fleet.demo.play import Mode
 from rce_fleet.drivers.report import WorldReport
 from rce_fleet.planning.scenario import Scenario
 

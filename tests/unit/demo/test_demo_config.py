@@ -1,4 +1,4 @@
-"""What is played, and what the planner is told."""
+"""What is run, and what the planner is told."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from pathlib import Path
 from rce.config.client import loads
 from rce.config.documents import write_items
 from rce_fleet.demo.bus import received
+from rce_fleet.demo.config import DemoConfig
 from rce_fleet.demo.floor import draw
 from rce_fleet.demo.machine import node_names, planner_argv, world_argv
 from rce_fleet.demo.multi import PLANNER, sync_argv
-from rce_fleet.demo.play import Play
 from rce_fleet.demo.ports import Ports
 from rce_fleet.wiring import fleet_config
 
-PLAY = Play(draw(3, 0), 0, Ports(), Path("/folder"))
+CONFIG = DemoConfig(draw(3, 0), 0, Ports(), Path("/folder"))
 
 
 def test_the_planner_is_not_told_of_hidden_boxes() -> None:
-    parameters, scenario = PLAY.planner_parameters, PLAY.scenario
+    parameters, scenario = CONFIG.planner_parameters, CONFIG.scenario
     assert parameters["walls"] == sorted(scenario.grid.blocked)
     assert parameters["blocked"] == list(scenario.known_boxes)
     assert not {*parameters["walls"], *parameters["blocked"]}.intersection(scenario.hidden_boxes)
@@ -27,21 +27,21 @@ def test_the_planner_is_not_told_of_hidden_boxes() -> None:
 
 
 def test_the_planner_gets_its_parameters_on_its_command_line() -> None:
-    argv = planner_argv(PLAY)
-    assert f"_walls:={sorted(PLAY.scenario.grid.blocked)}" in argv
+    argv = planner_argv(CONFIG)
+    assert f"_walls:={sorted(CONFIG.scenario.grid.blocked)}" in argv
     assert "_rows:=8" in argv
     assert any(word.endswith("fleet_planner.py") for word in argv)
 
 
 def test_each_robot_of_the_world_joins_its_own_core() -> None:
-    argv = world_argv(PLAY, "http://c:1/", {"Robot1": "http://a:1/", "Robot2": "http://b:1/"})
+    argv = world_argv(CONFIG, "http://c:1/", {"Robot1": "http://a:1/", "Robot2": "http://b:1/"})
     joins = [argv[place + 1] for place, word in enumerate(argv) if word == "--core"]
     assert joins == ["Robot1=http://a:1/", "Robot2=http://b:1/"]
     assert argv[argv.index("--planner-core") + 1] == "http://c:1/"
 
 
 def test_only_the_demos_own_nodes_are_counted() -> None:
-    one = replace(PLAY, scenario=draw(1, 0))
+    one = replace(CONFIG, scenario=draw(1, 0))
     assert node_names(one) == {
         *("/Robot1/robot", "/Robot1/move_client"),
         *("/fleet_planner", "/operator_station", "/world"),

@@ -1,4 +1,4 @@
-"""What every mode of the demo does for the stage."""
+"""What every mode of the demo does for the demo."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ START_TIMEOUT = 90.0
 """Seconds for one program to come up, on a machine that starts many at once."""
 
 
-class Setting(Protocol):
+class ModePrograms(Protocol):
     """The programs of one mode."""
 
     async def start(self, children: Children) -> str:

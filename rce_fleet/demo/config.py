@@ -1,4 +1,4 @@
-"""What is to be played, and where."""
+"""What the demo runs, and where."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ class Machines(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Play:
-    """What is to be played, and where.
+class DemoConfig:
+    """What the demo runs, and where.
 
     Attributes:
         scenario: Robots, boxes and goals.
