@@ -48,8 +48,8 @@ class Requests(ABC):
     ) -> None:
         """Change what a container may use, while it runs.
 
-        What is not given stays as it is; zero takes a wish back. If its machine has no room for it, an error
-        text says so and nothing changes.
+        What is not given stays as it is; zero withdraws a request. If its machine has no room for it, an
+        error text says so and nothing changes.
 
         Args:
             tag: The container's.

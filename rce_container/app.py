@@ -163,8 +163,10 @@ class App:
         """Where packages that users bring come from. Blocks."""
         client = ContentClient(self.master, self.control_port, self.secret, tls=tls)
         cache = BundleCache(state.library, client.piece, space=self.settings.bundle_space)
-        wish = self.settings.requirements
-        library = Library(cache=cache, installer=Installer(state.requirements, wish) if wish else None)
+        requested = self.settings.requirements
+        library = Library(
+            cache=cache, installer=Installer(state.requirements, requested) if requested else None
+        )
         library.open()
         return library
 
@@ -185,11 +187,11 @@ class App:
                 task.cancel()
 
 
-def choose_runtime(wish: str, runtimes: dict[str, Runtime]) -> tuple[Runtime, str]:
+def choose_runtime(requested: str, runtimes: dict[str, Runtime]) -> tuple[Runtime, str]:
     """Find the runtime to use. Blocks.
 
     Args:
-        wish: A runtime's name, or ``auto``: namespaces if they work here, else plain processes.
+        requested: A runtime's name, or ``auto``: namespaces if they work here, else plain processes.
         runtimes: All there are.
 
     Returns:
@@ -199,22 +201,22 @@ def choose_runtime(wish: str, runtimes: dict[str, Runtime]) -> tuple[Runtime, st
         RuntimeUnavailableError: The runtime that was asked for does not work here.
     """
     detail = ""
-    if wish in (AUTO, NamespaceRuntime.name):
+    if requested in (AUTO, NamespaceRuntime.name):
         namespace = runtimes[NamespaceRuntime.name]
         try:
             namespace.probe()
         except RuntimeUnavailableError as error:
-            if wish != AUTO:
+            if requested != AUTO:
                 raise
             detail = f"{error}; "
         else:
             return namespace, namespace.detail
-    elif wish == PodmanRuntime.name:
-        runtimes[wish].probe()
-        return runtimes[wish], runtimes[wish].detail
-    elif wish not in runtimes:
+    elif requested == PodmanRuntime.name:
+        runtimes[requested].probe()
+        return runtimes[requested], runtimes[requested].detail
+    elif requested not in runtimes:
         raise RuntimeUnavailableError(
-            wish, f"there is no such runtime; use one of {', '.join((AUTO, *runtimes))}"
+            requested, f"there is no such runtime; use one of {', '.join((AUTO, *runtimes))}"
         )
     detail += _NOT_ISOLATED
     log.warning("%s", detail)

@@ -151,7 +151,7 @@ class ManagerCore:
             if container.phase in {*ALIVE, Phase.CLEANING}:
                 assert container.mark, f"{id_} is {container.phase.value} without a life"
 
-    # The master's wishes
+    # What the master desires
 
     def _put(self, spec: EndpointSpec) -> None:
         if self._quitting:

@@ -227,16 +227,18 @@ class StateFolder:
             os.close(self._lock)
             self._lock = -1
 
-    def name(self, wish: str) -> str:
-        """The task set's name: ``wish``, or the one it had before, or a new one. It is kept.
+    def name(self, requested: str) -> str:
+        """The task set's name: ``requested``, or the one it had before, or a new one. It is kept.
 
         Raises:
-            StateError: ``wish`` cannot be a name.
+            StateError: ``requested`` cannot be a name.
         """
-        if wish:
-            if not _NAME.fullmatch(wish):
-                raise StateError(f"{wish!r} cannot name a task set: use letters, digits, '_', '-' and '.'")
-            self._keep(self._state / "name", wish)
+        if requested:
+            if not _NAME.fullmatch(requested):
+                raise StateError(
+                    f"{requested!r} cannot name a task set: use letters, digits, '_', '-' and '.'"
+                )
+            self._keep(self._state / "name", requested)
         return self._word("name", f"container-{secrets.token_hex(4)}")
 
     @property

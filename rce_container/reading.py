@@ -40,11 +40,11 @@ def read_for(archive: LogArchive, message: ReadLog, living: str) -> LogChunk:
 def _find(archive: LogArchive, message: ReadLog, living: str) -> Kept:
     current = archive.get(message.id, living) if living else None
     tag = EndpointId.parse(message.id).tag
-    if message.wish.life:
-        ended = [kept for kept in archive.ended(message.id) if kept.life.mark == message.wish.life]
-        found = current if living == message.wish.life else next(iter(ended), None)
+    if message.query.life:
+        ended = [kept for kept in archive.ended(message.id) if kept.life.mark == message.query.life]
+        found = current if living == message.query.life else next(iter(ended), None)
         missing = f"the logs of that life of container {tag} are not kept any more"
-    elif current is not None and not message.wish.previous and _is_owners(current, message):
+    elif current is not None and not message.query.previous and _is_owners(current, message):
         return current
     else:
         found = next((kept for kept in archive.ended(message.id) if kept.life.mark != living), None)
@@ -56,12 +56,12 @@ def _find(archive: LogArchive, message: ReadLog, living: str) -> Kept:
 
 def _is_owners(kept: Kept, message: ReadLog) -> bool:
     """Whether a life is of the user who is meant, and not of one of the same name before."""
-    return kept.life.began >= message.wish.since
+    return kept.life.began >= message.query.since
 
 
 def _read(kept: Kept, message: ReadLog) -> Chunk:
     if message.node:
-        letters = letters_of(message.wish.streams, message.wish.level)
+        letters = letters_of(message.query.streams, message.query.level)
         return read_node_log(kept.folder, message.node, message.offset, message.limit, letters)
-    name = ROSOUT_LOG if LogStream.ROSOUT in message.wish.streams else ENVIRONMENT_LOG
+    name = ROSOUT_LOG if LogStream.ROSOUT in message.query.streams else ENVIRONMENT_LOG
     return read_log(kept.folder, name, message.offset, message.limit)

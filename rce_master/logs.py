@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 import msgspec
 
 from rce.control.exceptions import ControlError
-from rce.control.logs import LogWish
+from rce.control.logs import LogQuery
 from rce.control.messages import LogChunk, TaskSetKind
 from rce.protocol.names import EndpointId, is_name
 from rce_master.exceptions import NotFound, TaskSetAway
@@ -26,7 +26,7 @@ class LogReader(Protocol):
         node: str,
         offset: int = 0,
         limit: int = 65536,
-        wish: LogWish = LogWish(),  # noqa: B008 - it is frozen
+        query: LogQuery = LogQuery(),  # noqa: B008 - it is frozen
     ) -> LogChunk:
         """Read a piece of a log."""
 
@@ -40,7 +40,7 @@ class LogRequest(NamedTuple):
     """Node tag; empty for the environment's own log."""
     offset: int = 0
     limit: int = 65536
-    wish: LogWish = LogWish()
+    query: LogQuery = LogQuery()
 
 
 async def read_log(tables: Tables, peers: Mapping[str, LogReader], request: LogRequest) -> LogChunk:
@@ -60,12 +60,12 @@ async def read_log(tables: Tables, peers: Mapping[str, LogReader], request: LogR
         raise NotFound(f"there is no container {tag!r}: a name has letters, digits and '_', a letter first")
     container = tables.container(request.id)
     if container is None or not _is_present(tables, request):
-        wish = msgspec.structs.replace(request.wish, since=_owner_since(tables, request.id))
-        request = request._replace(wish=wish)
-    wish = request.wish
+        query = msgspec.structs.replace(request.query, since=_owner_since(tables, request.id))
+        request = request._replace(query=query)
+    query = request.query
     if container is None:
         return await _read_anywhere(tables, peers, request)
-    if wish.previous or wish.life:
+    if query.previous or query.life:
         return await _read_earlier(tables, peers, request, container)
     if request.node and request.node not in container.nodes:
         raise NotFound(f"container {container.tag!r} has no node {request.node!r}")
@@ -120,7 +120,7 @@ async def _ask(peer: LogReader | None, request: LogRequest) -> LogChunk:
         raise TaskSetAway(f"container {tag!r} cannot be reached now")
     try:
         return await peer.read_log(
-            request.id, request.node, offset=request.offset, limit=request.limit, wish=request.wish
+            request.id, request.node, offset=request.offset, limit=request.limit, query=request.query
         )
     except ControlError as error:
         raise TaskSetAway(f"container {tag!r} cannot be reached: {error}") from error
@@ -129,8 +129,8 @@ async def _ask(peer: LogReader | None, request: LogRequest) -> LogChunk:
 def _is_present(tables: Tables, request: LogRequest) -> bool:
     """Whether the present life is meant, which is its owner's whatever its machine's clock says."""
     status = tables.container_live(request.id).status
-    wish = request.wish
-    return not wish.previous and wish.life in ("", status.incarnation if status is not None else "")
+    query = request.query
+    return not query.previous and query.life in ("", status.incarnation if status is not None else "")
 
 
 def _owner_since(tables: Tables, id_: str) -> float:

@@ -6,7 +6,7 @@ import logging
 from typing import TYPE_CHECKING, Protocol
 
 from rce.control.exceptions import PeerRefusedError
-from rce.control.logs import LogWish
+from rce.control.logs import LogQuery
 from rce.control.messages import (
     Drop,
     Fault,
@@ -121,7 +121,7 @@ class Reconciler:
         node: str,
         offset: int,
         limit: int,
-        wish: LogWish = LogWish(),  # noqa: B008 - it is frozen
+        query: LogQuery = LogQuery(),  # noqa: B008 - it is frozen
     ) -> LogChunk:
         """Read the log of a container's node where it is (:func:`rce_master.logs.read_log`).
 
@@ -129,7 +129,7 @@ class Reconciler:
             NotFound: There is no such container, node or log.
             TaskSetAway: Its task set is not connected or does not answer.
         """
-        request = LogRequest(id_, node, offset, limit, wish)
+        request = LogRequest(id_, node, offset, limit, query)
         return await read_log(self._state_service.tables, self._peers, request)
 
     def task_set_of(self, id_: str) -> Peer:

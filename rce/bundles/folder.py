@@ -111,8 +111,8 @@ def _name(folder: Path, texts: dict[str, bytes]) -> str:
         raise BadBundle(str(error)) from error
 
 
-def _version(wish: str, contents: Contents) -> str:
-    version = wish or contents.version
+def _version(requested: str, contents: Contents) -> str:
+    version = requested or contents.version
     if not version:
         raise BadBundle(
             "the package has no version: give --version, or write one into the manifest (in package.yaml in"

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from rce.config.exceptions import Fault
+from rce.protocol.container_checks import container_faults, find_circle
 from rce.protocol.names import Form, Role, is_name
-from rce.protocol.wishes import container_faults, find_circle
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Iterator, Mapping
@@ -77,7 +77,7 @@ def check(parts: Parts) -> list[Fault]:
     """Find everything that does not fit together."""
     return [
         *_check_tags(parts),
-        *_check_wishes(parts),
+        *_check_containers(parts),
         *_check_order(parts),
         *_check_interfaces(parts),
         *_check_connections(parts),
@@ -116,7 +116,7 @@ def _repeated(parts: Parts, key: str, field_: str, items: Iterable[tuple[int, Ha
         first.setdefault(identity, index)
 
 
-def _check_wishes(parts: Parts) -> Iterator[Fault]:
+def _check_containers(parts: Parts) -> Iterator[Fault]:
     addresses: dict[Hashable, int] = {}
     for index, container in parts.containers:
         place = f"containers[{index}]"

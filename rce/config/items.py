@@ -81,7 +81,7 @@ InterfacePath = Annotated[str, _matches(messages.InterfacePath)]
 
 
 class Container(Strict):
-    """A container to make; zero or empty means no wish."""
+    """A container to make; zero or empty: not requested."""
 
     tag: Name = Field(alias="cTag")
     group: Text = ""

@@ -28,7 +28,7 @@ class LogLevel(Enum):
     FATAL = "fatal"
 
 
-class LogWish(Struct, frozen=True, kw_only=True, omit_defaults=True):
+class LogQuery(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """What of the logs of a container's node is to be read."""
 
     streams: tuple[LogStream, ...] = ()

@@ -16,10 +16,10 @@ from enum import Enum
 from typing import Any
 
 import msgspec
-from msgspec import Struct
+from msgspec import Struct, field
 
 from rce.control.execution import Command
-from rce.control.logs import LogWish
+from rce.control.logs import LogQuery
 from rce.control.model import (
     EndpointSpec,
     EndpointStatus,
@@ -257,7 +257,7 @@ class ReadLog(_Message, frozen=True, kw_only=True, omit_defaults=True):
     offset: int = 0
     """Negative: that many bytes before the end."""
     limit: int = 65536
-    wish: LogWish = LogWish()
+    query: LogQuery = field(default=LogQuery(), name="wish")
 
 
 class Execute(_Message, frozen=True, kw_only=True, omit_defaults=True):

@@ -75,7 +75,7 @@ class Network(Enum):
 
 
 class Resources(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What a container asks for. Zero or empty means: no wish."""
+    """What a container asks for. Zero or empty: not requested."""
 
     group: str = ""
     group_ip: str = ""

@@ -8,7 +8,7 @@ import logging
 from typing import TYPE_CHECKING
 
 from rce.control.exceptions import PeerGoneError, PeerTimeoutError
-from rce.control.logs import LogWish
+from rce.control.logs import LogQuery
 from rce.control.messages import ReadLog, encode
 from rce.control.timeouts import MAX_QUEUED, ControlTimeouts
 
@@ -73,7 +73,7 @@ class Peer:
         node: str,
         offset: int = 0,
         limit: int = 65536,
-        wish: LogWish = LogWish(),  # noqa: B008 - it is frozen
+        query: LogQuery = LogQuery(),  # noqa: B008 - it is frozen
     ) -> LogChunk:
         """Read a piece of a node's log.
 
@@ -82,7 +82,7 @@ class Peer:
             node: Node tag; empty for the environment's own log.
             offset: Where to start, in bytes; negative: that many before the end.
             limit: At most so many bytes.
-            wish: Of which life of the container, and what of it.
+            query: Of which life of the container, and what of it.
 
         Raises:
             PeerGoneError: The task set left.
@@ -93,7 +93,7 @@ class Peer:
         number = next(self._numbers)
         reply: asyncio.Future[LogChunk] = asyncio.get_running_loop().create_future()
         self._reads[number] = reply
-        self.send(ReadLog(request=number, id=id, node=node, offset=offset, limit=limit, wish=wish))
+        self.send(ReadLog(request=number, id=id, node=node, offset=offset, limit=limit, query=query))
         try:
             async with asyncio.timeout(self._timeouts.log):
                 return await reply

@@ -110,7 +110,7 @@ class _Part(Struct, frozen=True, kw_only=True, omit_defaults=True, rename="camel
 
 
 class ContainerData(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
-    """What a container asks for; zero or empty means no wish."""
+    """What a container asks for; zero or empty: not requested."""
 
     group: Text = ""
     group_ip: Text = ""
@@ -144,7 +144,7 @@ class ContainerData(_Part, frozen=True, kw_only=True, omit_defaults=True, rename
 
 
 class ResizeData(_Part, frozen=True, kw_only=True, omit_defaults=True, rename="camel"):
-    """What is to change of a container's wishes; None leaves a wish as it is, zero takes it back."""
+    """A change of a container's resources; None leaves a value as it is, zero withdraws the request."""
 
     size: Annotated[int, Meta(ge=1, le=2**16)] | None = None
     cpu: Quantity | None = None

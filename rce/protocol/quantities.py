@@ -9,7 +9,7 @@ bandwidth   bytes per second: ``5000000``   ``"5M"``, ``"2.5MB/s"``, ``"10Mbit"`
 ==========  ==============================  ==================================================
 
 The prefixes of memory are powers of 1024, with and without the ``i``, as memory is built and limited; those
-of bandwidth are powers of 1000, as networks count, and of 1024 with the ``i``. Zero means: no wish.
+of bandwidth are powers of 1000, as networks count, and of 1024 with the ``i``. Zero: not requested.
 """
 
 from __future__ import annotations

@@ -14,6 +14,7 @@ import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 
 from rce.protocol.calls import text_id
+from rce.protocol.container_checks import container_faults, resize_faults
 from rce.protocol.exceptions import MessageError
 from rce.protocol.limits import DEFAULT_LIMITS
 from rce.protocol.messages import (
@@ -43,7 +44,6 @@ from rce.protocol.messages import (
     SourceName,
 )
 from rce.protocol.names import Form
-from rce.protocol.wishes import container_faults, resize_faults
 
 if TYPE_CHECKING:
     from collections.abc import Collection

@@ -116,7 +116,7 @@ class Child:
                 await self.wait()
 
     def hurry(self) -> None:
-        """Tell it once more to end, which programs take as a wish not to wait for others."""
+        """Tell it once more to end, which programs take as a request not to wait for others."""
         if self.returncode is None:
             self._signal(signal.SIGTERM)
 

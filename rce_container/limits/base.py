@@ -44,7 +44,7 @@ WEIGHT_PER_SLOT = 100
 def limits_of(resources: Resources, settings: SlotSettings) -> Limits:
     """The limits of a container: what it asks for itself, else as many slots' as its size says.
 
-    Stores of earlier releases may hold wishes for less memory than a container can live with.
+    Stores of earlier releases may hold requests for less memory than a container can live with.
     """
     size = max(1, resources.size)
     return Limits(

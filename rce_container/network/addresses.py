@@ -37,28 +37,28 @@ def parse_address(text: str) -> IPv4Interface:
     return address
 
 
-def choose(wish: str, taken: Mapping[IPv4Interface, str]) -> IPv4Interface:
+def choose(requested: str, taken: Mapping[IPv4Interface, str]) -> IPv4Interface:
     """Find the address of a new member of a group.
 
     Args:
-        wish: Its ``groupIp``; if empty, a free one is found.
+        requested: Its ``groupIp``; if empty, a free one is found.
         taken: The group's addresses, and which container has each.
 
     Raises:
-        NetworkError: The wish cannot be granted; the text says what to do.
+        NetworkError: The request cannot be granted; the text says what to do.
     """
     network = next((address.network for address in taken), None)
-    if not wish:
+    if not requested:
         return _free(network or DEFAULT_NETWORK, taken)
-    address = parse_address(wish)
+    address = parse_address(requested)
     if network is not None and address.network != network:
         raise NetworkError(
-            f"the groupIp {wish} is in {address.network}, but the group's other containers are in {network}: "
-            "give all of them addresses of one network, or none"
+            f"the groupIp {requested} is in {address.network}, but the group's other containers are in "
+            f"{network}: give all of them addresses of one network, or none"
         )
     if address in taken:
         raise NetworkError(
-            f"the groupIp {wish} belongs to container {taken[address]} of the same group; take another"
+            f"the groupIp {requested} belongs to container {taken[address]} of the same group; take another"
         )
     return address
 

@@ -195,8 +195,8 @@ def _needed_ports(mode: Mode, core_uri: str) -> tuple[str, ...]:
 def _choose_ports(headless: bool, given: dict[str, int | None], needed: Iterable[str]) -> Ports:
     """The ports to use; free ones where a headless run was not told which."""
     base = ANY if headless else Ports()
-    wished = {name: value for name, value in given.items() if value is not None}
-    return Ports(**{name: getattr(base, name) for name in given} | wished).chosen(needed)
+    chosen = {name: value for name, value in given.items() if value is not None}
+    return Ports(**{name: getattr(base, name) for name in given} | chosen).chosen(needed)
 
 
 def _show_warning(line: str) -> None:

@@ -26,7 +26,7 @@ class Mission:
     What the planner does not know, or no longer after a restart, is said again until it does.
 
     Args:
-        station: Carries the wishes.
+        station: Carries the requests.
         scenario: Robots and their goals.
         truth: Says what truly happens in the world.
         say: Gets lines for people.
@@ -124,10 +124,10 @@ class Mission:
         for robot in fleet.robots:
             goal = self.goals.get(robot.id)
             if goal is not None and robot.goal != goal:
-                await self._wish(self._station.set_goal(robot.id, goal))
+                await self._send(self._station.set_goal(robot.id, goal))
         for cell in self.block.done:
             if cell not in {*fleet.blocked, *fleet.pending}:
-                await self._wish(self._station.block(cell, blocked=True))
+                await self._send(self._station.block(cell, blocked=True))
 
     async def _block(self, fleet: FleetModel, truth: WorldReport) -> None:
         if not any(robot.distance_m > UNDER_WAY for robot in truth.robots):
@@ -137,18 +137,18 @@ class Mission:
             case Step.BLOCK:
                 on_path = [robot.id for robot in fleet.robots if block.cell in robot.plan]
                 self._say(f"blocking cell {block.cell} on the path of {', '.join(on_path)}")
-                if not await self._wish(self._station.block(block.cell, blocked=True)):
+                if not await self._send(self._station.block(block.cell, blocked=True)):
                     block.refused()
             case Step.FREE:
                 self._say(f"freeing cell {block.cell}: no robot had to replan, or goals could not be reached")
-                await self._wish(self._station.block(block.cell, blocked=False))
+                await self._send(self._station.block(block.cell, blocked=False))
             case Step.NOTHING if len(block.done) > done:
                 self._say(f"cell {block.cell} is blocked, and holds a box")
 
-    async def _wish(self, wish: Coroutine[Any, Any, None]) -> bool:
-        """Utter a wish; tell whether it was granted."""
+    async def _send(self, request: Coroutine[Any, Any, None]) -> bool:
+        """Send a request; tell whether it was granted."""
         try:
-            await wish
+            await request
         except StationAwayError:
             return False
         except WishRefusedError as error:

@@ -16,7 +16,7 @@ TIMEOUT = aiohttp.ClientTimeout(total=15)
 
 
 class StationApi:
-    """Reads the fleet's state and utters wishes.
+    """Reads the fleet's state and sends requests.
 
     Args:
         session: What HTTP goes through.

@@ -1,4 +1,4 @@
-"""The station's dealings with the planner: state and poses come in, wishes go out, over any wire."""
+"""The station's dealings with the planner: state and poses come in, requests go out, over any wire."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
+from rce_fleet.station.desired import Desired, DesiredCell, DesiredGoal
 from rce_fleet.station.view import FleetView
-from rce_fleet.station.wishes import CellWish, GoalWish, Wishes
 
 STATE = "fleet/FleetState"
 STATE_TOPIC = "/fleet/state"
@@ -115,7 +115,7 @@ class FleetLink:
         self._view = view
         self._on_change = on_change
         self._on_event = on_event
-        self._wishes = Wishes()
+        self._desired = Desired()
         self._planner_began: str | None = None
         self._planner_restarted = asyncio.Event()
         self._known: set[str] = set()
@@ -133,7 +133,7 @@ class FleetLink:
             FleetError: The planner refuses, or is away.
         """
         said = await self._ask(SET_GOAL, {"robot": robot, "cell": -1 if cell is None else cell})
-        self._wishes.set_goal(robot, cell)
+        self._desired.set_goal(robot, cell)
         return said
 
     async def block_cell(self, cell: int, *, blocked: bool) -> str:
@@ -143,7 +143,7 @@ class FleetLink:
             FleetError: The planner refuses, or is away.
         """
         said = await self._ask(BLOCK_CELL, {"cell": cell, "blocked": blocked})
-        self._wishes.set_cell(cell, blocked=blocked)
+        self._desired.set_cell(cell, blocked=blocked)
         return said
 
     async def _ask(self, service: PlannerService, request: dict[str, Any]) -> str:
@@ -165,12 +165,12 @@ class FleetLink:
                         await asyncio.sleep(TELL_EVERY_S)
 
     async def _tell_unmet(self) -> None:
-        for wish in self._wishes.unmet(self._view.state) if self._view.state else ():
+        for desired in self._desired.unmet(self._view.state) if self._view.state else ():
             with contextlib.suppress(FleetError):
-                match wish:
-                    case CellWish(cell, blocked):
+                match desired:
+                    case DesiredCell(cell, blocked):
                         await self.block_cell(cell, blocked=blocked)
-                    case GoalWish(robot, cell):
+                    case DesiredGoal(robot, cell):
                         await self.set_goal(robot, cell)
 
     # -- what comes in ------------------------------------------------------------------------------

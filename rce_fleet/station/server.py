@@ -55,7 +55,7 @@ class Station:
 
     Args:
         view: What is known of the fleet.
-        fleet: Carries wishes to the planner.
+        fleet: Carries requests to the planner.
         pages: The open pages.
         entrance: Says who somebody is; anybody may do everything if None.
         names: By which the station may be asked for.
@@ -258,9 +258,9 @@ class Station:
         refusal = self._door.may_steer(request, "set_goal", robot)
         if refusal is not None:
             return refusal
-        wish = GoalRequest.model_validate_json(await read_whole(request))
-        message = await self._fleet.set_goal(robot, wish.cell)
-        self._door.note(request, "set_goal", robot, "stop" if wish.cell is None else f"cell {wish.cell}")
+        asked = GoalRequest.model_validate_json(await read_whole(request))
+        message = await self._fleet.set_goal(robot, asked.cell)
+        self._door.note(request, "set_goal", robot, "stop" if asked.cell is None else f"cell {asked.cell}")
         return _reply(Answer(message=message))
 
     async def put_cell(self, request: web.Request) -> web.StreamResponse:
@@ -271,9 +271,9 @@ class Station:
         refusal = self._door.may_steer(request, "block_cell", number)
         if refusal is not None:
             return refusal
-        wish = CellRequest.model_validate_json(await read_whole(request))
-        message = await self._fleet.block_cell(int(number), blocked=wish.blocked)
-        self._door.note(request, "block_cell" if wish.blocked else "free_cell", number)
+        asked = CellRequest.model_validate_json(await read_whole(request))
+        message = await self._fleet.block_cell(int(number), blocked=asked.blocked)
+        self._door.note(request, "block_cell" if asked.blocked else "free_cell", number)
         return _reply(Answer(message=message))
 
     async def live(self, request: web.Request) -> web.StreamResponse:

@@ -38,7 +38,7 @@ _NOT_INSTALLED = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Wish:
+class PushRequest:
     """A version that a user wants to be taken."""
 
     user: str
@@ -87,12 +87,12 @@ class PackageService:
                     logger.error("packages that are needed no more stay on the disk: %s", error)  # noqa: TRY400
 
     async def push(
-        self, wish: Wish, size: int, chunks: AsyncIterator[bytes]
+        self, request: PushRequest, size: int, chunks: AsyncIterator[bytes]
     ) -> tuple[Bundle, tuple[str, ...]]:
         """Take a version of a package.
 
         Args:
-            wish: What it is to be.
+            request: What it is to be.
             size: Bytes of the archive as its sender says; 0 if it does not.
             chunks: The archive.
 
@@ -103,17 +103,17 @@ class PackageService:
             Refused: It cannot be taken.
             StoreError: It cannot be kept.
         """
-        self._check_early(wish, size)
-        async with self._uploads.one(wish.user) as upload:
-            bundle, contents = await self._take(wish, upload.counted(chunks))
+        self._check_early(request, size)
+        async with self._uploads.one(request.user) as upload:
+            bundle, contents = await self._take(request, upload.counted(chunks))
         kept = self._state_service.tables.bundles.get(bundle.id) or bundle
         return kept, (*contents.warnings, *self._warnings(contents))
 
-    async def _take(self, wish: Wish, chunks: AsyncIterator[bytes]) -> tuple[Bundle, Contents]:
+    async def _take(self, request: PushRequest, chunks: AsyncIterator[bytes]) -> tuple[Bundle, Contents]:
         async with self._store.receive(chunks) as incoming:
-            _verify(wish, incoming)
-            contents = await self._inspect(wish.user, incoming)
-            bundle = self._bundle(wish, incoming, contents)
+            _verify(request, incoming)
+            contents = await self._inspect(request.user, incoming)
+            bundle = self._bundle(request, incoming, contents)
             packages.check_new(self._state_service.tables, bundle)
             async with self._lock:
                 try:
@@ -130,25 +130,25 @@ class PackageService:
         except CrowdedError:
             raise Busy("too many packages are pushed at the same time; try again in a moment") from None
 
-    def _check_early(self, wish: Wish, size: int) -> None:
+    def _check_early(self, request: PushRequest, size: int) -> None:
         """Refuse what is to be refused anyway before all of it has come."""
         tables, settings = self._state_service.tables, self._state_service.state.settings
-        if package_key_key(wish.user, wish.key) not in tables.package_keys:
+        if package_key_key(request.user, request.key) not in tables.package_keys:
             raise Forbidden("the key is not registered with your account; run: rce package key register")
-        if bundle_key(wish.user, wish.name, wish.version) not in tables.bundles:
-            packages.check_room(tables, settings, wish.user, size)
+        if bundle_key(request.user, request.name, request.version) not in tables.bundles:
+            packages.check_room(tables, settings, request.user, size)
 
-    def _bundle(self, wish: Wish, incoming: Incoming, contents: Contents) -> Bundle:
-        if contents.name != wish.name:
-            raise Invalid(f"the archive holds the package {contents.name!r}, not {wish.name!r}")
+    def _bundle(self, request: PushRequest, incoming: Incoming, contents: Contents) -> Bundle:
+        if contents.name != request.name:
+            raise Invalid(f"the archive holds the package {contents.name!r}, not {request.name!r}")
         return Bundle(
-            user=wish.user,
-            name=wish.name,
-            version=wish.version,
+            user=request.user,
+            name=request.name,
+            version=request.version,
             sha256=incoming.sha256,
             digest=contents.digest,
-            signature=wish.signature,
-            key=wish.key,
+            signature=request.signature,
+            key=request.key,
             packed=incoming.size,
             size=contents.size,
             files=contents.files,
@@ -175,10 +175,10 @@ class PackageService:
             self._dirty.set()
 
 
-def _verify(wish: Wish, incoming: Incoming) -> None:
-    signed = statement(wish.user, wish.name, wish.version, incoming.sha256)
+def _verify(request: PushRequest, incoming: Incoming) -> None:
+    signed = statement(request.user, request.name, request.version, incoming.sha256)
     try:
-        verify(wish.key, wish.signature, signed)
+        verify(request.key, request.signature, signed)
     except (BadKey, BadSignature) as error:
         raise Invalid(
             f"{error}; the package was changed on its way, or signed for another user or version"

@@ -106,7 +106,9 @@ def _adapt(route: Route, services: Services) -> Answer:
         if reply is None:
             return web.Response(status=route.status)
         return web.Response(
-            body=reply.model_dump_json().encode(), status=route.status, content_type="application/json"
+            body=reply.model_dump_json(by_alias=True).encode(),
+            status=route.status,
+            content_type="application/json",
         )
 
     return answer

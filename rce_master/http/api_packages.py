@@ -9,7 +9,7 @@ from rce.bundles.exceptions import BadKey
 from rce.bundles.signing import key_id
 from rce.web.bodies import read_pieces
 from rce.web.openapi import Query
-from rce_master.bundles.service import Wish
+from rce_master.bundles.service import PushRequest
 from rce_master.exceptions import Invalid, NotFound
 from rce_master.http import package_models as models
 from rce_master.http.routes import OF_USER, Call, RouteTable
@@ -70,7 +70,7 @@ async def show_package(call: Call) -> models.PackageOut:
 )
 async def push_package(call: Call) -> models.PackageOut:
     """Take a version of a package; the same one again changes nothing."""
-    wish = Wish(
+    request = PushRequest(
         user=call.caller.name,
         name=call.path("name"),
         version=call.path("version"),
@@ -78,7 +78,7 @@ async def push_package(call: Call) -> models.PackageOut:
         signature=call.query("signature"),
     )
     size = call.request.content_length or 0
-    bundle, warnings = await call.services.packages.push(wish, size, read_pieces(call.request))
+    bundle, warnings = await call.services.packages.push(request, size, read_pieces(call.request))
     return _shown(call.services.state_service.tables, bundle, warnings)
 
 

@@ -11,7 +11,7 @@ from typing import TypeVar
 import msgspec
 from aiohttp import web
 
-from rce.control.logs import LogLevel, LogStream, LogWish
+from rce.control.logs import LogLevel, LogQuery, LogStream
 from rce.web.openapi import Query
 from rce_master.events import Event
 from rce_master.exceptions import Invalid
@@ -72,9 +72,9 @@ async def _read_log(call: Call, node: str) -> models.LogOut:
     if not 0 < limit <= MAX_LOG:
         raise Invalid(f"query parameter 'limit' must be 1 to {MAX_LOG}")
     id_ = f"{call.owner}/{call.path('container')}"
-    wish = _wish(call.request.query)
+    query = _log_query(call.request.query)
     async with call.services.quotas.log_read(call.caller):
-        chunk = await call.services.reconciler.read_log(id_, node, offset, limit, wish)
+        chunk = await call.services.reconciler.read_log(id_, node, offset, limit, query)
     return models.LogOut(
         text=chunk.text,
         offset=chunk.offset,
@@ -84,9 +84,9 @@ async def _read_log(call: Call, node: str) -> models.LogOut:
     )
 
 
-def _wish(query: Mapping[str, str]) -> LogWish:
+def _log_query(query: Mapping[str, str]) -> LogQuery:
     streams = [word for word in query.get("stream", "").split(",") if word]
-    return LogWish(
+    return LogQuery(
         streams=tuple(_one_of(LogStream, "stream", word) for word in streams),
         level=_one_of(LogLevel, "level", query.get("level", LogLevel.DEBUG.value)),
         previous=query.get("previous") == "true",

@@ -110,7 +110,7 @@ class LimitsIn(_In):
 
 
 class ContainerIn(_In):
-    """A container to make. Zero or empty means: no wish."""
+    """A container to make. Zero or empty: not requested."""
 
     tag: str
     group: str = ""
@@ -133,7 +133,7 @@ class ContainerIn(_In):
 
 
 class ResizeIn(_In):
-    """What a container may use from now on; null or left out: as before. Zero takes a wish back."""
+    """What a container may use from now on; null or left out: as before. Zero withdraws a request."""
 
     size: int | None = None
     cpu: Amount | None = None
@@ -294,7 +294,7 @@ class RobotOut(Model):
     interfaces: int
 
 
-class WishOut(Model):
+class RequestedOut(Model):
     """What a container asked for; zero or empty: nothing."""
 
     size: int
@@ -332,7 +332,7 @@ class ContainerOut(Model):
     """CPU seconds since its start."""
     memory: int
     """Bytes in use."""
-    wish: WishOut
+    requested: RequestedOut = Field(alias="wish")
     moving_to: str
     """Task set where its copy is being made, while its machine is drained; else empty."""
 

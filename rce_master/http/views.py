@@ -74,7 +74,7 @@ class Views:
             interfaces=len(container.interfaces),
             cpu_s=usage.cpu_s,
             memory=usage.memory,
-            wish=_wish(container.resources),
+            wish=_requested(container.resources),
             moving_to=move.to if (move := self._tables.moves.get(container.id)) else "",
         )
 
@@ -203,17 +203,17 @@ class Views:
         return set(status.connections) if status else set()
 
 
-def _wish(wish: Resources) -> models.WishOut:
-    return models.WishOut(
-        size=wish.size,
-        cpu=wish.cpu,
-        memory=wish.memory,
-        bandwidth=wish.bandwidth,
-        network=wish.network.value,
-        group=wish.group,
-        group_ip=wish.group_ip,
-        image=wish.image,
-        special_features=list(wish.special_features),
+def _requested(requested: Resources) -> models.RequestedOut:
+    return models.RequestedOut(
+        size=requested.size,
+        cpu=requested.cpu,
+        memory=requested.memory,
+        bandwidth=requested.bandwidth,
+        network=requested.network.value,
+        group=requested.group,
+        group_ip=requested.group_ip,
+        image=requested.image,
+        special_features=list(requested.special_features),
     )
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from rce.control.limits import MEGABYTE, MIN_MEMORY
 from rce.control.messages import TaskSetKind
 from rce.control.model import Network, Resources
-from rce.protocol.wishes import DEFAULT_PREFIX
+from rce.protocol.container_checks import DEFAULT_PREFIX
 from rce_master.exceptions import Conflict, Forbidden, Invalid
 from rce_master.state import limits
 from rce_master.state.placement import Room
@@ -57,14 +57,14 @@ def rooms(tables: Tables, *, away: bool = False) -> dict[str, Room]:
 
 def group_mates(tables: Tables, container: Container) -> list[Container]:
     """List the other containers that must be on the same machine: those of its group's network."""
-    wish = container.resources
-    if wish.network is not Network.GROUP:
+    requested = container.resources
+    if requested.network is not Network.GROUP:
         return []
     return [
         other
         for other in tables.containers(container.user)
         if other.id != container.id
-        and (other.resources.network, other.resources.group) == (Network.GROUP, wish.group)
+        and (other.resources.network, other.resources.group) == (Network.GROUP, requested.group)
     ]
 
 
@@ -119,54 +119,55 @@ def own(tables: Tables, container: Container) -> Counter[str]:
 # What a user may ask for
 
 
-def check_wish(tx: Transaction, user: str, id_: str, wish: Resources) -> None:
+def check_resources(tx: Transaction, user: str, id_: str, requested: Resources) -> None:
     """Check that a user may ask for this.
 
     Args:
         tx: The transaction.
         user: Whose container it is.
         id_: The container; what it was promised before does not count.
-        wish: What it is to get.
+        requested: What it is to get.
 
     Raises:
         Refused: They may not; the text says why and how to mend it.
     """
-    if 0 < wish.memory < MIN_MEMORY:
+    if 0 < requested.memory < MIN_MEMORY:
         raise Invalid(
-            f"memory: {wish.memory / MEGABYTE:.3g} MB are too little; a container itself needs "
+            f"memory: {requested.memory / MEGABYTE:.3g} MB are too little; a container itself needs "
             f"{MIN_MEMORY // MEGABYTE} MB (a plain number is MB)"
         )
     others = [c for c in tx.tables.containers(user) if c.id != id_]
-    _check_group(wish, others)
+    _check_group(requested, others)
     if tx.tables.users[user].role is not UserRole.ADMIN:
-        _check_privileges(wish)
-    limits.check_wishes(tx, user, [wish, *(c.resources for c in others)])
+        _check_privileges(requested)
+    limits.check_all_resources(tx, user, [requested, *(c.resources for c in others)])
 
 
-def _check_privileges(wish: Resources) -> None:
-    if wish.network is Network.HOST:
+def _check_privileges(requested: Resources) -> None:
+    if requested.network is Network.HOST:
         raise Forbidden("network: host is for containers of administrators; use none or group")
-    if wish.image.startswith("/"):
+    if requested.image.startswith("/"):
         raise Forbidden("image: folders of the machine are for administrators; use an OCI image's name")
 
 
-def _check_group(wish: Resources, others: list[Container]) -> None:
-    if wish.network is not Network.GROUP or not wish.group_ip:
+def _check_group(requested: Resources, others: list[Container]) -> None:
+    if requested.network is not Network.GROUP or not requested.group_ip:
         return
-    address = _address(wish.group_ip)
+    address = _address(requested.group_ip)
     for other in others:
         theirs = other.resources
-        if (theirs.network, theirs.group) != (Network.GROUP, wish.group) or not theirs.group_ip:
+        if (theirs.network, theirs.group) != (Network.GROUP, requested.group) or not theirs.group_ip:
             continue
         there = _address(theirs.group_ip)
         if there.ip == address.ip:
             raise Conflict(
-                f"groupIp: {address.ip} is the address of container {other.tag!r} of the group {wish.group!r}"
+                f"groupIp: {address.ip} is the address of container {other.tag!r} of the group "
+                f"{requested.group!r}"
             )
         if there.network != address.network:
             raise Conflict(
                 f"groupIp: {address} is not in {there.network}, where container {other.tag!r} of the group "
-                f"{wish.group!r} is; give all of them addresses of one network"
+                f"{requested.group!r} is; give all of them addresses of one network"
             )
 
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rce_master.state.records import Bundle, KnownLogin, PackageKey, Token, User, UserRole
 
 
-_NO_WISHES = Resources()
+_NOTHING_REQUESTED = Resources()
 
 # Users
 
@@ -234,14 +234,14 @@ class CreateContainer:
 
     user: str
     tag: str
-    resources: Resources = _NO_WISHES
+    resources: Resources = _NOTHING_REQUESTED
     wait: bool = False
     """Whether to wait for room if no machine has any now; else that is refused."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResizeContainer:
-    """``RC``; None leaves a wish as it is, zero takes it back."""
+    """``RC``; None leaves a value as it is, zero withdraws the request."""
 
     user: str
     tag: str

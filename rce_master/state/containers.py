@@ -16,7 +16,7 @@ from rce.control.model import (
     NodeStatus,
     ParameterValue,
 )
-from rce.protocol.wishes import find_circle
+from rce.protocol.container_checks import find_circle
 from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
 from rce_master.state import capacity, draining, endpoints, limits, packages, placing
 from rce_master.state.lifecycle import ContainerEvent, ContainerPhase, next_phase
@@ -61,7 +61,7 @@ def create_container(tx: Transaction, command: CreateContainer) -> None:
     if there is not None:
         raise Conflict(f"{command.tag!r} is a robot already; a container needs another tag")
     limits.check_containers(tx, command.user)
-    capacity.check_wish(tx, command.user, id_, command.resources)
+    capacity.check_resources(tx, command.user, id_, command.resources)
     made = Container(
         id=id_,
         resources=command.resources,

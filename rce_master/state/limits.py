@@ -71,11 +71,11 @@ def limit_of(tables: Tables, settings: StateSettings, user: str, kind: str) -> L
 
 def used_of(tables: Tables, user: str) -> dict[str, float]:
     """Tell how much of each kind a user has."""
-    wishes = [container.resources for container in tables.containers(user)]
+    all_requested = [container.resources for container in tables.containers(user)]
     bundles = tables.bundles.by("user", user)
     return {
-        "containers": len(wishes),
-        **{kind: _asked(wishes, kind) for kind in _OF_MACHINES},
+        "containers": len(all_requested),
+        **{kind: _asked(all_requested, kind) for kind in _OF_MACHINES},
         "packages": len(bundles),
         "disk": sum(bundle.size for bundle in bundles),
     }
@@ -94,7 +94,7 @@ def check_containers(tx: Transaction, user: str) -> None:
         )
 
 
-def check_wishes(tx: Transaction, user: str, wishes: list[Resources]) -> None:
+def check_all_resources(tx: Transaction, user: str, all_requested: list[Resources]) -> None:
     """Check what a user's containers ask for together.
 
     Raises:
@@ -102,7 +102,7 @@ def check_wishes(tx: Transaction, user: str, wishes: list[Resources]) -> None:
     """
     for kind in _OF_MACHINES:
         limit = limit_of(tx.tables, tx.settings, user, kind)
-        asked = _asked(wishes, kind)
+        asked = _asked(all_requested, kind)
         if limit.most and asked > limit.most + _EPSILON:
             share = (
                 f", {tx.settings.user_share:.0%} of what the machines have"
@@ -159,10 +159,10 @@ def _offered(tables: Tables, kind: str) -> float:
     return sum({"slots": m.slots, "cpu": m.cores, "memory": m.memory}[kind] for m in machines)
 
 
-def _asked(wishes: Iterable[Resources], kind: str) -> float:
+def _asked(all_requested: Iterable[Resources], kind: str) -> float:
     if kind == "slots":
-        return sum(max(1, wish.size) for wish in wishes)
-    return sum(wish.cpu if kind == "cpu" else wish.memory for wish in wishes)
+        return sum(max(1, requested.size) for requested in all_requested)
+    return sum(requested.cpu if kind == "cpu" else requested.memory for requested in all_requested)
 
 
 def _plain(kind: str, amount: float) -> str:

@@ -54,11 +54,11 @@ def place_waiting(tx: Transaction) -> None:
     rooms = capacity.rooms(tx.tables)
     too_much: set[Resources] = set()  # rooms only fill up here: what found none finds none later
     for container in sorted(waiting, key=lambda c: c.number):
-        wish = container.resources
-        if wish in too_much:
+        requested = container.resources
+        if requested in too_much:
             continue
-        if not any(room.fits(wish) for room in rooms.values()):
-            too_much.add(wish)
+        if not any(room.fits(requested) for room in rooms.values()):
+            too_much.add(requested)
             continue
         room = best(tx, container, rooms)
         if room is not None:

@@ -1,6 +1,6 @@
 """Chaos: kill -9 of random processes of an engine at random moments of its containers' lives, by a seed.
 
-``python -m support.chaos RUNTIME SEED ROUNDS`` does it for as long as is wished.
+``python -m support.chaos RUNTIME SEED ROUNDS`` does it for as long as is asked.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ class Customer:
     container: str
     robot: str
     client: Stranger
-    wishes: dict[str, Any]
+    requested: dict[str, Any]
     wants: bool = False
     count: int = 0
 
     async def create(self) -> None:
         self.wants = True
         await ask_for_echo(
-            self.client, self.container, self.robot, self.wishes, restart="always", maxRestarts=0
+            self.client, self.container, self.robot, self.requested, restart="always", maxRestarts=0
         )
 
     async def destroy(self) -> None:
@@ -175,13 +175,15 @@ def _part(pid: int) -> str:
 
 @contextlib.asynccontextmanager
 async def customers(engine: Engine, *, groups: bool) -> AsyncIterator[list[Customer]]:
-    wishes = {"network": "group", "group": "crowd"} if groups else {}
+    requested = {"network": "group", "group": "crowd"} if groups else {}
     async with contextlib.AsyncExitStack() as stack:
         found = []
         for number in range(CONTAINERS):
             robot = f"robot{number}"
             client = await stack.enter_async_context(stranger(engine.url, robot=robot))
-            found.append(Customer(f"box{number}_{engine.http_port}", robot, client, wishes if number else {}))
+            found.append(
+                Customer(f"box{number}_{engine.http_port}", robot, client, requested if number else {})
+            )
         yield found
 
 

@@ -86,8 +86,8 @@ class World:
     def container(
         self, tag: str = "c", user: str = "anna", *, wait: bool = False, **resources: Any
     ) -> Changes:
-        wish = Resources(**resources)
-        return self.do(commands.CreateContainer(user=user, tag=tag, resources=wish, wait=wait))
+        requested = Resources(**resources)
+        return self.do(commands.CreateContainer(user=user, tag=tag, resources=requested, wait=wait))
 
     def interface(
         self,

@@ -1,6 +1,6 @@
 """Ends ``rce up`` at random moments by random signals, its parts killed before or not: nothing may be left.
 
-``python -m support.moments SEED COUNT`` does it as often as is wished.
+``python -m support.moments SEED COUNT`` does it as often as is asked.
 """
 
 from __future__ import annotations

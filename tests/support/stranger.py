@@ -145,13 +145,13 @@ async def wire_echo(client: Stranger, *, container: str = "cTag_01", robot: str 
 
 
 async def ask_for_echo(
-    client: Stranger, container: str, robot: str, wishes: dict[str, Any] | None = None, **node: Any
+    client: Stranger, container: str, robot: str, requested: dict[str, Any] | None = None, **node: Any
 ) -> None:
-    """Ask for what :func:`wire_echo` makes, with wishes for its container and more keys for its node.
+    """Ask for what :func:`wire_echo` makes, with resources for its container and more keys for its node.
 
     May be repeated.
     """
-    await client.send("CC", {"containerTag": container, "containerData": wishes or {}})
+    await client.send("CC", {"containerTag": container, "containerData": requested or {}})
     await client.send(
         "CN",
         {

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from support.containers import Machine, joined, until
 
-from rce.control.logs import LogLevel, LogStream, LogWish
+from rce.control.logs import LogLevel, LogQuery, LogStream
 from rce.control.messages import LogChunk, ReadLog, Status
 from rce.control.model import EndpointState, InterfaceSpec, NodeSpec, NodeState, RestartPolicy
 from rce.ros.types import TypeRegistry
@@ -79,14 +79,14 @@ def own(exe: str, args: str = "", tag: str = "node", **options: Any) -> NodeSpec
     return NodeSpec(tag=tag, pkg="own", exe=exe, args=args, **options)
 
 
-async def read(machine: Machine, node: str, *streams: LogStream, id_: str = BOX, **wish: Any) -> LogChunk:
-    request = ReadLog(request=1, id=id_, node=node, limit=1 << 20, wish=LogWish(streams=streams, **wish))
+async def read(machine: Machine, node: str, *streams: LogStream, id_: str = BOX, **query: Any) -> LogChunk:
+    request = ReadLog(request=1, id=id_, node=node, limit=1 << 20, query=LogQuery(streams=streams, **query))
     return await machine.read_log(request)
 
 
-async def holds(machine: Machine, node: str, text: str, *streams: LogStream, **wish: Any) -> str:
+async def holds(machine: Machine, node: str, text: str, *streams: LogStream, **query: Any) -> str:
     async with asyncio.timeout(20):
-        while text not in (found := (await read(machine, node, *streams, **wish)).text):
+        while text not in (found := (await read(machine, node, *streams, **query)).text):
             await asyncio.sleep(0.02)
     return found
 

@@ -32,8 +32,8 @@ def test_a_taken_port_is_named_with_its_option(name: str, option: str) -> None:
 
 
 def test_ports_that_are_given_are_kept() -> None:
-    wished = ANY.chosen()
-    assert wished.chosen() == wished
+    chosen = ANY.chosen()
+    assert chosen.chosen() == chosen
     assert Ports().http == 9000
 
 

@@ -71,7 +71,7 @@ async def session() -> AsyncIterator[aiohttp.ClientSession]:
         yield session
 
 
-async def test_state_and_wishes(played: Played, server: TestServer, session: aiohttp.ClientSession) -> None:
+async def test_state_and_requests(played: Played, server: TestServer, session: aiohttp.ClientSession) -> None:
     station = StationApi(session, str(server.make_url("/")))
     assert await station.fleet() == FLEET
     await station.set_goal("Robot1", 7)

@@ -7,7 +7,7 @@ import io
 import json
 from typing import TYPE_CHECKING, Any
 
-from rce.control.logs import LogLevel, LogStream, LogWish
+from rce.control.logs import LogLevel, LogQuery, LogStream
 from rce.control.messages import Drop, Put
 from rce.control.model import (
     EndpointState,
@@ -172,15 +172,15 @@ async def test_logs_are_followed_by_offset(site: Site) -> None:
             reply = await site.api("GET", "/containers/c/log", status=422, **wrong)
             assert "must be one of" in reply["error"]
         await site.api("GET", "/containers/c/log", stream="rosout,stderr", level="warn", life="abc")
-        assert containers.asked[-1].wish == LogWish(
+        assert containers.asked[-1].query == LogQuery(
             streams=(LogStream.ROSOUT, LogStream.STDERR),
             level=LogLevel.WARN,
             life="abc",
-            since=containers.asked[-1].wish.since,
+            since=containers.asked[-1].query.since,
         )
-        assert containers.asked[-1].wish.since > 0
+        assert containers.asked[-1].query.since > 0
         await site.api("GET", "/containers/gone/nodes/n/log", previous="true")
-        assert (containers.asked[-1].id, containers.asked[-1].wish.previous) == ("testUser/gone", True)
+        assert (containers.asked[-1].id, containers.asked[-1].query.previous) == ("testUser/gone", True)
         for offset in ("x", "9" * 40, "-" + "9" * 40, "9" * 5000):
             await site.api("GET", "/containers/c/log", status=422, offset=offset)
     while (await site.api("GET", "/machines"))["machines"][0]["connected"]:

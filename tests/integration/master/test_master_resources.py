@@ -75,8 +75,13 @@ async def test_amounts_are_read_and_out_of_capacity_is_a_conflict(site: Site) ->
         body = {"tag": "c", "cpu": "50%", "memory": "256M", "bandwidth": "8Mbit", "size": 2}
         await site.api("POST", "/containers", body, status=204)
         put = await put_of(there, "testUser/c")
-        wish = put.endpoint.resources
-        assert (wish.cpu, wish.memory, wish.bandwidth, wish.size) == (0.5, 256 * MB, 1_000_000, 2)
+        requested = put.endpoint.resources
+        assert (requested.cpu, requested.memory, requested.bandwidth, requested.size) == (
+            0.5,
+            256 * MB,
+            1_000_000,
+            2,
+        )
         shown = (await container(site, "c"))["wish"]
         assert (shown["cpu"], shown["memory"], shown["network"]) == (0.5, 256 * MB, "none")
         reply = await site.api("POST", "/containers", {"tag": "d", "cpu": 4}, status=409)

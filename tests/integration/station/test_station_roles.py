@@ -27,17 +27,17 @@ ROLES = ("viewer", "user", "operator", "admin")
 
 
 class RecordingFleet:
-    """Takes wishes in place of a planner."""
+    """Takes requests in place of a planner."""
 
     def __init__(self) -> None:
-        self.wishes: list[tuple[Any, ...]] = []
+        self.desired: list[tuple[Any, ...]] = []
 
     async def set_goal(self, robot: str, cell: int | None) -> str:
-        self.wishes.append((robot, cell))
+        self.desired.append((robot, cell))
         return "done"
 
     async def block_cell(self, cell: int, *, blocked: bool) -> str:
-        self.wishes.append((cell, blocked))
+        self.desired.append((cell, blocked))
         return "done"
 
 
@@ -107,7 +107,7 @@ async def test_roles_at_station_and_audit(tmp_path: Path) -> None:
         found = {who: (await site.look(token), await site.steer(token)) for who, token in site.tokens.items()}
         assert found == expected
         assert await site.look("") == await site.look("rce_guess") == 401
-        assert site.fleet.wishes == [("Robot1", 7)] * 3
+        assert site.fleet.desired == [("Robot1", 7)] * 3
         robot = (await site.master("POST", "/robot-tokens", {"robot": "R1"}, status=201))["token"]
         assert await site.look(robot) == 401, "a robot's token is for robots"
 
@@ -190,4 +190,4 @@ async def test_page_asks_for_login(tmp_path: Path) -> None:
             assert await page.evaluate("fetch('/api/v1/fleet').then(r => r.status)") == 401
         finally:
             await browser.close()
-    assert site.fleet.wishes == []
+    assert site.fleet.desired == []

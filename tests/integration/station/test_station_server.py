@@ -16,10 +16,10 @@ from rce_fleet.station.view import FleetView
 
 
 class RecordingFleet(FleetLink):
-    """Takes wishes in place of the planner."""
+    """Takes requests in place of the planner."""
 
     def __init__(self) -> None:
-        self.wishes: list[tuple[object, ...]] = []
+        self.desired: list[tuple[object, ...]] = []
         self.fault: FleetError | None = None
 
     async def set_goal(self, robot: str, cell: int | None) -> str:
@@ -28,10 +28,10 @@ class RecordingFleet(FleetLink):
     async def block_cell(self, cell: int, *, blocked: bool) -> str:
         return self._note("cell", cell, blocked)
 
-    def _note(self, *wish: object) -> str:
+    def _note(self, *requested: object) -> str:
         if self.fault is not None:
             raise self.fault
-        self.wishes.append(wish)
+        self.desired.append(requested)
         return "done"
 
 
@@ -97,7 +97,7 @@ async def test_sets_goals_and_blocks_cells(house: House) -> None:
     assert (await house.client.put("/api/v1/robots/Robot1/goal", json={"cell": 5})).status == 200
     assert (await house.client.put("/api/v1/robots/Robot1/goal", json={"cell": None})).status == 200
     assert (await house.client.put("/api/v1/cells/7", json={"blocked": True})).status == 200
-    assert house.fleet.wishes == [("goal", "Robot1", 5), ("goal", "Robot1", None), ("cell", 7, True)]
+    assert house.fleet.desired == [("goal", "Robot1", 5), ("goal", "Robot1", None), ("cell", 7, True)]
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ async def test_bad_input_names_the_place(house: House, path: str, body: str, wor
     reply = await house.client.put(path, data=body)
     assert reply.status in (400, 404)
     assert words in (await reply.json())["error"]
-    assert house.fleet.wishes == []
+    assert house.fleet.desired == []
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ async def test_names_that_the_station_has_not_are_refused(house: House) -> None:
     assert "--public-name" in (await reply.json())["error"]
     for path in ("/", "/api/v1/fleet", "/api/v1/live"):
         assert (await house.client.get(path, headers={"Host": "evil.example"})).status == 421
-    assert house.fleet.wishes == []
+    assert house.fleet.desired == []
 
 
 async def test_a_token_is_asked_for_where_one_is_set(house: House) -> None:

@@ -351,7 +351,7 @@ def test_any_text_is_refused(text: str) -> None:
 
 def test_amounts_are_read_as_the_protocol_reads_them() -> None:
     data = good()
-    wishes = {
+    requested = {
         "cpu": "50%",
         "memory": "256M",
         "bandwidth": "10Mbit",
@@ -359,9 +359,9 @@ def test_amounts_are_read_as_the_protocol_reads_them() -> None:
         "network": "none",
         "image": "debian:12",
     }
-    data["containers"][0] |= wishes
+    data["containers"][0] |= requested
     (made,) = [r for r in loads(json.dumps(data)).setup() if isinstance(r, CreateContainer)]
-    for key, value in wishes.items():
+    for key, value in requested.items():
         assert getattr(made.container_data, key) == value
 
 

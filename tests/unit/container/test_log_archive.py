@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rce.control.logs import LogStream, LogWish
+from rce.control.logs import LogQuery, LogStream
 from rce.control.messages import ReadLog
 from rce_container.archive import MAX_LIVES, LogArchive
 from rce_container.environment.logs.files import ENVIRONMENT_LOG, ROSOUT_LOG, LogWriter
@@ -38,8 +38,8 @@ def live(archive: LogArchive, mark: str, text: str = "hello", id_: str = BOX) ->
     log.close()
 
 
-def read(archive: LogArchive, node: str = "node", living: str = "", id_: str = BOX, **wish: object) -> str:
-    message = ReadLog(request=1, id=id_, node=node, wish=LogWish(**wish))  # type: ignore[arg-type]
+def read(archive: LogArchive, node: str = "node", living: str = "", id_: str = BOX, **query: object) -> str:
+    message = ReadLog(request=1, id=id_, node=node, query=LogQuery(**query))  # type: ignore[arg-type]
     return read_for(archive, message, living).text
 
 
@@ -75,9 +75,9 @@ def test_the_environment_has_two_logs(archive: LogArchive) -> None:
 def test_nobody_reads_what_is_another_ones(archive: LogArchive) -> None:
     live(archive, "one", id_="bob/box")
     archive.end("bob/box", "one", "", 10.0)
-    for wish in ({}, {"life": "one"}, {"previous": True}):
+    for query in ({}, {"life": "one"}, {"previous": True}):
         with pytest.raises(FileNotFoundError):
-            read(archive, **wish)
+            read(archive, **query)
     for node in ("../one/node", "_environment", "", "*"):
         with pytest.raises(FileNotFoundError):
             read(archive, node)
@@ -89,9 +89,9 @@ def test_nobody_reads_what_is_another_ones(archive: LogArchive) -> None:
 def test_what_still_ends_of_a_user_who_was_removed_is_not_another_ones(archive: LogArchive) -> None:
     live(archive, "one")
     assert read(archive, living="one", since=1.0)
-    for wish in ({}, {"life": "one"}):
+    for query in ({}, {"life": "one"}):
         with pytest.raises(FileNotFoundError):
-            read(archive, living="one", since=1.5, **wish)
+            read(archive, living="one", since=1.5, **query)
 
 
 def test_the_last_life_that_ended_counts(archive: LogArchive) -> None:

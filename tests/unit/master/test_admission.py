@@ -20,8 +20,8 @@ def at(world: World, tag: str, user: str = "anna") -> str:
     return world.state.tables.endpoints[f"{user}/{tag}"].task_set
 
 
-def resize(world: World, tag: str = "c", user: str = "anna", **wish: object) -> object:
-    return world.do(commands.ResizeContainer(user=user, tag=tag, **wish))  # type: ignore[arg-type]
+def resize(world: World, tag: str = "c", user: str = "anna", **requested: object) -> object:
+    return world.do(commands.ResizeContainer(user=user, tag=tag, **requested))  # type: ignore[arg-type]
 
 
 def gone(world: World, tag: str, process: str = "c1") -> None:
@@ -220,8 +220,8 @@ def test_a_container_is_resized_while_it_runs(world: World) -> None:
     assert [(h.kind, h.text) for h in changes.events] == [  # type: ignore[attr-defined]
         ("container_resized", "size 1, cpu 0.5, memory 256 MB, bandwidth 5B/s")
     ]
-    wish = world.spec("c").resources
-    assert (wish.cpu, wish.memory, wish.bandwidth) == (0.5, 256 * MB, 5)
+    requested = world.spec("c").resources
+    assert (requested.cpu, requested.memory, requested.bandwidth) == (0.5, 256 * MB, 5)
     assert world.phase() == "running"
     assert list(resize(world, cpu=0.5).touched) == []  # type: ignore[attr-defined]
     resize(world, cpu=0.0)

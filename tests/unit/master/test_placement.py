@@ -31,7 +31,7 @@ def room(process: str = "m1", **fields: Any) -> Room:
 
 
 @pytest.mark.parametrize(
-    ("where", "wish", "reason"),
+    ("where", "requested", "reason"),
     [
         (room(cores=2, cpu_used=0.5), {"cpu": 4.0}, "m1 has 1.5 of 2 cores free, 4 needed"),
         (room(slots=4, slots_used=3), {"size": 2}, "m1 has 1 of 4 slots free, 2 needed"),
@@ -48,9 +48,9 @@ def room(process: str = "m1", **fields: Any) -> Room:
         ),
     ],
 )
-def test_what_is_missing_is_named(where: Room, wish: dict[str, Any], reason: str) -> None:
-    assert where.why_not(Resources(**wish)) == reason
-    assert not where.fits(Resources(**wish))
+def test_what_is_missing_is_named(where: Room, requested: dict[str, Any], reason: str) -> None:
+    assert where.why_not(Resources(**requested)) == reason
+    assert not where.fits(Resources(**requested))
 
 
 def test_what_a_machine_does_not_count_it_has_enough_of() -> None:
@@ -99,7 +99,7 @@ def test_a_long_list_of_refusals_is_cut() -> None:
     assert text.endswith("and 12 more machines")
 
 
-WISHES = st.builds(
+REQUESTS = st.builds(
     Resources,
     size=st.integers(1, 4),
     cpu=st.sampled_from([0.0, 0.1, 0.5, 2.0]),
@@ -121,35 +121,37 @@ ROOMS = st.lists(
 )
 
 
-@given(ROOMS, st.lists(WISHES, max_size=12))
-def test_no_machine_is_ever_promised_more_than_it_has(rooms: list[Room], wishes: list[Resources]) -> None:
+@given(ROOMS, st.lists(REQUESTS, max_size=12))
+def test_no_machine_is_ever_promised_more_than_it_has(rooms: list[Room], requests: list[Resources]) -> None:
     found = {made.process: made for made in rooms}
-    for wish in wishes:
-        chosen = choose(found.values(), wish)
+    for requested in requests:
+        chosen = choose(found.values(), requested)
         if chosen is None:
-            assert not any(each.fits(wish) for each in found.values())
-            assert len(refusals(found.values(), wish, most=99).split("; ")) == max(1, len(found))
+            assert not any(each.fits(requested) for each in found.values())
+            assert len(refusals(found.values(), requested, most=99).split("; ")) == max(1, len(found))
             continue
         assert not chosen.draining
-        assert set(wish.special_features) <= set(chosen.machine.labels)
-        found[chosen.process] = chosen.with_(wish)
+        assert set(requested.special_features) <= set(chosen.machine.labels)
+        found[chosen.process] = chosen.with_(requested)
         assert all(share <= 1 + 1e-6 for share in found[chosen.process].shares.values())
-        assert found[chosen.process].without(wish).load == pytest.approx(chosen.load)
+        assert found[chosen.process].without(requested).load == pytest.approx(chosen.load)
 
 
-@given(ROOMS, st.lists(WISHES, max_size=9))
+@given(ROOMS, st.lists(REQUESTS, max_size=9))
 def test_filling_a_machine_at_once_is_filling_it_one_by_one(
-    rooms: list[Room], wishes: list[Resources]
+    rooms: list[Room], requests: list[Resources]
 ) -> None:
     for each in rooms:
         filled = each
-        for wish in wishes:
-            filled = filled.with_(wish)
-        assert each.filled(wishes) == filled
+        for requested in requests:
+            filled = filled.with_(requested)
+        assert each.filled(requests) == filled
 
 
-@given(ROOMS, WISHES, st.randoms())
-def test_the_choice_does_not_depend_on_the_order(rooms: list[Room], wish: Resources, random: Any) -> None:
+@given(ROOMS, REQUESTS, st.randoms())
+def test_the_choice_does_not_depend_on_the_order(
+    rooms: list[Room], requested: Resources, random: Any
+) -> None:
     shuffled = list(rooms)
     random.shuffle(shuffled)
-    assert choose(rooms, wish) == choose(shuffled, wish)
+    assert choose(rooms, requested) == choose(shuffled, requested)

@@ -48,8 +48,8 @@ def texts(found: list[Advice]) -> list[tuple[str, str]]:
     return [(one.about, one.command) for one in found]
 
 
-def advise(history: History, room: Room | None = None, **wish: Any) -> list[Advice]:
-    return for_container("c", Resources(**wish), history, room)
+def advise(history: History, room: Room | None = None, **requested: Any) -> list[Advice]:
+    return for_container("c", Resources(**requested), history, room)
 
 
 def test_rates_are_those_of_the_last_two_reports(watched: Watched) -> None:
@@ -132,17 +132,17 @@ def test_advice_to_grow_says_when_the_machine_has_no_room(watched: Watched) -> N
 
 
 def test_what_is_hardly_used_is_too_large_but_not_at_once(watched: Watched) -> None:
-    wish: dict[str, Any] = {"cpu": 2.0, "memory": 1000 * MB}
-    assert advise(watched.run(200, cores=0.1, memory=50 * MB), **wish) == []
+    requested: dict[str, Any] = {"cpu": 2.0, "memory": 1000 * MB}
+    assert advise(watched.run(200, cores=0.1, memory=50 * MB), **requested) == []
     history = watched.run(200, cores=0.1, memory=50 * MB)
-    assert texts(advise(history, **wish)) == [
+    assert texts(advise(history, **requested)) == [
         ("too large", "rce resize c --cpu 0.2"),
         ("too large", "rce resize c --memory 112M"),
     ]
     history = watched.run(10, cores=1.5, memory=900 * MB)
-    assert advise(history, **wish) == [], "once is enough"
+    assert advise(history, **requested) == [], "once is enough"
     watched.run(4, memory=50 * MB)
-    assert advise(watched.run(400, memory=50 * MB), **wish) == []
+    assert advise(watched.run(400, memory=50 * MB), **requested) == []
 
 
 def test_a_container_of_many_slots_that_uses_few_gives_some_back(watched: Watched) -> None:
@@ -175,7 +175,7 @@ def test_a_machine_that_is_nearly_promised_away_is_too_full() -> None:
     st.builds(Resources, size=st.integers(1, 9), cpu=st.floats(0, 8), memory=st.integers(0, 1 << 33)),
 )
 def test_advice_is_about_one_direction_of_each_thing(
-    reports: list[tuple[float, float, int, int, int]], wish: Resources
+    reports: list[tuple[float, float, int, int, int]], requested: Resources
 ) -> None:
     watched = Watched()
     for cores, throttled, memory, limit, kills in reports:
@@ -186,9 +186,9 @@ def test_advice_is_about_one_direction_of_each_thing(
             memory=memory,
             memory_limit=limit,
             oom_kills=kills,
-            cpu_limit=wish.cpu,
+            cpu_limit=requested.cpu,
         )
-    found = for_container("c", wish, history, None)
+    found = for_container("c", requested, history, None)
     assert all(one.command.startswith("rce resize c --") and one.text for one in found)
     assert len({one.command.split()[3] for one in found if one.about == "too small"}) == sum(
         one.about == "too small" for one in found

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rce.protocol.container_checks import find_circle
 from rce.protocol.exceptions import MessageError
 from rce.protocol.messages import ConfigureComponents, ContainerData, CreateContainer, ResizeContainer
 from rce.protocol.reading import read_request
-from rce.protocol.wishes import find_circle
 
 
 def create(**data: Any) -> ContainerData:

@@ -39,7 +39,7 @@ class Fault(NamedTuple):
 
 
 def container_faults(data: ContainerData) -> Iterator[Fault]:
-    """Find what is wrong with the wishes of a container that is to be made."""
+    """Find what is wrong with the request for a container."""
     yield from _quantity_faults(data)
     yield from _network_faults(data)
     if data.image and (len(data.image) > _MAX_IMAGE or not _IMAGE.fullmatch(data.image)):

@@ -1,4 +1,4 @@
-"""Wishes that a restarted planner is told again, and nodes that are started again."""
+"""Requests that a restarted planner is told again, and nodes that are started again."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 from rce.config.client import loads
 from rce.config.documents import write_items
 from rce.protocol.messages import ConfigureComponents, RemoveNode
+from rce_fleet.station.desired import Desired, DesiredCell, DesiredGoal
 from rce_fleet.station.respawn import repairs
-from rce_fleet.station.wishes import CellWish, GoalWish, Wishes
 from rce_fleet.wiring import fleet_config
 
 CONFIG = loads(write_items(fleet_config()))
@@ -26,46 +26,46 @@ def state(
 
 
 def test_a_planner_that_knows_everything_is_told_nothing() -> None:
-    wishes = Wishes()
-    wishes.set_goal("a", 5)
-    wishes.set_cell(7, blocked=True)
-    wishes.set_cell(8, blocked=True)
-    assert wishes.unmet(state(("a", 5), blocked=(7,), pending=(8,))) == []
+    desired = Desired()
+    desired.set_goal("a", 5)
+    desired.set_cell(7, blocked=True)
+    desired.set_cell(8, blocked=True)
+    assert desired.unmet(state(("a", 5), blocked=(7,), pending=(8,))) == []
 
 
 def test_a_planner_that_forgot_is_told_cells_first() -> None:
-    wishes = Wishes()
-    wishes.set_goal("a", 5)
-    wishes.set_cell(7, blocked=True)
-    assert wishes.unmet(state(("a", -1), ("b", -1))) == [CellWish(7, True), GoalWish("a", 5)]
+    desired = Desired()
+    desired.set_goal("a", 5)
+    desired.set_cell(7, blocked=True)
+    assert desired.unmet(state(("a", -1), ("b", -1))) == [DesiredCell(7, True), DesiredGoal("a", 5)]
 
 
 def test_a_cell_that_was_freed_is_freed_again() -> None:
-    wishes = Wishes()
-    wishes.set_cell(7, blocked=True)
-    wishes.set_cell(7, blocked=False)
-    assert wishes.unmet(state(blocked=(7,))) == [CellWish(7, False)]
-    assert wishes.unmet(state()) == []
+    desired = Desired()
+    desired.set_cell(7, blocked=True)
+    desired.set_cell(7, blocked=False)
+    assert desired.unmet(state(blocked=(7,))) == [DesiredCell(7, False)]
+    assert desired.unmet(state()) == []
 
 
 def test_walls_are_left_alone() -> None:
-    wishes = Wishes()
-    wishes.set_cell(0, blocked=False)
-    assert wishes.unmet(state()) == []
+    desired = Desired()
+    desired.set_cell(0, blocked=False)
+    assert desired.unmet(state()) == []
 
 
 def test_goals_of_others_and_robots_that_are_not_there_are_left_alone() -> None:
-    wishes = Wishes()
-    wishes.set_goal("a", 5)
-    assert wishes.unmet(state(("a", 9))) == []
-    assert wishes.unmet(state()) == []
+    desired = Desired()
+    desired.set_goal("a", 5)
+    assert desired.unmet(state(("a", 9))) == []
+    assert desired.unmet(state()) == []
 
 
 def test_a_goal_that_was_taken_back_is_forgotten() -> None:
-    wishes = Wishes()
-    wishes.set_goal("a", 5)
-    wishes.set_goal("a", None)
-    assert wishes.unmet(state(("a", -1))) == []
+    desired = Desired()
+    desired.set_goal("a", 5)
+    desired.set_goal("a", None)
+    assert desired.unmet(state(("a", -1))) == []
 
 
 def engine(state: str, *nodes: tuple[str, str]) -> dict[str, Any]:

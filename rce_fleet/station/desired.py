@@ -7,7 +7,7 @@ from typing import Any
 
 
 @dataclass(frozen=True, slots=True)
-class GoalWish:
+class DesiredGoal:
     """A robot is to go to a cell."""
 
     robot: str
@@ -15,15 +15,15 @@ class GoalWish:
 
 
 @dataclass(frozen=True, slots=True)
-class CellWish:
+class DesiredCell:
     """A cell is to be blocked, or free."""
 
     cell: int
     blocked: bool
 
 
-class Wishes:
-    """The newest wish for each robot and each cell."""
+class Desired:
+    """The newest request for each robot and each cell."""
 
     def __init__(self) -> None:
         self._goals: dict[str, int] = {}
@@ -40,7 +40,7 @@ class Wishes:
         """The planner blocked or freed a cell."""
         self._cells[cell] = blocked
 
-    def unmet(self, state: dict[str, Any]) -> list[CellWish | GoalWish]:
+    def unmet(self, state: dict[str, Any]) -> list[DesiredCell | DesiredGoal]:
         """What a planner that says ``state`` (a fleet/FleetState in its JSON form) does not know.
 
         Cells come first, so that no path is planned through them. Robots that it does not know yet are left
@@ -48,12 +48,12 @@ class Wishes:
         """
         shut = {*state["blocked"], *state["pending"]}
         cells = [
-            CellWish(cell, blocked)
+            DesiredCell(cell, blocked)
             for cell, blocked in self._cells.items()
             if blocked != (cell in shut) and cell not in state["walls"]
         ]
         goals = [
-            GoalWish(robot["id"], self._goals[robot["id"]])
+            DesiredGoal(robot["id"], self._goals[robot["id"]])
             for robot in state["robots"]
             if robot["id"] in self._goals and robot["goal"] < 0
         ]
