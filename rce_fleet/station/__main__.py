@@ -29,13 +29,13 @@ from rce.tls.identity import Context, client_contexts
 from rce.web.origin import ServerNames
 from rce.web.server import HttpServer
 from rce_client.exceptions import RefusedError
-from rce_fleet.station.engine_entrance import EngineAccount, EngineEntrance
+from rce_fleet.station.authentication import Authenticator, TokenAuthenticator
+from rce_fleet.station.engine_authenticator import EngineAuthenticator, StationAccount
 from rce_fleet.station.engine_watch import EngineWatch
 from rce_fleet.station.engine_wire import EngineWire
 from rce_fleet.station.fleet_link import FleetLink, PlannerWire
 from rce_fleet.station.graph_watch import GraphWatch
 from rce_fleet.station.live import Broadcast
-from rce_fleet.station.persons import Entrance, SharedToken
 from rce_fleet.station.ros_wire import RosWire
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
@@ -46,29 +46,29 @@ PORT = 9080
 @from_file("ui", shared=tls_of)
 def ui(
     config: Annotated[
-        Path | None, typer.Argument(help="The operator's file: user, robotID, the planner's container.")
+        Path | None, typer.Argument(help="The operator's config: user, robotID, the planner's container.")
     ] = None,
     ros_master: Annotated[
         str,
-        typer.Option(help="In place of a file: the ROS master of a planner that runs without the engine."),
+        typer.Option(help="Instead of CONFIG: ROS master of a planner that runs without the engine."),
     ] = "",
-    port: Annotated[int, typer.Option(help="Port of the page and the API; 0 takes a free one.")] = PORT,
+    port: Annotated[int, typer.Option(help="Port of the page and the API; 0: any free port.")] = PORT,
     bind: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     public_name: Annotated[
         list[str] | None,
-        typer.Option(help="Further name by which the station may be asked for; may be repeated."),
+        typer.Option(help="Additional host name of the station; may be repeated."),
     ] = None,
     token: Annotated[
         str,
         typer.Option(
             envvar="RCE_STATION_TOKEN",
-            help="With --ros-master: callers must show it.",
+            help="With --ros-master: the token that requests must carry.",
         ),
     ] = "",
     login: Annotated[
         bool | None,
         typer.Option(
-            help="Ask people to log in as users of the engine"
+            help="Ask for a login as a user of the engine"
             " (default: unless station and engine are on loopback)",
             show_default=False,
         ),
@@ -80,7 +80,7 @@ def ui(
     tls_key: TlsKey = None,
     authority: Authority = None,
 ) -> None:
-    """Serve the page and the API that steer a fleet; CONFIG's planner is run in the cloud for that."""
+    """Serve the operator's page and API of a fleet; with CONFIG, the planner runs in the engine."""
     start_logging(logging.WARNING)
     if (config is None) == (not ros_master):
         raise typer.BadParameter("give either CONFIG or --ros-master")
@@ -99,10 +99,10 @@ def ui(
         raise typer.Exit(2) from None
     if identity is None and (text := plain_warning("the logins of the station travel", bind)):
         logging.getLogger(__name__).warning("%s", text)
-    entrance = _entrance(way, bind, token, login)
+    authenticator = _authenticator(way, bind, token, login)
     try:
         names = ServerNames(bind, public_name or ())
-        uvloop.run(serve(way, bind, port, entrance, names, identity.server if identity else None))
+        uvloop.run(serve(way, bind, port, authenticator, names, identity.server if identity else None))
     except* RefusedError as group:
         typer.echo(f"rce ui: {group.exceptions[0]}", err=True)
         raise typer.Exit(1) from None
@@ -111,28 +111,33 @@ def ui(
         raise typer.Exit(1) from None
 
 
-def _entrance(way: EngineWay | RosWay, bind: str, token: str, login: bool | None) -> Entrance:
-    """Choose how people come in.
+def _authenticator(way: EngineWay | RosWay, bind: str, token: str, login: bool | None) -> Authenticator:
+    """Choose how users are authenticated.
 
     Raises:
-        typer.BadParameter: What was chosen would let in anybody from elsewhere, or does not fit.
+        typer.BadParameter: The options would open the fleet to everybody, or contradict each other.
     """
     if isinstance(way, RosWay):
         if login:
-            raise typer.BadParameter("--login needs the users of an engine; give a --token with --ros-master")
+            raise typer.BadParameter(
+                "--login needs the user accounts of an engine; with --ros-master, give a --token"
+            )
         if not token and not _is_loopback(bind):
-            raise typer.BadParameter(f"--bind {bind} opens the station to others: give it a --token")
-        return SharedToken(token)
+            raise typer.BadParameter(f"with --bind {bind} other computers reach the station; give a --token")
+        return TokenAuthenticator(token)
     if token:
         raise typer.BadParameter(
-            "--token is for --ros-master; at a station of the engine callers show tokens of the engine's"
-            " users (rce token), and people log in at the page"
+            "--token is for --ros-master; with CONFIG, programs send tokens of the engine's users (rce token)"
+            " and people log in at the page"
         )
     account = way.account
     asks = login if login is not None else not (_is_loopback(bind) and _is_loopback(_host(account.url)))
     if not asks and not _is_loopback(bind):
-        raise typer.BadParameter(f"--no-login with --bind {bind} would let anybody steer the fleet")
-    return EngineEntrance(account, open=not asks)
+        raise typer.BadParameter(
+            f"--no-login with --bind {bind} would let every computer in the network control the fleet;"
+            " leave out one of the two"
+        )
+    return EngineAuthenticator(account, allow_anonymous=not asks)
 
 
 def _host(url: str) -> str:
@@ -201,7 +206,7 @@ class EngineWay:
             raise ConfigError(
                 "station", [Fault("token", "is for robots; a station needs its user's password")]
             )
-        self.account = EngineAccount(config.url, config.user, password, self._tls)
+        self.account = StationAccount(config.url, config.user, password, self._tls)
         self.wire = EngineWire(config, self._tls)
 
     async def watch(self, on_state: Callable[[dict[str, Any]], None]) -> None:
@@ -228,7 +233,12 @@ class RosWay:
 
 
 async def serve(
-    way: Way, bind: str, port: int, entrance: Entrance, names: ServerNames, tls: Context | None = None
+    way: Way,
+    bind: str,
+    port: int,
+    authenticator: Authenticator,
+    names: ServerNames,
+    tls: Context | None = None,
 ) -> None:
     """Serve until SIGINT or SIGTERM."""
     view, pages = FleetView(), Broadcast()
@@ -237,10 +247,10 @@ async def serve(
     stop = asyncio.Event()
     for number in end_signals():
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    station = Station(view, fleet, pages, entrance=entrance, names=names)
+    station = Station(view, fleet, pages, authenticator=authenticator, names=names)
     async with AsyncExitStack() as stack:
-        if isinstance(entrance, EngineEntrance):
-            await stack.enter_async_context(entrance)
+        if isinstance(authenticator, EngineAuthenticator):
+            await stack.enter_async_context(authenticator)
         server = await stack.enter_async_context(HttpServer(station.make_app(), bind, port, tls))
 
         async def announce() -> None:

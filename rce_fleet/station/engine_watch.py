@@ -13,7 +13,7 @@ from yarl import URL
 
 from rce.tls.faults import explain_to_client
 from rce.web.client import session_connector
-from rce_fleet.station.engine_entrance import Secure
+from rce_fleet.station.engine_authenticator import RequestOptions
 
 if TYPE_CHECKING:
     from rce.tls.identity import Context
@@ -52,8 +52,8 @@ class EngineWatch:
         self._last: dict[str, Any] = {}
 
     @property
-    def _how(self) -> Secure:
-        return Secure(ssl=True if self._tls is None else self._tls(), allow_redirects=False)
+    def _request_options(self) -> RequestOptions:
+        return RequestOptions(ssl=True if self._tls is None else self._tls(), allow_redirects=False)
 
     async def run(self) -> None:
         """Watch until cancelled; then give the token back."""
@@ -86,14 +86,14 @@ class EngineWatch:
             return
         headers = {"Authorization": f"Bearer {self._token}"}
         try:
-            async with session.delete(self._api / "login", headers=headers, **self._how):
+            async with session.delete(self._api / "login", headers=headers, **self._request_options):
                 self._token = ""
         except (aiohttp.ClientError, TimeoutError) as error:
             _log.info("the token of this station was not given back, it expires by itself: %s", error)
 
     async def _read(self, session: aiohttp.ClientSession) -> dict[str, Any]:
         if not self._token:
-            async with session.post(self._api / "login", json=self._login, **self._how) as reply:
+            async with session.post(self._api / "login", json=self._login, **self._request_options) as reply:
                 self._token = (await reply.json())["token"]
         containers, nodes, connections = [
             (await self._get(session, kind))[kind] for kind in ("containers", "nodes", "connections")
@@ -127,7 +127,7 @@ class EngineWatch:
             self._api / kind,
             headers=headers,
             params={"user": self._login["userID"]},
-            **self._how,
+            **self._request_options,
         ) as reply:
             found: dict[str, Any] = await reply.json()
             return found

@@ -21,7 +21,7 @@ from rce_fleet.station.fleet_link import (
     STATE_TOPIC,
     Ask,
     Listener,
-    PlannerAwayError,
+    PlannerUnavailableError,
     PlannerWire,
     pose_topic,
 )
@@ -116,8 +116,8 @@ def _asking(client: ServiceClient[dict[str, Any]]) -> Ask:
         try:
             return await client(request, timeout=CALL_TIMEOUT_S)
         except CallError as error:
-            raise PlannerAwayError(f"the planner did not answer: {error}") from error
+            raise PlannerUnavailableError(f"the planner did not answer: {error}") from error
         except ClientError as error:
-            raise PlannerAwayError(f"the engine cannot be reached: {error}") from error
+            raise PlannerUnavailableError(f"the engine cannot be reached: {error}") from error
 
     return ask

@@ -36,11 +36,11 @@ def pose_topic(robot: str) -> str:
     return f"/fleet/poses/{robot}"
 
 
-class FleetError(Exception):
+class PlannerError(Exception):
     """The fleet does not do what was asked."""
 
 
-class PlannerAwayError(FleetError):
+class PlannerUnavailableError(PlannerError):
     """The planner cannot be reached at this moment."""
 
 
@@ -89,7 +89,7 @@ class PlannerWire(ABC):
         """
         ask = self._asks.get(service)
         if ask is None:
-            raise PlannerAwayError(self._away)
+            raise PlannerUnavailableError(self._away)
         return await ask(request)
 
 
@@ -130,7 +130,7 @@ class FleetLink:
         """Send a robot to a cell, or let it stop (None); returns what the planner says.
 
         Raises:
-            FleetError: The planner refuses, or is away.
+            PlannerError: The planner refuses, or is away.
         """
         said = await self._ask(SET_GOAL, {"robot": robot, "cell": -1 if cell is None else cell})
         self._desired.set_goal(robot, cell)
@@ -140,7 +140,7 @@ class FleetLink:
         """Block or free a cell; returns what the planner says.
 
         Raises:
-            FleetError: The planner refuses, or is away.
+            PlannerError: The planner refuses, or is away.
         """
         said = await self._ask(BLOCK_CELL, {"cell": cell, "blocked": blocked})
         self._desired.set_cell(cell, blocked=blocked)
@@ -149,7 +149,7 @@ class FleetLink:
     async def _ask(self, service: PlannerService, request: dict[str, Any]) -> str:
         answer = await self._wire.call(service, request)
         if not answer["ok"]:
-            raise FleetError(answer["message"])
+            raise PlannerError(answer["message"])
         return str(answer["message"])
 
     async def _tell_again(self) -> None:
@@ -166,7 +166,7 @@ class FleetLink:
 
     async def _tell_unmet(self) -> None:
         for desired in self._desired.unmet(self._view.state) if self._view.state else ():
-            with contextlib.suppress(FleetError):
+            with contextlib.suppress(PlannerError):
                 match desired:
                     case DesiredCell(cell, blocked):
                         await self.block_cell(cell, blocked=blocked)

@@ -19,7 +19,7 @@ from rce_fleet.station.fleet_link import (
     STATE_TOPIC,
     Ask,
     Listener,
-    PlannerAwayError,
+    PlannerUnavailableError,
     PlannerWire,
     pose_topic,
 )
@@ -69,9 +69,9 @@ def _asking(client: ServiceClient) -> Ask:
         try:
             return plain(await client(request, timeout=CALL_TIMEOUT_S))
         except ServiceError as error:
-            raise PlannerAwayError(f"the planner did not answer: {error}") from error
+            raise PlannerUnavailableError(f"the planner did not answer: {error}") from error
         except RosError as error:
-            raise PlannerAwayError(f"the planner's ROS graph cannot be reached: {error}") from error
+            raise PlannerUnavailableError(f"the planner's ROS graph cannot be reached: {error}") from error
 
     return ask
 

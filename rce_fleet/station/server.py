@@ -13,6 +13,7 @@ from pydantic import BaseModel, ValidationError
 from rce.web.bodies import read_whole
 from rce.web.openapi import PREFIX, Operation, build_document
 from rce.web.origin import ServerNames
+from rce_fleet.station.access import COOKIE, USER, AccessControl, problem, set_cookie, token_of
 from rce_fleet.station.api import (
     MAX_CELL,
     Answer,
@@ -21,31 +22,30 @@ from rce_fleet.station.api import (
     GoalRequest,
     LoginRequest,
     MapModel,
-    PersonModel,
     Problem,
     RobotModel,
+    UserModel,
 )
-from rce_fleet.station.door import COOKIE, PERSON, Door, problem, set_cookie, shown_token
-from rce_fleet.station.fleet_link import FleetError, FleetLink, PlannerAwayError
+from rce_fleet.station.authentication import AuthenticationError, Authenticator, TokenAuthenticator
+from rce_fleet.station.fleet_link import FleetLink, PlannerError, PlannerUnavailableError
 from rce_fleet.station.live import Broadcast, Page
-from rce_fleet.station.persons import Entrance, EntranceError, SharedToken
 from rce_fleet.station.view import FleetView
 
 STATIC = Path(__file__).parent / "static"
 MAX_BODY = 1 << 16
 MAX_DIGITS = 20
-"""Of a cell's number; Python reads no more than 4300."""
+"""Digits of a cell's number; Python parses at most 4300."""
 SHOWN = 80
-"""Characters of a wrong name that an answer repeats."""
+"""Characters of an invalid name that an error repeats."""
 MIN_FRAME_S = 0.05
-"""Least time between two batches of messages to one page."""
+"""Minimum time between two batches of messages to one page."""
 HEARTBEAT_S = 20.0
 CHECK_S = 5.0
-"""How often it is looked whether the login of an open page is still good."""
+"""How often the login of an open page is checked."""
 
-_LOOKING = (401, 403, 421, 503)
-"""How a request may be refused that only looks."""
-_STEERING = (*_LOOKING, 400, 404, 408, 409, 413)
+_VIEW_ERRORS = (401, 403, 421, 503)
+"""Error statuses of requests that read."""
+_CONTROL_ERRORS = (*_VIEW_ERRORS, 400, 404, 408, 409, 413)
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -54,11 +54,11 @@ class Station:
     """Handlers of all routes.
 
     Args:
-        view: What is known of the fleet.
-        fleet: Carries requests to the planner.
+        view: The state of the fleet.
+        fleet: Sends goals and blocked cells to the planner.
         pages: The open pages.
-        entrance: Says who somebody is; anybody may do everything if None.
-        names: By which the station may be asked for.
+        authenticator: Finds the user of a token; if None, every request may do everything.
+        names: Host names under which the station may be requested.
     """
 
     def __init__(
@@ -67,24 +67,24 @@ class Station:
         fleet: FleetLink,
         pages: Broadcast,
         *,
-        entrance: Entrance | None = None,
+        authenticator: Authenticator | None = None,
         names: ServerNames | None = None,
     ) -> None:
         self._view = view
         self._fleet = fleet
         self._pages = pages
-        self._entrance = entrance or SharedToken()
-        self._door = Door(self._entrance, names or ServerNames())
+        self._authenticator = authenticator or TokenAuthenticator()
+        self._access = AccessControl(self._authenticator, names or ServerNames())
 
     def make_app(self) -> web.Application:
         """Build the application."""
-        app = web.Application(middlewares=[_problems, self._door.guard], client_max_size=MAX_BODY)
+        app = web.Application(middlewares=[_problems, self._access.check], client_max_size=MAX_BODY)
         for known, handler in self._operations():
             app.router.add_route(known.method, PREFIX + known.path, handler)
         document = build_document(
             [known for known, _ in self._operations()],
             title="RCE operator station",
-            description="Steers a fleet of robots: goals and blocked cells. For an ERP and for the page.",
+            description="Control a fleet of robots: set goals, block cells. Used by the page and by an ERP.",
             error=Problem,
         )
 
@@ -109,7 +109,7 @@ class Station:
                     summary="The whole fleet",
                     group="fleet",
                     reply=FleetModel,
-                    errors=_LOOKING,
+                    errors=_VIEW_ERRORS,
                 ),
                 self.get_fleet,
             ),
@@ -132,7 +132,7 @@ class Station:
                     name="log_out",
                     method="DELETE",
                     path="/login",
-                    summary="Make the token of this request worthless",
+                    summary="Revoke the token of this request",
                     group="login",
                     status=204,
                     errors=(403, 421),
@@ -144,12 +144,12 @@ class Station:
                     name="get_person",
                     method="GET",
                     path="/me",
-                    summary="Who you are, and what you may do",
+                    summary="The user of this request and their permissions",
                     group="fleet",
-                    reply=PersonModel,
-                    errors=_LOOKING,
+                    reply=UserModel,
+                    errors=_VIEW_ERRORS,
                 ),
-                self.get_person,
+                self.get_user,
             ),
             (
                 Operation(
@@ -159,7 +159,7 @@ class Station:
                     summary="One robot",
                     group="fleet",
                     reply=RobotModel,
-                    errors=(*_LOOKING, 404),
+                    errors=(*_VIEW_ERRORS, 404),
                 ),
                 self.get_robot,
             ),
@@ -172,7 +172,7 @@ class Station:
                     group="fleet",
                     body=GoalRequest,
                     reply=Answer,
-                    errors=_STEERING,
+                    errors=_CONTROL_ERRORS,
                 ),
                 self.put_goal,
             ),
@@ -185,7 +185,7 @@ class Station:
                     group="fleet",
                     body=CellRequest,
                     reply=Answer,
-                    errors=_STEERING,
+                    errors=_CONTROL_ERRORS,
                 ),
                 self.put_cell,
             ),
@@ -194,44 +194,44 @@ class Station:
     # Handlers
 
     async def page(self, request: web.Request) -> web.StreamResponse:
-        """The page itself."""
+        """Return the page."""
         del request
         return web.FileResponse(STATIC / "index.html", headers={hdrs.CACHE_CONTROL: "no-cache"})
 
     async def login_page(self, request: web.Request) -> web.StreamResponse:
-        """The page where people log in."""
+        """Return the login page."""
         del request
         return web.FileResponse(STATIC / "login.html", headers={hdrs.CACHE_CONTROL: "no-cache"})
 
     async def log_in(self, request: web.Request) -> web.StreamResponse:
         """Check a password at the engine; the token goes into a cookie, never to the page."""
-        who = LoginRequest.model_validate_json(await read_whole(request))
-        token = await self._entrance.log_in(who.userID, who.password, request.remote or "")
+        login = LoginRequest.model_validate_json(await read_whole(request))
+        token = await self._authenticator.log_in(login.userID, login.password, request.remote or "")
         response = web.Response(status=204)
         set_cookie(response, token, secure=request.secure)
         return response
 
     async def log_out(self, request: web.Request) -> web.StreamResponse:
-        """Make the token worthless that the request shows."""
-        await self._entrance.log_out(shown_token(request))
+        """Revoke the request's token and delete the cookie."""
+        await self._authenticator.log_out(token_of(request))
         response = web.Response(status=204)
         response.del_cookie(COOKIE)
         return response
 
-    async def get_person(self, request: web.Request) -> web.StreamResponse:
-        """Who asks."""
-        person = request[PERSON]
+    async def get_user(self, request: web.Request) -> web.StreamResponse:
+        """Return the user of the request."""
+        user = request[USER]
         return _reply(
-            PersonModel(
-                name=person.name,
-                role=person.role,
-                steers=person.steers,
-                logged_in=self._entrance.has_logins,
+            UserModel(
+                name=user.name,
+                role=user.role,
+                steers=user.may_control,
+                logged_in=self._authenticator.has_logins,
             )
         )
 
     async def get_fleet(self, request: web.Request) -> web.StreamResponse:
-        """Everything that is known of the fleet."""
+        """Return the state of the fleet."""
         del request
         grid = self._view.map()
         return _reply(
@@ -244,23 +244,23 @@ class Station:
         )
 
     async def get_robot(self, request: web.Request) -> web.StreamResponse:
-        """One robot."""
+        """Return one robot."""
         wanted = request.match_info["robot"]
         for robot in self._view.robots():
             if robot["id"] == wanted:
                 return _reply(RobotModel(**robot))
         known = ", ".join(self._view.robot_ids()) or "none yet"
-        return problem(404, f"there is no robot {wanted!r}; known are: {known}")
+        return problem(404, f"robot {wanted!r} is unknown; known robots: {known}")
 
     async def put_goal(self, request: web.Request) -> web.StreamResponse:
         """Send a robot to a cell."""
         robot = request.match_info["robot"]
-        refusal = self._door.may_steer(request, "set_goal", robot)
+        refusal = self._access.control_refusal(request, "set_goal", robot)
         if refusal is not None:
             return refusal
         asked = GoalRequest.model_validate_json(await read_whole(request))
         message = await self._fleet.set_goal(robot, asked.cell)
-        self._door.note(request, "set_goal", robot, "stop" if asked.cell is None else f"cell {asked.cell}")
+        self._access.audit(request, "set_goal", robot, "stop" if asked.cell is None else f"cell {asked.cell}")
         return _reply(Answer(message=message))
 
     async def put_cell(self, request: web.Request) -> web.StreamResponse:
@@ -268,21 +268,21 @@ class Station:
         number = request.match_info["cell"]
         if not number.isdecimal() or len(number) > MAX_DIGITS or int(number) > MAX_CELL:
             return problem(404, f"{number[:SHOWN]!r} is not the number of a cell")
-        refusal = self._door.may_steer(request, "block_cell", number)
+        refusal = self._access.control_refusal(request, "block_cell", number)
         if refusal is not None:
             return refusal
         asked = CellRequest.model_validate_json(await read_whole(request))
         message = await self._fleet.block_cell(int(number), blocked=asked.blocked)
-        self._door.note(request, "block_cell" if asked.blocked else "free_cell", number)
+        self._access.audit(request, "block_cell" if asked.blocked else "free_cell", number)
         return _reply(Answer(message=message))
 
     async def live(self, request: web.Request) -> web.StreamResponse:
-        """Send a page what changes, until it goes."""
+        """Send changes to a page until it disconnects."""
         socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, compress=False)
         await socket.prepare(request)
         page = self._pages.open()
         writer = asyncio.create_task(_write(socket, page))
-        watcher = asyncio.create_task(self._close_when_out(socket, request))
+        watcher = asyncio.create_task(self._close_when_logged_out(socket, request))
         try:
             async for message in socket:
                 if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
@@ -294,13 +294,13 @@ class Station:
             await asyncio.gather(writer, watcher, return_exceptions=True)
         return socket
 
-    async def _close_when_out(self, socket: web.WebSocketResponse, request: web.Request) -> None:
-        """End a page's socket when its person may not look any more."""
+    async def _close_when_logged_out(self, socket: web.WebSocketResponse, request: web.Request) -> None:
+        """Close a page's socket when its user may not see the fleet any more."""
         while True:
             await asyncio.sleep(CHECK_S)
-            if not await self._door.is_still_in(request):
+            if not await self._access.is_still_allowed(request):
                 break
-        await socket.close(code=WSCloseCode.POLICY_VIOLATION, message=b"your login ended; log in again")
+        await socket.close(code=WSCloseCode.POLICY_VIOLATION, message=b"your login has ended; log in again")
 
 
 async def _write(socket: web.WebSocketResponse, page: Page) -> None:
@@ -313,18 +313,18 @@ async def _write(socket: web.WebSocketResponse, page: Page) -> None:
 
 @web.middleware
 async def _problems(request: web.Request, handler: Handler) -> web.StreamResponse:
-    """Turn what goes wrong into an answer that says so."""
+    """Turn exceptions into error responses."""
     try:
         return await handler(request)
     except ValidationError as error:
         faults = [f"{'.'.join(map(str, fault['loc'])) or 'body'}: {fault['msg']}" for fault in error.errors()]
         return problem(400, "; ".join(faults))
-    except EntranceError as error:
+    except AuthenticationError as error:
         headers = {"Retry-After": str(error.retry_after)} if error.retry_after else None
         return problem(error.status, str(error), headers)
-    except PlannerAwayError as error:
+    except PlannerUnavailableError as error:
         return problem(503, str(error))
-    except FleetError as error:
+    except PlannerError as error:
         return problem(409, str(error))
     except web.HTTPException as error:
         kept = {"Allow": error.headers["Allow"]} if "Allow" in error.headers else None

@@ -15,7 +15,7 @@ from support.engine import until
 from support.master_program import master
 
 from rce_fleet.station import server as station_server
-from rce_fleet.station.engine_entrance import FRESH_S, EngineAccount, EngineEntrance
+from rce_fleet.station.engine_authenticator import CACHE_S, EngineAuthenticator, StationAccount
 from rce_fleet.station.live import Broadcast
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
@@ -82,14 +82,16 @@ async def running_site(folder: Path, *, open_: bool = False) -> AsyncIterator[Si
     async with (
         master(folder, "--dev") as url,
         aiohttp.ClientSession(cookie_jar=aiohttp.DummyCookieJar()) as session,
-        EngineEntrance(EngineAccount(url, "testUser", "testUser"), open=open_) as entrance,
+        EngineAuthenticator(
+            StationAccount(url, "testUser", "testUser"), allow_anonymous=open_
+        ) as authenticator,
     ):
         site = Site(url, session)
         await site.log_in("testUser", "testUser")
         for role in ROLES:
             await site.master("POST", "/users", {"name": role, "password": "pw", "role": role}, status=201)
             await site.log_in(role, "pw")
-        app = Station(FleetView(), site.fleet, Broadcast(), entrance=entrance).make_app()  # type: ignore[arg-type]  # as wide as what is called
+        app = Station(FleetView(), site.fleet, Broadcast(), authenticator=authenticator).make_app()  # type: ignore[arg-type]  # as wide as what is called
         async with TestServer(app) as server:
             site.station = str(server.make_url("/"))
             yield site
@@ -135,9 +137,9 @@ async def test_revoked_token_ends_open_page(tmp_path: Path, monkeypatch: pytest.
         async with site.session.ws_connect(f"{site.station}api/v1/live", headers=headers) as socket:
             (token,) = (await site.master("GET", "/tokens?user=operator"))["tokens"]
             await site.master("DELETE", f"/tokens/{token['id']}?user=operator", status=204)
-            while (message := await socket.receive(timeout=FRESH_S + 60)).type != aiohttp.WSMsgType.CLOSE:
+            while (message := await socket.receive(timeout=CACHE_S + 60)).type != aiohttp.WSMsgType.CLOSE:
                 assert message.type is aiohttp.WSMsgType.TEXT
-        assert (message.data, message.extra) == (1008, "your login ended; log in again")
+        assert (message.data, message.extra) == (1008, "your login has ended; log in again")
         assert await site.steer(site.tokens["operator"]) == 401
 
 

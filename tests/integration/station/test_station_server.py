@@ -8,9 +8,9 @@ from collections.abc import AsyncIterator
 import pytest
 from aiohttp.test_utils import TestClient, TestServer
 
-from rce_fleet.station.fleet_link import FleetError, FleetLink, PlannerAwayError
+from rce_fleet.station.authentication import TokenAuthenticator
+from rce_fleet.station.fleet_link import FleetLink, PlannerError, PlannerUnavailableError
 from rce_fleet.station.live import Broadcast
-from rce_fleet.station.persons import SharedToken
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
 
@@ -20,7 +20,7 @@ class RecordingFleet(FleetLink):
 
     def __init__(self) -> None:
         self.desired: list[tuple[object, ...]] = []
-        self.fault: FleetError | None = None
+        self.fault: PlannerError | None = None
 
     async def set_goal(self, robot: str, cell: int | None) -> str:
         return self._note("goal", robot, cell)
@@ -43,7 +43,7 @@ class House:
         self.client: TestClient
 
     async def start(self, token: str = "") -> None:
-        app = Station(self.view, self.fleet, self.pages, entrance=SharedToken(token)).make_app()
+        app = Station(self.view, self.fleet, self.pages, authenticator=TokenAuthenticator(token)).make_app()
         self.client = TestClient(TestServer(app))
         await self.client.start_server()
 
@@ -119,9 +119,9 @@ async def test_bad_input_names_the_place(house: House, path: str, body: str, wor
 
 
 @pytest.mark.parametrize(
-    ("fault", "status"), [(FleetError("cell 7 is a wall"), 409), (PlannerAwayError("away"), 503)]
+    ("fault", "status"), [(PlannerError("cell 7 is a wall"), 409), (PlannerUnavailableError("away"), 503)]
 )
-async def test_says_what_the_planner_says(house: House, fault: FleetError, status: int) -> None:
+async def test_says_what_the_planner_says(house: House, fault: PlannerError, status: int) -> None:
     await house.start()
     house.fleet.fault = fault
     reply = await house.client.put("/api/v1/cells/7", json={"blocked": True})
