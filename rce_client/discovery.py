@@ -15,8 +15,8 @@ from urllib.parse import urlencode, urlsplit
 import h11
 
 from rce.dialing import open_socket
-from rce_client.backoff import judge, judge_status
 from rce_client.exceptions import RefusedError, UnavailableError, UntrustedError
+from rce_client.failures import judge, judge_status
 
 if TYPE_CHECKING:
     import ssl

@@ -13,13 +13,14 @@ from urllib.parse import urlencode, urlsplit, urlunsplit
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
 
+from rce.aio.backoff import Backoff
 from rce.dialing import open_url_socket
 from rce.protocol.http import FEATURES, FEATURES_HEADER, FEATURES_KEY, SINGLE_FRAME
 from rce.protocol.limits import Limits
 from rce.protocol.stream import ProtocolStream
-from rce_client.backoff import Backoff, judge
 from rce_client.discovery import VERSION, locate
 from rce_client.exceptions import InUseError, LostError, RefusedError, UntrustedError
+from rce_client.failures import judge
 from rce_client.sendqueue import QueuedMessage, QueueLimits, SendQueue
 from rce_client.socket import EngineSocket
 
@@ -100,7 +101,8 @@ class Timing:
     max_message: int = 64 << 20
     write_buffer: tuple[int, int] = (128 << 10, 32 << 10)
     """What waits stays in the queue, where it can be overtaken, while so much waits in the socket."""
-    backoff: Backoff = field(default_factory=Backoff)
+    backoff: Backoff = Backoff(first=0.2, longest=15.0, jitter=1.0)
+    """Pauses between attempts to connect."""
 
 
 class Listener(Protocol):
@@ -154,7 +156,7 @@ class EngineTransport:
         Raises:
             RefusedError: The engine does not want this client.
         """
-        delays = self._timing.backoff.delays()
+        pauses = self._timing.backoff.start()
         while True:
             self._listener.on_connecting()
             try:
@@ -165,12 +167,12 @@ class EngineTransport:
                 repairable = self._was_connected and isinstance(error, UntrustedError)
                 if isinstance(error, RefusedError) and not repairable:
                     raise error from raised
-                delay = next(delays)
+                delay = pauses.next()
                 await asyncio.sleep(min(delay, IN_USE_DELAY) if isinstance(error, InUseError) else delay)
                 continue
-            delays = self._timing.backoff.delays()
+            pauses.reset()
             self._listener.on_lost(await self._use(socket))
-            await asyncio.sleep(next(delays))
+            await asyncio.sleep(pauses.next())
 
     def post_data(self, tag: str, frames: Sequence[Frame], key: str | None = None) -> bool:
         """Send a topic's message when its turn comes; False if there is no connection."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
+from rce.aio.backoff import Backoff
 from rce.control.messages import Fault, Gone, Status
 from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress, Resources
 from rce_container.events import (
@@ -35,8 +36,8 @@ from rce_container.events import (
 )
 from rce_container.life import ALIVE, LifeEvent, Phase, after
 
-BACKOFF_S = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
-"""Pauses before a container that ended is made again: the first, second, ... time."""
+BACKOFF = Backoff(first=0.5, longest=30.0)
+"""Pauses before a container that ended is made again. The first time in a row it is made again at once."""
 STABLE_S = 30.0
 """A container that ran for so long starts at the first pause again."""
 
@@ -304,7 +305,7 @@ class ManagerCore:
         self._out.append(Start(container.id))
 
     def _pause(self, container: Container) -> None:
-        delay = BACKOFF_S[min(container.failures, len(BACKOFF_S)) - 1]
+        delay = BACKOFF.pause_after(container.failures - 1)
         container.ticket += 1
         self._out.append(Wait(container.id, container.ticket, delay))
         self._tell(container)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
-import random
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -100,7 +99,7 @@ class TaskSetChannel:
         self._outbox: asyncio.Queue[str] | None = None  # there is one while there is a connection
         self._inbox: asyncio.Queue[ToTaskSet] = asyncio.Queue(MAX_QUEUED)
         self._socket: ClientConnection | None = None
-        self._failures = 0
+        self._pauses = timeouts.backoff.start()
         self._told = ""
         """Why there was no connection, as the log has it."""
         self._handler_failed = False
@@ -225,7 +224,7 @@ class TaskSetChannel:
             if status in (HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN):
                 if self._secret.was_refused(shown):
                     _log.info("the master at %s refuses one of our secrets; showing the other", self._url)
-                    return self._next_delay()
+                    return self._pauses.next()
                 _log.error("the master at %s refuses our secret (HTTP %d)", self._url, status)
                 return self._timeouts.backoff_refused
             body = bytes(error.response.body or b"")[:_MOST_SAID].decode(errors="replace").strip()
@@ -238,7 +237,7 @@ class TaskSetChannel:
         if self._handler_failed:  # it may fail again, so not at once
             self._handler_failed = False
             return self._timeouts.backoff_refused
-        return self._next_delay()
+        return self._pauses.next()
 
     def _tell(self, error: Exception) -> None:
         """Log why there is no connection: plainly at first, and whenever the reason is another one."""
@@ -249,12 +248,6 @@ class TaskSetChannel:
             level = logging.DEBUG
         self._told = words
         _log.log(level, "no connection to the master at %s: %s", self._url, words)
-
-    def _next_delay(self) -> float:
-        """Draw a wait below a bound that doubles (full jitter), so that task sets do not all dial at once."""
-        bound = min(self._timeouts.backoff_max, self._timeouts.backoff_min * 2 ** min(self._failures, 16))
-        self._failures += 1
-        return random.uniform(0.0, bound)  # noqa: S311 - spreads load, keeps no secret
 
     async def _talk(self, socket: ClientConnection) -> None:
         self._socket = socket
@@ -302,7 +295,7 @@ class TaskSetChannel:
                 _log.info("the master sent a %s, which this release does not know", name)
             case Welcome():
                 _log.info("connected to master %s at %s", message.master, self._url)
-                self._failures = 0
+                self._pauses.reset()
                 self._told = ""
                 self._welcomed.set()
                 await self._inbox.put(message)

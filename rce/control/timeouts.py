@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from rce.aio.backoff import Backoff
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlTimeouts:
@@ -19,9 +21,8 @@ class ControlTimeouts:
     """An answer of the master; long enough for a master that is being restarted."""
     log: float = 5.0
     """A piece of a node's log."""
-    backoff_min: float = 0.05
-    backoff_max: float = 2.0
-    """The longest wait before the next dial; waits are spread at random between zero and a growing bound."""
+    backoff: Backoff = Backoff(first=0.05, longest=2.0, jitter=1.0)
+    """Waits before the next dial."""
     backoff_refused: float = 5.0
     """The wait after the master refused this task set or its secret, which will hardly help itself."""
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from rce.aio.backoff import Backoff
+
 KIB = 1024
 MIB = 1024 * KIB
 
@@ -18,10 +20,8 @@ class LinkTimeouts:
     """From an accepted connection to its HELLO, and from HELLO to the answer; more than ``unknown_link``."""
     unknown_link: float = 5.0
     """An accepted link that no endpoint knows yet: its spec may be on its way."""
-    redial_first: float = 0.02
-    """First pause before dialing again; it doubles every time."""
-    redial_last: float = 1.0
-    """Longest pause before dialing again."""
+    redial: Backoff = Backoff(first=0.02, longest=1.0, jitter=0.5)
+    """Pauses before dialing again."""
     heartbeat: float = 2.0
     """A TCP link that was silent for so long is asked whether it lives."""
     silence: float = 8.0

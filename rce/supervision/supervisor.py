@@ -6,13 +6,14 @@ import asyncio
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from typing import Any
 
+from rce.aio.backoff import Backoff
 from rce.supervision.final import FinalCommand
 from rce.supervision.prefork import ForkedProcess, Prepared
 from rce.supervision.process import Child, relay
 from rce.supervision.program import Program
 
-RESTART_DELAY_S = 0.2
-RESTART_DELAY_MAX_S = 5.0
+RESTARTS = Backoff(first=0.2, longest=5.0)
+"""Pauses before a program that ended is started again."""
 STABLE_AFTER_S = 10.0
 READY_TIMEOUT_S = 60.0
 OUTPUT_TIMEOUT_S = 1.0
@@ -98,17 +99,17 @@ class Supervisor:
 
     async def _keep(self, program: Program, ready: asyncio.Event) -> None:
         loop = asyncio.get_running_loop()
-        delay = RESTART_DELAY_S
+        pauses = RESTARTS.start()
         while True:
             started = loop.time()
             code = await self._run_once(program, ready)
             if not ready.is_set():
                 raise StartError(f"{program.name} ended with exit code {code} before it was ready")
             if loop.time() - started > STABLE_AFTER_S:
-                delay = RESTART_DELAY_S
+                pauses.reset()
+            delay = pauses.next()
             self._show(f"[up] {program.name} ended with exit code {code}; starting it again in {delay:.1f} s")
             await asyncio.sleep(delay)
-            delay = min(2 * delay, RESTART_DELAY_MAX_S)
 
     async def _run_once(self, program: Program, ready: asyncio.Event) -> int:
         child = await self._start(program)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
+from rce.aio.backoff import Backoff
 from rce.bundles.requirements import FILE_NAME as REQUIREMENTS_FILE
 from rce.control.model import BundleSpec
 from rce.link.tasks import TaskScope
@@ -19,8 +20,8 @@ from rce_container.bundles.shelf import Shelf
 
 log = logging.getLogger(__name__)
 
-PAUSES_S = (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
-"""Before it is tried again, the first, second, ... time."""
+RETRY = Backoff(first=0.5, longest=30.0)
+"""Pauses before it is tried again."""
 
 _NOT_INSTALLED = (
     "it has a requirements.txt, which this machine does not install (its operator may allow it:"
@@ -35,7 +36,7 @@ class Library:
     cache: BundleCache
     installer: Installer | None = None
     """Installs what packages ask for in their ``requirements.txt``; None: that is not allowed here."""
-    pauses: tuple[float, ...] = field(default=PAUSES_S)
+    retry: Backoff = RETRY
 
     def open(self) -> None:
         """Look at what is there. Blocks.
@@ -101,21 +102,18 @@ class Supply:
     async def _get(self, bundle: BundleSpec) -> None:
         """Get one package, however often it takes."""
         told = ""
-        attempt = 0
+        pauses = self._library.retry.start()
         while True:
             try:
                 await self._bring(bundle)
             except BundleTrouble as trouble:
-                pauses = self._library.pauses
-                pause = pauses[min(attempt, len(pauses) - 1)]
-                attempt += 1
                 what = f"package {bundle.name} {bundle.version}"
                 text = f"{what} is not there yet: {trouble}; it is tried again"
                 if text != told:
                     log.warning("%s: %s", self._holder, text)
                     self._tell(text)
                 told = text
-                await asyncio.sleep(pause * trouble.patience)
+                await asyncio.sleep(pauses.next() * trouble.patience)
             else:
                 self._on_arrival()
                 return

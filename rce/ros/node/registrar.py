@@ -10,10 +10,11 @@ from __future__ import annotations
 import asyncio
 import logging
 import random
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from rce.aio.backoff import Backoff
 from rce.ros.errors import MasterError, MasterRefused, MasterUnreachable, RpcUnreachable
 from rce.ros.node.master import MasterClient
 from rce.ros.node.parameters import Parameters
@@ -25,9 +26,8 @@ _log = logging.getLogger(__name__)
 CHECK_INTERVAL = 30.0
 """Seconds after which the master is asked whether it knows the node, although no connection was lost."""
 
-RETRY_FIRST = 0.1
-RETRY_MOST = 3.0
-"""Seconds between attempts to reach a master that is away: the first wait and the longest."""
+RETRY = Backoff(first=0.1, longest=3.0, jitter=0.5)
+"""Pauses between attempts to reach a master that is away."""
 
 RUN_ID = "/run_id"
 
@@ -89,7 +89,8 @@ class Registrar:
         return True
 
     async def _until_reached(self, attempt: Callable[[], Awaitable[None]]) -> None:
-        for wait in _waits():
+        pauses = RETRY.start()
+        while True:
             try:
                 await attempt()
             except MasterUnreachable as error:
@@ -98,7 +99,7 @@ class Registrar:
                 _log.warning("%s does not take %s back: %s", self.master.uri, self.master.caller, error)
             else:
                 return
-            await asyncio.sleep(wait)
+            await asyncio.sleep(pauses.next())
 
     async def _check(self, *, was_lost: bool) -> None:
         master = self.master
@@ -123,11 +124,3 @@ class Registrar:
             return await self.master.call("getParam", RUN_ID)
         except MasterRefused:
             return None  # a bare rosmaster has none
-
-
-def _waits() -> Iterator[float]:
-    """Yield growing waits, jittered so that not all nodes come back at once."""
-    wait = RETRY_FIRST
-    while True:
-        yield wait * random.uniform(0.5, 1.0)  # noqa: S311 - no secret
-        wait = min(RETRY_MOST, 2 * wait)

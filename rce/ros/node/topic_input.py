@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import random
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
+from rce.aio.backoff import Backoff
 from rce.ros.dialing import open_peer_socket
 from rce.ros.errors import HandshakeRefused, RosError, TcprosError, TypeMismatch
 from rce.ros.node.local import LocalLink, LocalMessage, find_neighbour
@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 CONNECT_TIMEOUT = 10.0
-RETRY_FIRST = 0.05
-RETRY_MOST = 5.0
+RETRY = Backoff(first=0.05, longest=5.0, jitter=0.5)
 """Seconds between attempts to reach a publisher: the first wait and the longest."""
 
 
@@ -125,7 +124,7 @@ class TopicInput:
 
     async def _follow(self, uri: str) -> None:
         """Receive from one publisher for as long as the master names it, reconnecting when needed."""
-        waits = _waits()
+        pauses = RETRY.start()
         while True:
             link = InputLink(self, uri)
             neighbour = find_neighbour(uri) if self._runtime.intra_process else None
@@ -140,8 +139,8 @@ class TopicInput:
                 del self._following[uri]
                 return
             if link.messages:
-                waits = _waits()
-            await asyncio.sleep(next(waits))
+                pauses.reset()
+            await asyncio.sleep(pauses.next())
 
     async def _receive_locally(self, uri: str, neighbour: Topics) -> None:
         output = neighbour.outputs.get(self.topic)
@@ -269,11 +268,3 @@ class InputLink:
             self.ended.set_result(None)
         else:
             self.ended.set_exception(error)
-
-
-def _waits() -> Iterator[float]:
-    """Yield growing waits, jittered so that many subscribers do not come back at once."""
-    wait = RETRY_FIRST
-    while True:
-        yield wait * random.uniform(0.5, 1.0)  # noqa: S311 - no secret
-        wait = min(RETRY_MOST, 2 * wait)

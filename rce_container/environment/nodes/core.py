@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterator, Mapping
 from itertools import count
 
+from rce.aio.backoff import Backoff
 from rce.control.model import NodeSpec, NodeState, NodeStatus
 from rce_container.environment.nodes.events import (
     Beat,
@@ -32,8 +33,8 @@ from rce_container.environment.nodes.life import LifeEvent, after
 from rce_container.environment.nodes.order import StartOrder, levels, ready_to_end
 from rce_container.environment.nodes.record import LAST_CHANCE_S, Node
 
-BACKOFF_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
-"""Pauses before a node that ended is started again: the first, second, ... time in a row."""
+BACKOFF = Backoff(first=0.5, longest=30.0)
+"""Pauses before a node that ended is started again."""
 FIRST_BEAT_WITHIN_S = 30.0
 """How long after its start a node may take for its first heartbeat."""
 REGISTERS_WITHIN_S = 10.0
@@ -248,8 +249,8 @@ class NodesCore:
                 "to start it anew, remove it and add it again, or change it",
             )
             return
-        delay = BACKOFF_S[min(node.in_a_row, len(BACKOFF_S) - 1)]
         node.in_a_row += 1
+        delay = BACKOFF.pause_after(node.in_a_row)
         node.pausing, node.failing, node.due = True, failed, self._now + delay
         self._become(node, LifeEvent.PAUSE, detail=f"{reason}; starts again after {delay:g} s")
         self._note(node, f"starts again after {delay:g} s")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from support.cloud import PASSWORD, Cloud, running_cloud
 
-from rce_client.backoff import Backoff
+from rce.aio.backoff import Backoff
 from rce_client.connection import Connection
 from rce_client.engine_transport import Timing
 from rce_robot.websocket import RobotSocket
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from rce.control.messages import ClientRequest
 
-TIMING = Timing(backoff=Backoff(first=0.01, cap=0.05), ping_interval=None, close=1.0)
+TIMING = Timing(backoff=Backoff(first=0.01, longest=0.05, jitter=1.0), ping_interval=None, close=1.0)
 
 
 class Door:

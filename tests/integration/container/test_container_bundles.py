@@ -13,6 +13,7 @@ import pytest
 from support.bundles import pack, sign, write_package
 from support.containers import Machine, until
 
+from rce.aio.backoff import Backoff
 from rce.control.model import BundleSpec, InterfaceSpec, NodeSpec, NodeState, ParameterSpec
 from rce_container.bundles.requirements import Installer, InstallerSettings
 
@@ -45,7 +46,7 @@ time.sleep(600)
 @pytest.fixture
 def shop(machine: Machine) -> Machine:
     """A machine that is quick to try again."""
-    machine.library = dataclasses.replace(machine.library, pauses=(0.05,))
+    machine.library = dataclasses.replace(machine.library, retry=Backoff(first=0.05, longest=0.05))
     return machine
 
 

@@ -13,6 +13,7 @@ from websockets.asyncio.client import connect
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from rce.aio.backoff import Backoff
 from rce.config.secret import Secret
 from rce.control.channel import TaskSetChannel
 from rce.control.exceptions import (
@@ -51,7 +52,9 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
 SECRET = Secret("the engine's secret")
-QUICK = ControlTimeouts(open=2, close=0.2, request=5, log=0.2, backoff_max=0.05, backoff_refused=0.02)
+QUICK = ControlTimeouts(
+    open=2, close=0.2, request=5, log=0.2, backoff=Backoff(0.05, 0.05, jitter=1.0), backoff_refused=0.02
+)
 
 
 class Master:

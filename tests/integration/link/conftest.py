@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rce.aio.backoff import Backoff
 from rce.control.model import (
     ConnectionSpec,
     EndpointKind,
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from rce.link import Buffer, Port
 
 WAYS = ("local", "unix", "tcp", "handed-over", "secure", "handed-over-secure")
-TIMEOUTS = LinkTimeouts(redial_first=0.005, redial_last=0.05, unknown_link=0.5, flush=0.2, close=1.0)
+TIMEOUTS = LinkTimeouts(redial=Backoff(0.005, 0.05, jitter=0.5), unknown_link=0.5, flush=0.2, close=1.0)
 
 
 class FakeInterface(Interface):

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 import uvloop
 
+from rce.aio.backoff import Backoff
 from rce.control.model import LinkAddress
 from rce.link import LinkHub, LinkTimeouts
 from rce.link.frames import Frame, FrameType, encode
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
     from .conftest import Rig
 
-TIMEOUTS = LinkTimeouts(redial_first=0.005)
+TIMEOUTS = LinkTimeouts(redial=Backoff(0.005, 1.0, jitter=0.5))
 TOPIC_OUT = ("SubscriberConverter", "PublisherInterface")
 TOPIC_IN = ("PublisherConverter", "SubscriberInterface")
 SERVICE_OUT = ("ServiceProviderForwarder", "ServiceClientInterface")

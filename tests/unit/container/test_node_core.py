@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from rce.control.model import NodeSpec, NodeState, NodeStatus, RestartPolicy
 from rce_container.environment.nodes import events as e
-from rce_container.environment.nodes.core import BACKOFF_S, FIRST_BEAT_WITHIN_S, NodesCore
+from rce_container.environment.nodes.core import FIRST_BEAT_WITHIN_S, NodesCore
 from rce_container.environment.nodes.life import NEXT, WITH_PROCESS, LifeEvent, after
 from rce_container.environment.nodes.order import StartOrder, levels, ready_to_end
 from rce_container.environment.nodes.record import LAST_CHANCE_S, WELL_S
@@ -168,7 +168,7 @@ def test_pauses_grow_and_the_limit_ends_them() -> None:
         pauses.append(world.core.deadline - world.now)
         world.wait(pauses[-1])
     world.end()
-    assert pauses == [*BACKOFF_S, 30.0, 30.0]
+    assert pauses == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0, 30.0]
     status = world.status()
     assert (status.state, status.restarts, status.exit_code) == (NodeState.FAILED, 9, 3)
     assert status.detail == (

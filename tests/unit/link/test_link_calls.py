@@ -1,9 +1,8 @@
-"""Who waits for answers, who works on them, and how dialing pauses."""
+"""Who waits for answers, and who works on them."""
 
 from __future__ import annotations
 
 import asyncio
-from itertools import islice
 from typing import TYPE_CHECKING, cast
 
 import pytest
@@ -11,7 +10,6 @@ import pytest
 from rce.guard.holdings import Holdings
 from rce.link.calls import CallServer, PendingCalls
 from rce.link.carrier import LocalCarrier
-from rce.link.dialer import pauses
 from rce.link.exceptions import MessageTooLarge, NotConnected, Overloaded, PeerFault, PeerLost, ProtocolError
 from rce.link.frames import Frame, FrameType
 from rce.link.settings import LinkLimits
@@ -135,12 +133,6 @@ async def test_what_a_server_raises_is_told_to_the_peer() -> None:
     await channel.answered.wait()
     assert channel.faults == {1: "nothing like that here"}
     await server.close()
-
-
-def test_pauses_double_up_to_the_longest() -> None:
-    found = list(islice(pauses(0.02, 1.0), 9))
-    for pause, most in zip(found, [0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1, 1, 1], strict=True):
-        assert most / 2 <= pause <= most
 
 
 async def test_scope_reports_failures_and_ends_its_tasks() -> None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import random
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
+from rce.aio.backoff import Backoff
 from rce.dialing import open_socket
 from rce.guard.complaints import Complaints
 from rce.guard.lobby import Lobby
@@ -25,7 +25,9 @@ _log = logging.getLogger(__name__)
 DEFAULT_PORT = 11911
 HELLO_TIMEOUT = 5.0
 CONNECT_TIMEOUT = 10.0
-RETRY_FIRST, RETRY_MOST = 0.2, 5.0
+RETRY = Backoff(first=0.2, longest=5.0, jitter=0.5)
+WORKED_AFTER = 5.0
+"""A link that lasted for so many seconds did work: the next pause is a short one."""
 MAX_NEW = STRANGERS = 64
 """How many links may wait to be taken, or have not shown yet that they have the token."""
 
@@ -81,7 +83,7 @@ class RelayLinks:
     async def dial(self, host: str, port: int) -> None:
         """Keep a link to another side, until cancelled."""
         loop = asyncio.get_running_loop()
-        wait = RETRY_FIRST
+        pauses = RETRY.start()
         while True:
             begin = loop.time()
             try:
@@ -91,10 +93,9 @@ class RelayLinks:
                 await self._serve(link, self._greet_as_dialer)
             except (OSError, LinkBroken) as error:
                 _log.warning("relay to %s:%d: %s", host, port, str(error) or type(error).__name__)
-            if loop.time() - begin > RETRY_MOST:  # it did work for a while
-                wait = RETRY_FIRST
-            await asyncio.sleep(wait * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
-            wait = min(RETRY_MOST, 2 * wait)
+            if loop.time() - begin > WORKED_AFTER:
+                pauses.reset()
+            await asyncio.sleep(pauses.next())
 
     async def open_server(self, host: str | None, port: int) -> asyncio.Server:
         """Begin to listen for links; :meth:`serve` takes them.

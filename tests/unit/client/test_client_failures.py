@@ -1,33 +1,16 @@
-"""When to try again, and whether to."""
+"""Which failures are worth another attempt."""
 
 from __future__ import annotations
 
-import itertools
-import random
 import ssl
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from websockets.datastructures import Headers
 from websockets.exceptions import InvalidMessage, InvalidStatus
 from websockets.http11 import Response
 
-from rce_client.backoff import Backoff, judge, judge_status
 from rce_client.exceptions import CallError, RefusedError, UnavailableError
-
-
-@given(seed=st.integers(), count=st.integers(1, 40))
-def test_delays_are_random_below_a_bound_that_doubles_up_to_a_cap(seed: int, count: int) -> None:
-    delays = list(itertools.islice(Backoff(first=0.5, factor=2, cap=8).delays(random.Random(seed)), count))
-    for number, delay in enumerate(delays):
-        assert 0 <= delay <= min(8, 0.5 * 2**number)
-
-
-def test_delays_use_the_whole_range() -> None:
-    delays = list(itertools.islice(Backoff(first=1, factor=1, cap=1).delays(random.Random(1)), 1000))
-    assert min(delays) < 0.05
-    assert max(delays) > 0.95
+from rce_client.failures import judge, judge_status
 
 
 def test_a_robot_id_in_use_is_worth_another_try() -> None:

@@ -1,46 +1,18 @@
-"""When to try again, and whether to: full-jitter delays and the judgement of failures. Pure."""
+"""Whether a failure is worth another attempt. Pure."""
 
 from __future__ import annotations
 
-import random
 import ssl
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from websockets.exceptions import InvalidHandshake, InvalidStatus, WebSocketException
 
 from rce.tls.faults import explain_to_client, find_tls_error
 from rce_client.exceptions import ClientError, InUseError, RefusedError, UnavailableError, UntrustedError
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
 RETRIED_STATUSES = frozenset((408, 425, 429, 500, 502, 503, 504))
 """HTTP statuses that another attempt may clear."""
 IN_USE = 409
 """The status if another client has the robotID: perhaps a former connection that has not ended yet."""
-
-
-@dataclass(frozen=True, slots=True)
-class Backoff:
-    """Delays between attempts: a random part of a bound that doubles (*full jitter*).
-
-    A fleet that lost its engine at the same moment comes back spread out in time.
-    """
-
-    first: float = 0.2
-    """Bound of the first delay in seconds."""
-    factor: float = 2.0
-    cap: float = 15.0
-    """Largest bound in seconds."""
-
-    def delays(self, rng: random.Random | None = None) -> Iterator[float]:
-        """Yield delays in seconds, for ever."""
-        rng = rng or random.Random()  # noqa: S311 - spreads load, guards nothing
-        bound = self.first
-        while True:
-            yield rng.uniform(0.0, bound)
-            bound = min(self.cap, bound * self.factor)
 
 
 def judge_status(status: int, reason: str) -> ClientError:

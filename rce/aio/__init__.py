@@ -1,0 +1,1 @@
+"""What asyncio leaves to its users, written once: pauses between attempts, owners of tasks."""
