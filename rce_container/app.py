@@ -29,14 +29,14 @@ from rce.ros.packages import PackageIndex, installed_shares
 from rce.supervision.signals import end_signals
 from rce.tls.choice import TlsChoice
 from rce.tls.identity import Context
-from rce_container.bundles.cache import BundleCache
-from rce_container.bundles.requirements import Installer
-from rce_container.bundles.supply import Library
 from rce_container.exceptions import RuntimeUnavailableError, StateError
 from rce_container.folder import StateFolder
 from rce_container.limits import Limiter, choose_limiter
 from rce_container.manager import Manager
 from rce_container.offers import Offers, find_offers
+from rce_container.packages.cache import PackageCache
+from rce_container.packages.requirements import Installer
+from rce_container.packages.supply import Library
 from rce_container.renewal import RENEW, inherited_children
 from rce_container.runtimes.base import Runtime, source_root
 from rce_container.runtimes.namespace import NamespaceRuntime
@@ -162,7 +162,7 @@ class App:
     def _library(self, state: StateFolder, tls: Context | None) -> Library:
         """Where packages that users bring come from. Blocks."""
         client = ContentClient(self.master, self.control_port, self.secret, tls=tls)
-        cache = BundleCache(state.library, client.piece, space=self.settings.bundle_space)
+        cache = PackageCache(state.library, client.piece, space=self.settings.bundle_space)
         requested = self.settings.requirements
         library = Library(
             cache=cache, installer=Installer(state.requirements, requested) if requested else None

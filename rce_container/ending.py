@@ -14,13 +14,13 @@ from rce.control.exceptions import ContentError
 from rce.control.messages import MachineInfo
 from rce.link.handover import LinkAcceptor
 from rce.link.unix import remove_stale_sockets
-from rce_container.bundles.cache import BundleCache
-from rce_container.bundles.supply import Library
 from rce_container.environment import proc
 from rce_container.exceptions import StateBusyError
 from rce_container.folder import StateFolder
 from rce_container.limits import choose_limiter
 from rce_container.manager import Manager
+from rce_container.packages.cache import PackageCache
+from rce_container.packages.supply import Library
 from rce_container.runtimes.base import Runtime
 from rce_container.runtimes.namespace import NamespaceRuntime
 from rce_container.runtimes.podman import PodmanRuntime
@@ -70,7 +70,7 @@ async def end_containers(
             acceptor=LinkAcceptor(),
             links=("", 0),
             limiter=limiter,
-            library=Library(cache=BundleCache(state.library, _no_master, space=settings.bundle_space)),
+            library=Library(cache=PackageCache(state.library, _no_master, space=settings.bundle_space)),
         )
         quit_ = asyncio.Event()
         quit_.set()

@@ -72,7 +72,7 @@ class ContainerFolder:
         self.home = self.path / "home"
         self.logs = logs or self.path / "logs"
         self.etc = self.path / "etc"
-        self.bundles = self.path / "bundles"
+        self.user_packages = self.path / "bundles"
         self.hosts = self.etc / "hosts"
         self.control_socket = self.run / "control.sock"
         self.link_socket = self.run / "link.sock"
@@ -87,8 +87,8 @@ class ContainerFolder:
             for path in (self.path, self.run, self.home, self.etc):
                 path.mkdir(mode=0o700, parents=True)
             self.logs.mkdir(mode=0o700, exist_ok=True)
-            self.bundles.mkdir()
-            self.bundles.chmod(0o755)  # for whomever the container runs as; nobody else comes by
+            self.user_packages.mkdir()
+            self.user_packages.chmod(0o755)  # for whomever the container runs as; nobody else comes by
         except OSError as error:
             raise StateError(f"cannot make {error.filename}: {error.strerror}") from error
 

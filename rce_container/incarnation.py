@@ -20,8 +20,6 @@ from rce.link.tasks import TaskScope
 from rce.protocol.names import EndpointId
 from rce_container import events, intake
 from rce_container.archive import LogArchive
-from rce_container.bundles.shelf import Shelf
-from rce_container.bundles.supply import Library, Supply
 from rce_container.dial import dial
 from rce_container.environment import messages as m
 from rce_container.environment import proc
@@ -39,6 +37,8 @@ from rce_container.folder import ContainerFolder
 from rce_container.limits.enforcer import LimitEnforcer
 from rce_container.logs import last_line
 from rce_container.network import Networks
+from rce_container.packages.shelf import Shelf
+from rce_container.packages.supply import Library, Supply
 from rce_container.runtimes.base import Handle
 from rce_container.settings import ContainerSettings
 
@@ -110,7 +110,7 @@ class Incarnation:
             self.mark,
             EndpointId.parse(id).user,
             context.library,
-            Shelf(folder.bundles, link=isolated),
+            Shelf(folder.user_packages, link=isolated),
             tell=lambda text: context.feed(events.Faulted(id, folder.mark, text)),
             on_arrival=self._tell_of_arrival,
         )
@@ -132,7 +132,7 @@ class Incarnation:
             self.folder.note_revision(spec.revision)
         except StateError as error:
             log.warning("container %s: %s", self.id, error)
-        self._supply.want(spec.bundles)
+        self._supply.want(spec.packages)
         if self._channel is not None:
             self._channel.send(m.encode(m.Apply(spec=spec)))
         if self._sender is not None:

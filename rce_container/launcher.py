@@ -167,7 +167,7 @@ class Launcher:
             address=str(seat.address.ip) if seat else LOOPBACK,
             rlimits=_rlimits(control_group, isolated=runtime.isolated),
             packages=tuple(map(str, settings.packages)),
-            bundles=runtime.bundles(folder),
+            user_packages=runtime.user_packages(folder),
             grace=settings.grace,
             interrupt_timeout=settings.interrupt_timeout,
             terminate_timeout=settings.terminate_timeout,

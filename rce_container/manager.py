@@ -32,7 +32,6 @@ from rce.control.model import EndpointStatus, LinkAddress
 from rce.control.usage import cpu_seconds, resident_bytes
 from rce.protocol.names import EndpointId
 from rce_container import core, events
-from rce_container.bundles.supply import Library
 from rce_container.environment import messages as m
 from rce_container.environment import proc
 from rce_container.environment.channel import connect
@@ -48,6 +47,7 @@ from rce_container.limits import ControlGroup
 from rce_container.limits.enforcer import LimitEnforcer
 from rce_container.log_reads import LogReads
 from rce_container.network import Networks
+from rce_container.packages.supply import Library
 from rce_container.reading import read_for
 from rce_container.runtimes.base import Handle
 from rce_container.usage import Subject, UsageMeter

@@ -16,9 +16,9 @@ from rce.guard.files import raise_file_limit
 from rce.tls.choice import TlsChoice
 from rce.tls.exceptions import CertificateError
 from rce_container.app import App, package_path
-from rce_container.bundles.requirements import InstallerSettings
 from rce_container.ending import end_containers
 from rce_container.exceptions import ContainerError
+from rce_container.packages.requirements import InstallerSettings
 from rce_container.renewal import renew
 from rce_container.settings import ContainerSettings
 

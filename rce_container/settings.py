@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rce.control.limits import MEGABYTE
 from rce_container.archive import LOG_DAYS, LOG_SPACE
-from rce_container.bundles.requirements import InstallerSettings
+from rce_container.packages.requirements import InstallerSettings
 from rce_container.uids import FIRST_UID, UIDS
 
 BUNDLE_SPACE = 4096 * MEGABYTE

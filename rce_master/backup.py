@@ -27,7 +27,7 @@ import msgspec
 
 from rce import __version__
 from rce_master.exceptions import StoreError
-from rce_master.state.records import Bundle
+from rce_master.state.records import UserPackage
 from rce_master.state.tables import Tables
 from rce_master.store.lock import FolderLock
 from rce_master.store.sqlite import FILE_NAME, SCHEMA_VERSION
@@ -223,7 +223,7 @@ def _files(folders: Mapping[str, Path], store: Path) -> Iterator[tuple[str, Path
     """Name the files of a copy: the store, the packages that it names, and the rest of the folders."""
     yield f"{MASTER}/{FILE_NAME}", store
     master = folders[MASTER]
-    for sha256 in sorted({bundle.sha256 for bundle in _bundles(store)}):
+    for sha256 in sorted({package.sha256 for package in _packages(store)}):
         yield f"{MASTER}/{BUNDLES}/{sha256}", master / BUNDLES / sha256
     for part, folder in folders.items():
         for path in sorted(folder.rglob("*")):
@@ -233,11 +233,11 @@ def _files(folders: Mapping[str, Path], store: Path) -> Iterator[tuple[str, Path
                 yield f"{part}/{inside.as_posix()}", path
 
 
-def _bundles(store: Path) -> Iterator[Bundle]:
+def _packages(store: Path) -> Iterator[UserPackage]:
     with closing(sqlite3.connect(f"{store.as_uri()}?mode=ro", uri=True)) as database:
-        rows = database.execute("SELECT key, body FROM record WHERE kind = ?", (Tables().bundles.name,))
+        rows = database.execute("SELECT key, body FROM record WHERE kind = ?", (Tables().packages.name,))
         for _, body in rows:
-            yield msgspec.json.decode(body, type=Bundle)
+            yield msgspec.json.decode(body, type=UserPackage)
 
 
 def _check_store(path: Path) -> None:

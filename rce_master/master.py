@@ -17,14 +17,14 @@ from rce.web.origin import ServerNames
 from rce.web.server import HttpServer
 from rce_master.audit import AuditLog
 from rce_master.auth import Authenticator, client_digest
-from rce_master.bundles.contents import ContentStore
-from rce_master.bundles.service import PackageService
 from rce_master.control_handler import ControlHandler
 from rce_master.events import EventLog
 from rce_master.exceptions import MasterError
 from rce_master.executions import Executions
 from rce_master.http.routes import Services
 from rce_master.http.server import make_app
+from rce_master.packages.contents import ContentStore
+from rce_master.packages.service import PackageService
 from rce_master.quotas import Quotas
 from rce_master.reconciler import Reconciler
 from rce_master.state import commands

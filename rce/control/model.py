@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-from msgspec import Struct
+from msgspec import Struct, field
 
 ParameterValue = bool | int | float | str | list[bool | int | float | str]
 """A parameter's value on the wire."""
@@ -130,7 +130,7 @@ class ConnectionSpec(Struct, frozen=True, kw_only=True):
     peer_interface: str
 
 
-class BundleSpec(Struct, frozen=True, kw_only=True):
+class PackageSpec(Struct, frozen=True, kw_only=True):
     """A version of a package that a user brought to the engine; mounted read-only on the package path."""
 
     name: str
@@ -138,7 +138,7 @@ class BundleSpec(Struct, frozen=True, kw_only=True):
     sha256: str
     """Of the archive, in hex; names its content everywhere."""
     signature: str
-    """Ed25519, in hex, over what :mod:`rce.bundles` says."""
+    """Ed25519, in hex, over what :mod:`rce.packages` says."""
     key: str
     """The public key that made the signature, in hex."""
 
@@ -162,7 +162,7 @@ class EndpointSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
     resources: Resources = Resources()
     nodes: tuple[NodeSpec, ...] = ()
     parameters: tuple[ParameterSpec, ...] = ()
-    bundles: tuple[BundleSpec, ...] = ()
+    packages: tuple[PackageSpec, ...] = field(default=(), name="bundles")
 
 
 class NodeState(Enum):

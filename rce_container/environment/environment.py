@@ -29,7 +29,6 @@ from rce.ros.node.settings import is_loopback
 from rce.ros.types import TypeRegistry
 from rce.ros.xmlrpc import RpcClient
 from rce_container.environment import messages as m
-from rce_container.environment.bundles import Bundles
 from rce_container.environment.channel import Channel, accept
 from rce_container.environment.exceptions import ChannelError
 from rce_container.environment.executions import Executions
@@ -45,6 +44,7 @@ from rce_container.environment.nodes.reaper import Reaper
 from rce_container.environment.parameters import Values, difference, evaluate_all
 from rce_container.environment.process import kill_marked
 from rce_container.environment.reach import DialProxy
+from rce_container.environment.user_packages import UserPackages
 
 log = logging.getLogger(__name__)
 
@@ -91,8 +91,8 @@ class Environment:
         self._told: EndpointStatus | None = None
         self._report_due: asyncio.Handle | None = None
         self._handover: HandoverReceiver | None = None
-        self._bundles = Bundles(boot.bundles, boot.packages)
-        self._packages = self._bundles.index
+        self._user_packages = UserPackages(boot.user_packages, boot.packages)
+        self._packages = self._user_packages.index
         self._dial_proxy = DialProxy(self._ask)
         self._causes = Causes(self._ask)
 
@@ -169,7 +169,7 @@ class Environment:
     def _context(self, reaper: Reaper) -> NodeContext:
         return NodeContext(
             reaper=reaper,
-            outfit=lambda node: self._bundles.outfit(node, self._environ()),
+            outfit=lambda node: self._user_packages.outfit(node, self._environ()),
             mark=self._boot.mark,
             home=self._boot.home,
             logs=Path(self._boot.logs),
@@ -197,17 +197,17 @@ class Environment:
         if spec.revision < self._desired.revision or self._ending.is_set():
             return
         self._desired = spec
-        self._bundles.apply(spec.bundles)
+        self._user_packages.apply(spec.packages)
         self._set_parameters(spec)
-        self._nodes.lack(self._bundles.lacking(spec.nodes))
+        self._nodes.lack(self._user_packages.lacking(spec.nodes))
         self._nodes.apply(spec.nodes)
         self._news.set()
 
-    def _take_bundles(self) -> None:
+    def _take_user_packages(self) -> None:
         """Go on with what waited for packages that have come."""
-        self._bundles.look()
+        self._user_packages.look()
         self._set_parameters(self._desired)
-        self._nodes.lack(self._bundles.lacking(self._desired.nodes))
+        self._nodes.lack(self._user_packages.lacking(self._desired.nodes))
         self._news.set()
 
     def _set_parameters(self, spec: EndpointSpec) -> None:
@@ -218,7 +218,7 @@ class Environment:
         for name, value in change.set.items():
             self._core.set_param(name, value)
         self._parameters = desired
-        if self._bundles.is_waiting:  # they may name a package that is still to come
+        if self._user_packages.is_waiting:  # they may name a package that is still to come
             return
         texts = {str(fault) for fault in faults}
         for text in sorted(texts - self._faulty):
@@ -231,7 +231,7 @@ class Environment:
             self._news.clear()
             spec = self._desired
             await self._heartbeats.follow(spec.nodes)
-            possible = self._bundles.hold_back(spec, self._interfaces)
+            possible = self._user_packages.hold_back(spec, self._interfaces)
             self._interfaces = possible.interfaces
             await self._endpoint.apply(possible)
             self._applied_revision = spec.revision
@@ -335,7 +335,7 @@ class Environment:
             case m.Apply(spec=spec):
                 self._apply(spec)
             case m.Shelved():
-                self._take_bundles()
+                self._take_user_packages()
             case m.Poll():
                 counters = m.Counters(interfaces=self._endpoint.usage(), traffic=self._endpoint.traffic)
                 channel.send(m.encode(counters))

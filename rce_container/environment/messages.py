@@ -8,7 +8,7 @@ die and another one come: the newest connection counts, and an environment first
 from __future__ import annotations
 
 import msgspec
-from msgspec import Struct
+from msgspec import Struct, field
 
 from rce.control.execution import Command
 from rce.control.model import EndpointSpec, EndpointStatus, InterfaceUsage, LinkAddress
@@ -40,8 +40,8 @@ class Boot(Struct, frozen=True, kw_only=True, omit_defaults=True):
     rlimits: dict[int, int] = {}
     """What each of its processes limits for itself, by the numbers of :mod:`resource`."""
     packages: tuple[str, ...] = ()
-    bundles: str = ""
-    """Folder in which packages that the user brought appear; see :mod:`rce_container.environment.bundles`."""
+    user_packages: str = field(default="", name="bundles")
+    """Folder in which the user's packages appear; see :mod:`rce_container.environment.user_packages`."""
     grace: float = 30.0
     """Seconds without a manager after which the environment ends itself."""
     interrupt_timeout: float = 15.0

@@ -189,9 +189,9 @@ class Runtime(ABC):
     def close(self) -> None:  # noqa: B027 - most keep nothing
         """End what the runtime keeps running for itself; containers live on."""
 
-    def bundles(self, folder: ContainerFolder) -> str:
+    def user_packages(self, folder: ContainerFolder) -> str:
         """Where the container sees the packages that its user brought; it cannot write there if isolated."""
-        return str(folder.bundles)
+        return str(folder.user_packages)
 
     def adopt(self, process: proc.Process, record: Record) -> Handle:
         """Take over a container that an earlier manager started.

@@ -110,7 +110,7 @@ class NamespaceRuntime(Runtime):
                 self.name, "bwrap is not installed (Debian, Ubuntu: apt install bubblewrap)"
             )
 
-    def bundles(self, folder: ContainerFolder) -> str:  # noqa: ARG002
+    def user_packages(self, folder: ContainerFolder) -> str:  # noqa: ARG002
         """The same in every container."""
         return BUNDLES
 
@@ -257,7 +257,7 @@ def _mounts(order: Order) -> list[str]:
         *("--ro-bind", str(folder.etc), "/etc"),
         *(word for name in _etc(order) for word in ("--ro-bind-try", f"/etc/{name}", f"/etc/{name}")),
         *("--bind", str(folder.logs), LOGS),
-        *("--dir", "/opt", "--dir", "/opt/rce", "--ro-bind", str(folder.bundles), BUNDLES),
+        *("--dir", "/opt", "--dir", "/opt/rce", "--ro-bind", str(folder.user_packages), BUNDLES),
         *read_only_mounts([*interpreter_paths(), *order.packages]),
         *("--dir", "/run", "--symlink", "../run", "/var/run"),
         *("--symlink", "../tmp", "/var/tmp", "--remount-ro", "/"),  # noqa: S108 - the container's own

@@ -188,7 +188,7 @@ class PodmanRuntime(NamespaceRuntime):
         folder = order.folder
         mounts = [(path, str(path)) for path in outermost(_paths(order))]
         mounts += [(folder.etc / name, f"/etc/{name}") for name in _OWN_ETC]
-        mounts.append((folder.bundles, BUNDLES))
+        mounts.append((folder.user_packages, BUNDLES))
         image = order.image
         if not image:
             root = folder.path / "root"

@@ -6,8 +6,8 @@ import os
 import stat
 from pathlib import Path
 
-from rce.bundles.exceptions import BadKey
-from rce.bundles.signing import SigningKey
+from rce.packages.exceptions import BadKey
+from rce.packages.signing import SigningKey
 from rce_master.cli.credentials import login_file
 from rce_master.cli.exceptions import CliError
 

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
     from rce_master.audit import AuditLog
     from rce_master.auth import Authenticator
-    from rce_master.bundles.service import PackageService
     from rce_master.events import EventLog
     from rce_master.executions import Executions
+    from rce_master.packages.service import PackageService
     from rce_master.quotas import Quotas
     from rce_master.reconciler import Reconciler
     from rce_master.state.records import User

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from msgspec.structs import replace
 
 from rce_master.state.records import (
-    Bundle,
     Container,
     ContainerLive,
     Counter,
@@ -26,6 +25,7 @@ from rce_master.state.records import (
     Tombstone,
     User,
     UserLimits,
+    UserPackage,
 )
 from rce_master.store.base import Row
 
@@ -142,7 +142,7 @@ class Transaction:
         | KnownLogin
         | UserLimits
         | PackageKey
-        | Bundle
+        | UserPackage
         | Endpoint
         | TaskSet
         | RobotLive
@@ -239,7 +239,7 @@ class Transaction:
             KnownLogin: tables.known_logins,
             UserLimits: tables.user_limits,
             PackageKey: tables.package_keys,
-            Bundle: tables.bundles,
+            UserPackage: tables.packages,
             Robot: tables.endpoints,
             Container: tables.endpoints,
             TaskSet: tables.task_sets,

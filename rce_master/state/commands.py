@@ -14,7 +14,7 @@ from rce.control.model import Resources
 if TYPE_CHECKING:
     from rce.control.messages import Hello
     from rce.control.model import EndpointStatus, InterfaceSpec, NodeSpec, ParameterValue
-    from rce_master.state.records import Bundle, KnownLogin, PackageKey, Token, User, UserRole
+    from rce_master.state.records import KnownLogin, PackageKey, Token, User, UserPackage, UserRole
 
 
 _NOTHING_REQUESTED = Resources()
@@ -128,18 +128,18 @@ class RemovePackageKey:
 
     user: str
     id: str
-    """As :func:`rce.bundles.signing.key_id` names it."""
+    """As :func:`rce.packages.signing.key_id` names it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AddBundle:
+class AddPackage:
     """Take a version of a package; whoever sends this has verified it."""
 
-    bundle: Bundle
+    package: UserPackage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RemoveBundle:
+class RemovePackage:
     """Remove a version of a package; refused while a node needs it."""
 
     user: str
@@ -365,8 +365,8 @@ Command: TypeAlias = (
     | SetLimits
     | AddPackageKey
     | RemovePackageKey
-    | AddBundle
-    | RemoveBundle
+    | AddPackage
+    | RemovePackage
     | TaskSetArrived
     | TaskSetLeft
     | StatusReported

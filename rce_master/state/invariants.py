@@ -29,7 +29,7 @@ def validate(tables: Tables) -> None:
     _check_connections(tables)
     _check_observed(tables)
     _check_moves(tables)
-    for record in (*tables.bundles, *tables.package_keys, *tables.known_logins, *tables.user_limits):
+    for record in (*tables.packages, *tables.package_keys, *tables.known_logins, *tables.user_limits):
         assert record.user in tables.users, f"{record}: its user is unknown"
 
 

@@ -72,12 +72,12 @@ def limit_of(tables: Tables, settings: StateSettings, user: str, kind: str) -> L
 def used_of(tables: Tables, user: str) -> dict[str, float]:
     """Tell how much of each kind a user has."""
     all_requested = [container.resources for container in tables.containers(user)]
-    bundles = tables.bundles.by("user", user)
+    packages = tables.packages.by("user", user)
     return {
         "containers": len(all_requested),
         **{kind: _asked(all_requested, kind) for kind in _OF_MACHINES},
-        "packages": len(bundles),
-        "disk": sum(bundle.size for bundle in bundles),
+        "packages": len(packages),
+        "disk": sum(package.size for package in packages),
     }
 
 

@@ -136,7 +136,7 @@ def package_key_key(user: str, key: str) -> str:
     return f"{user}/{key}"
 
 
-class Bundle(Struct, frozen=True, kw_only=True):
+class UserPackage(Struct, frozen=True, kw_only=True):
     """A version of a package that a user brought. It never changes."""
 
     user: str
@@ -165,11 +165,11 @@ class Bundle(Struct, frozen=True, kw_only=True):
     @property
     def id(self) -> str:
         """``user/name@version``."""
-        return bundle_key(self.user, self.name, self.version)
+        return user_package_key(self.user, self.name, self.version)
 
 
-def bundle_key(user: str, name: str, version: str) -> str:
-    """Tell the key of a bundle."""
+def user_package_key(user: str, name: str, version: str) -> str:
+    """Tell the key of a package."""
     return f"{user}/{name}@{version}"
 
 

@@ -43,7 +43,7 @@ def _with_contents(tables: Tables, spec: EndpointSpec, container: Container) -> 
         connections=spec.connections,
         resources=container.resources,
         nodes=tuple(container.nodes.values()),
-        bundles=packages.bundle_specs(tables, container),
+        packages=packages.package_specs(tables, container),
         parameters=tuple(ParameterSpec(name=n, value=v) for n, v in container.parameters.items()),
     )
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 import msgspec
 
 from rce_master.state.records import (
-    Bundle,
     Container,
     ContainerLive,
     Counter,
@@ -26,6 +25,7 @@ from rce_master.state.records import (
     Tombstone,
     User,
     UserLimits,
+    UserPackage,
 )
 
 if TYPE_CHECKING:
@@ -160,9 +160,9 @@ class Tables:
         self.package_keys = Table[PackageKey](
             "package_keys", type_=PackageKey, key=lambda k: k.id, user=lambda k: [k.user]
         )
-        self.bundles = Table[Bundle](
+        self.packages = Table[UserPackage](
             "bundles",
-            type_=Bundle,
+            type_=UserPackage,
             key=lambda b: b.id,
             user=lambda b: [b.user],
             package=lambda b: [f"{b.user}/{b.name}"],
@@ -201,7 +201,7 @@ class Tables:
             self.known_logins,
             self.user_limits,
             self.package_keys,
-            self.bundles,
+            self.packages,
             self.endpoints,
             self.links,
             self.task_sets,

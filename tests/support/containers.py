@@ -41,13 +41,13 @@ from rce.control.model import (
 from rce.link import Buffer, Endpoint, Interface, LinkHub, Port
 from rce.link.handover import LinkAcceptor
 from rce.protocol.names import EndpointId
-from rce_container.bundles.cache import BundleCache
-from rce_container.bundles.supply import Library
 from rce_container.environment import proc
 from rce_container.folder import Record, StateFolder
 from rce_container.limits import choose_limiter
 from rce_container.limits.files import children
 from rce_container.manager import Manager
+from rce_container.packages.cache import PackageCache
+from rce_container.packages.supply import Library
 from rce_container.runtimes.base import Runtime
 from rce_container.runtimes.namespace import NamespaceRuntime
 from rce_container.runtimes.podman import PodmanRuntime
@@ -140,7 +140,7 @@ class Machine:
         (self.packages / "own" / "package.yaml").write_text("name: own\n")
         for name, text in NODES.items():
             (nodes / name).write_text(text)
-        self.library = Library(cache=BundleCache(folder / "bundles", self._fetch, space=1 << 30))
+        self.library = Library(cache=PackageCache(folder / "bundles", self._fetch, space=1 << 30))
         self.library.open()
         self.contents: dict[str, bytes] = {}
         """What its master hands out, by hash."""

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from rce.ros.substitution import split_arguments
-from rce_container.environment.bundles import LaunchEnvironment
 from rce_container.environment.exceptions import NodeError
 from rce_container.environment.nodes.system import system_environ
+from rce_container.environment.user_packages import LaunchEnvironment
 
 NODE_MARK = "RCE_NODE"
 """Environment variable that every process of a node carries; its value names one life of one node."""

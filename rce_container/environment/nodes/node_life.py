@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rce.control.model import NodeSpec
-from rce_container.environment.bundles import LaunchEnvironment
 from rce_container.environment.exceptions import NodeError
 from rce_container.environment.logs.node_log import NodeLog
 from rce_container.environment.logs.pump import Pump
@@ -20,6 +19,7 @@ from rce_container.environment.nodes.events import Ended, Event, Made, Refused
 from rce_container.environment.nodes.launch import NODE_MARK, Launch, prepare
 from rce_container.environment.nodes.reaper import Child, Reaper
 from rce_container.environment.process import kill_marked
+from rce_container.environment.user_packages import LaunchEnvironment
 
 _PASSING = frozenset({errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE, errno.ETXTBSY, errno.ENOSPC})
 """Errors for which a start may succeed when it is tried later."""

@@ -11,7 +11,7 @@ import pytest
 from aiohttp import web
 
 from rce.web.server import HttpServer
-from rce_container.bundles.requirements import Installer, InstallerSettings
+from rce_container.packages.requirements import Installer, InstallerSettings
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rce.bundles.folder import look_into
-from rce.bundles.signing import SigningKey, key_id, statement
 from rce.config.secret import Secret
 from rce.control.contents import ContentClient
 from rce.control.exceptions import ContentError
 from rce.control.messages import Put
 from rce.control.model import EndpointSpec
+from rce.packages.folder import look_into
+from rce.packages.signing import SigningKey, key_id, statement
 from rce_master.cli import packages, signing_key
 from rce_master.cli.credentials import FILE_VARIABLE, Credentials, save
 from rce_master.cli.exceptions import ApiError, CliError
@@ -115,7 +115,7 @@ async def test_nodes_get_what_they_name(shop: Site, tmp_path: Path) -> None:
         node = {"exe": "run.py", "pkg": "nav"}
         await shop.api("POST", "/containers/c/nodes", {"tag": "any", **node}, status=204)
         spec = await newest_spec(containers, lambda spec: bool(spec.nodes))
-        assert [(b.name, b.version) for b in spec.bundles] == [("nav", "1.0")]
+        assert [(b.name, b.version) for b in spec.packages] == [("nav", "1.0")]
         node["pkg"] = "nav@3.0"
         reply = await shop.api("POST", "/containers/c/nodes", {"tag": "fixed", **node}, status=404)
         assert "no package 'nav' of version '3.0'" in reply["error"]
@@ -124,8 +124,8 @@ async def test_nodes_get_what_they_name(shop: Site, tmp_path: Path) -> None:
         make_package(tmp_path, text="print('newer')\n")
         await push(package, version="1.10")
         await push(package, version="2.0-rc1")
-        spec = await newest_spec(containers, lambda spec: len(spec.bundles) == 2)
-        assert [b.version for b in spec.bundles] == ["1.0", "1.10"]
+        spec = await newest_spec(containers, lambda spec: len(spec.packages) == 2)
+        assert [b.version for b in spec.packages] == ["1.0", "1.10"]
         reply = await shop.api("DELETE", "/packages/nav/1.10", status=409)
         assert "used by c/any" in reply["error"]
         await shop.api("DELETE", "/containers/c/nodes/any", status=204)
@@ -152,7 +152,7 @@ async def test_another_user_neither_sees_nor_uses_it(shop: Site, tmp_path: Path)
         node = {"tag": "n", "exe": "run.py", "pkg": "nav"}
         await shop.api("POST", "/containers/c/nodes", node, token=eve, status=204)
         spec = await newest_spec(containers, lambda spec: bool(spec.nodes))
-        assert spec.bundles == ()
+        assert spec.packages == ()
         node |= {"tag": "m", "pkg": "nav@1.0"}
         await shop.api("POST", "/containers/c/nodes", node, token=eve, status=404)
 

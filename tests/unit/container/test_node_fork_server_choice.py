@@ -17,7 +17,7 @@ OWN = {"PATH": "/bin", "PYTHONPATH": "/engine"}
     [
         ([sys.executable, "/p/node.py", "a"], OWN, True),
         ([sys.executable, "/p/node.py"], {**OWN, "PYTHONUNBUFFERED": "1", "ROS_IP": "1.2.3.4"}, True),
-        ([sys.executable, "/p/node.py"], {**OWN, "PYTHONPATH": "/bundle:/engine"}, False),
+        ([sys.executable, "/p/node.py"], {**OWN, "PYTHONPATH": "/package:/engine"}, False),
         ([sys.executable, "/p/node.py"], {**OWN, "LD_PRELOAD": "/x.so"}, False),
         ([sys.executable, "/p/node.py"], {"PATH": "/bin"}, False),
         ([sys.executable, "-c", "print()"], OWN, False),

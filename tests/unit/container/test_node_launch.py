@@ -10,11 +10,11 @@ import pytest
 
 from rce.control.model import NodeSpec
 from rce.ros.packages import PackageIndex
-from rce_container.environment.bundles import LaunchEnvironment
 from rce_container.environment.exceptions import NodeError
 from rce_container.environment.nodes import system
 from rce_container.environment.nodes.launch import NODE_MARK, prepare
 from rce_container.environment.nodes.node_life import describe_exit
+from rce_container.environment.user_packages import LaunchEnvironment
 
 
 @pytest.fixture

@@ -4,8 +4,8 @@ import asyncio
 
 import pytest
 
-from rce_master.bundles.uploads import FIRST_S, MAX_UPLOADS, Upload, Uploads
 from rce_master.exceptions import Busy, TooMuch
+from rce_master.packages.uploads import FIRST_S, MAX_UPLOADS, Upload, Uploads
 
 
 class Clock:

@@ -11,9 +11,9 @@ import shutil
 import tempfile
 from typing import TYPE_CHECKING
 
-from rce.bundles.contents import Contents, inspect
-from rce.bundles.exceptions import BadBundle
-from rce.bundles.limits import DEFAULT_LIMITS, BundleLimits
+from rce.packages.contents import Contents, inspect
+from rce.packages.exceptions import BadArchive
+from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
 from rce_master.exceptions import Invalid, StoreError
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ _BUFFER = 1 << 20
 class Incoming:
     """An archive that came in whole."""
 
-    def __init__(self, path: Path, limits: BundleLimits, sha256: str, size: int) -> None:
+    def __init__(self, path: Path, limits: ArchiveLimits, sha256: str, size: int) -> None:
         self.path = path
         self.sha256 = sha256
         self.size = size
@@ -39,11 +39,11 @@ class Incoming:
         """Tell what it holds.
 
         Raises:
-            Invalid: It is no bundle.
+            Invalid: It is not a package's archive.
         """
         try:
             return await asyncio.to_thread(self._inspect)
-        except BadBundle as error:
+        except BadArchive as error:
             raise Invalid(f"the archive cannot be taken: {error}") from error
 
     def _inspect(self) -> Contents:
@@ -59,7 +59,7 @@ class ContentStore:
         limits: How large each may be.
     """
 
-    def __init__(self, folder: Path, limits: BundleLimits = DEFAULT_LIMITS) -> None:
+    def __init__(self, folder: Path, limits: ArchiveLimits = DEFAULT_LIMITS) -> None:
         self._folder = folder
         self._limits = limits
 

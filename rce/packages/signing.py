@@ -9,7 +9,7 @@ import hashlib
 from binascii import unhexlify
 from typing import TYPE_CHECKING
 
-from rce.bundles.exceptions import BadKey, BadSignature
+from rce.packages.exceptions import BadKey, BadSignature
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -72,9 +72,9 @@ class SigningKey:
 
 
 def statement(user: str, name: str, version: str, sha256: str) -> bytes:
-    """What is signed of a bundle: whose it is, what it is, and the archive's SHA-256 in hex.
+    """What is signed of a package: whose it is, what it is, and the archive's SHA-256 in hex.
 
-    None of them can hold a newline, so no two bundles have the same statement.
+    None of them can hold a newline, so no two packages have the same statement.
     """
     return f"rce bundle 1\n{user}\n{name}\n{version}\n{sha256}\n".encode()
 

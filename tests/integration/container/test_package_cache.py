@@ -1,4 +1,4 @@
-"""The bundles of a machine: fetched once, verified, kept within a limit, whole or not there at all."""
+"""The packages of a machine: fetched once, verified, kept within a limit, whole or not there at all."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import os
 from pathlib import Path
 
 import pytest
-from support.bundles import pack, sign, write_package
+from support.user_packages import pack, sign, write_package
 
-from rce.bundles.limits import BundleLimits
 from rce.control.contents import Piece
 from rce.control.exceptions import ContentError
-from rce.control.model import BundleSpec
-from rce_container.bundles import cache as cache_module
-from rce_container.bundles import disk, shelf
-from rce_container.bundles.cache import BundleCache
-from rce_container.bundles.disk import replicate
-from rce_container.bundles.exceptions import NoSpace, Unfetched, Unverified
-from rce_container.bundles.shelf import Shelf
+from rce.control.model import PackageSpec
+from rce.packages.limits import ArchiveLimits
+from rce_container.packages import cache as cache_module
+from rce_container.packages import disk, shelf
+from rce_container.packages.cache import PackageCache
+from rce_container.packages.disk import replicate
+from rce_container.packages.exceptions import NoSpace, Unfetched, Unverified
+from rce_container.packages.shelf import Shelf
 
 
 class Depot:
@@ -32,7 +32,7 @@ class Depot:
         self.gate = asyncio.Event()
         self.gate.set()
 
-    def make(self, name: str, version: str = "1.0", size: int = 10) -> BundleSpec:
+    def make(self, name: str, version: str = "1.0", size: int = 10) -> PackageSpec:
         archive = pack(write_package(self.folder / version, name, run=os.urandom(size).hex()))
         spec = sign(archive, name, version)
         self.contents[spec.sha256] = archive
@@ -52,8 +52,8 @@ def depot(tmp_path: Path) -> Depot:
     return Depot(tmp_path / "source")
 
 
-def opened(depot: Depot, folder: Path, space: int = 1 << 20) -> BundleCache:
-    made = BundleCache(folder, depot.fetch, space=space)
+def opened(depot: Depot, folder: Path, space: int = 1 << 20) -> PackageCache:
+    made = PackageCache(folder, depot.fetch, space=space)
     made.open()
     return made
 
@@ -120,7 +120,7 @@ async def test_what_is_not_what_was_signed_is_refused(depot: Depot, tmp_path: Pa
     depot.contents[garbage.sha256] = b"garbage"
     with pytest.raises(Unverified, match="cannot be unpacked"):
         await cache.ensure("user", garbage)
-    small = BundleCache(tmp_path / "cache", depot.fetch, space=1, limits=BundleLimits(archive=50))
+    small = PackageCache(tmp_path / "cache", depot.fetch, space=1, limits=ArchiveLimits(archive=50))
     with pytest.raises(Unverified, match="more than 50 bytes"):
         await small.ensure("user", other)
     del depot.contents[nav.sha256]

@@ -1,4 +1,4 @@
-"""A package's folder on its owner's machine: what goes into the bundle, and what keeps it from being one."""
+"""A package's folder on its owner's machine: what goes into the package, and what keeps it from being one."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from rce.bundles import ignore
-from rce.bundles.archive import ArchiveWriter, make_header
-from rce.bundles.contents import Contents, describe
-from rce.bundles.exceptions import BadBundle
-from rce.bundles.limits import DEFAULT_LIMITS, BundleLimits
-from rce.bundles.requirements import FILE_NAME as REQUIREMENTS
-from rce.bundles.tree import Entry, Kind, Tree, path_fault
+from rce.packages import ignore
+from rce.packages.archive import ArchiveWriter, make_header
+from rce.packages.contents import Contents, describe
+from rce.packages.exceptions import BadArchive
+from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
+from rce.packages.requirements import FILE_NAME as REQUIREMENTS
+from rce.packages.tree import Entry, Kind, Tree, path_fault
 from rce.protocol.names import is_version
 from rce.ros.packages import MANIFESTS, BadPackage, parse_manifest
 
@@ -23,7 +23,7 @@ _READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
 class Source(NamedTuple):
-    """A package's folder that can be a bundle."""
+    """A package's folder that can be a package."""
 
     folder: Path
     tree: Tree
@@ -34,7 +34,7 @@ class Source(NamedTuple):
         """Write the archive. Blocks.
 
         Raises:
-            BadBundle: A file changed meanwhile, or cannot be read.
+            BadArchive: A file changed meanwhile, or cannot be read.
         """
         with ArchiveWriter(file) as archive:
             for entry in self.tree.entries.values():
@@ -47,19 +47,19 @@ class Source(NamedTuple):
                 while chunk := file.read(_CHUNK):
                     yield chunk
         except OSError as error:
-            raise BadBundle(f"{path}: {error.strerror}") from error
+            raise BadArchive(f"{path}: {error.strerror}") from error
 
 
-def look_into(folder: Path, version: str = "", limits: BundleLimits = DEFAULT_LIMITS) -> Source:
+def look_into(folder: Path, version: str = "", limits: ArchiveLimits = DEFAULT_LIMITS) -> Source:
     """Find out what a package's folder makes. Blocks.
 
     Args:
         folder: Holds the manifest.
         version: Instead of the one in the manifest.
-        limits: How large a bundle may be.
+        limits: How large a package may be.
 
     Raises:
-        BadBundle: It cannot be one; all faults are told.
+        BadArchive: It cannot be one; all faults are told.
     """
     folder = folder.absolute()
     texts = _texts(folder, limits)
@@ -70,20 +70,20 @@ def look_into(folder: Path, version: str = "", limits: BundleLimits = DEFAULT_LI
         try:
             make_header(entry)
             tree.add(entry)
-        except BadBundle as error:
+        except BadArchive as error:
             faults += error.faults
             if len(tree.entries) > limits.entries or tree.size > limits.unpacked:
                 break
     if faults:
-        raise BadBundle(faults)
+        raise BadArchive(faults)
     tree.finish()
     contents = describe(tree, {key: text for key, text in texts.items() if f"{name}/{key}" in tree.entries})
     return Source(folder, tree, contents, _version(version, contents))
 
 
-def _texts(folder: Path, limits: BundleLimits) -> dict[str, bytes]:
+def _texts(folder: Path, limits: ArchiveLimits) -> dict[str, bytes]:
     if not folder.is_dir():
-        raise BadBundle(f"{folder} is no folder")
+        raise BadArchive(f"{folder} is no folder")
     texts = {}
     for name in (*MANIFESTS, REQUIREMENTS):
         file = folder / name
@@ -92,34 +92,34 @@ def _texts(folder: Path, limits: BundleLimits) -> dict[str, bytes]:
                 with file.open("rb") as opened:
                     texts[name] = opened.read(limits.manifest + 1)
             except OSError as error:
-                raise BadBundle(f"{file}: {error.strerror}") from error
+                raise BadArchive(f"{file}: {error.strerror}") from error
             if len(texts[name]) > limits.manifest:
-                raise BadBundle(f"{file} has more than {limits.manifest} bytes")
+                raise BadArchive(f"{file} has more than {limits.manifest} bytes")
     return texts
 
 
 def _name(folder: Path, texts: dict[str, bytes]) -> str:
     manifest = next((name for name in MANIFESTS if name in texts), None)
     if manifest is None:
-        raise BadBundle(
+        raise BadArchive(
             f"{folder} is no package: it has no {' or '.join(MANIFESTS)}; write a package.yaml with the lines"
             " 'name: ...' and 'version: ...'"
         )
     try:
         return parse_manifest(folder / manifest, texts[manifest], folder.resolve().name).name
     except BadPackage as error:
-        raise BadBundle(str(error)) from error
+        raise BadArchive(str(error)) from error
 
 
 def _version(requested: str, contents: Contents) -> str:
     version = requested or contents.version
     if not version:
-        raise BadBundle(
+        raise BadArchive(
             "the package has no version: give --version, or write one into the manifest (in package.yaml in"
             " quotes, version: '1.2.0')"
         )
     if not is_version(version):
-        raise BadBundle(
+        raise BadArchive(
             f"{version!r} is no version: use up to four numbers, such as 1.2.0, and a label if it is not a"
             " release yet, such as 1.3-rc1"
         )
@@ -187,4 +187,4 @@ def _ignore_text(folder: Path) -> str:
     except FileNotFoundError:
         return ""
     except (OSError, UnicodeDecodeError) as error:
-        raise BadBundle(f"{folder / ignore.FILE_NAME}: {error}") from error
+        raise BadArchive(f"{folder / ignore.FILE_NAME}: {error}") from error

@@ -1,4 +1,4 @@
-"""Packages' folders: what goes in, what keeps a folder from being a bundle, and that equal ones are equal."""
+"""Packages' folders: what goes in, what keeps one from being packed, and that equal ones are equal."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from rce.bundles.exceptions import BadBundle
-from rce.bundles.folder import look_into
-from rce.bundles.limits import BundleLimits
 from rce.config.resources import examples_dir
+from rce.packages.exceptions import BadArchive
+from rce.packages.folder import look_into
+from rce.packages.limits import ArchiveLimits
 
 
 @pytest.fixture
@@ -34,8 +34,8 @@ def inside(folder: Path, version: str = "") -> list[str]:
     return ["/".join(entry.parts[1:]) for entry in look_into(folder, version).tree.entries.values()][1:]
 
 
-def fault(folder: Path, version: str = "", limits: BundleLimits | None = None) -> str:
-    with pytest.raises(BadBundle) as caught:
+def fault(folder: Path, version: str = "", limits: ArchiveLimits | None = None) -> str:
+    with pytest.raises(BadArchive) as caught:
         look_into(folder, version, *([limits] if limits else []))
     return str(caught.value)
 
@@ -161,11 +161,11 @@ def test_sockets_pipes_and_odd_names_are_refused(package: Path, monkeypatch: pyt
 
 def test_too_much_is_refused(package: Path) -> None:
     (package / "large").write_bytes(bytes(5000))
-    assert "more than 4000 bytes" in fault(package, limits=BundleLimits(unpacked=4000))
-    assert "more than 3 files" in fault(package, limits=BundleLimits(entries=3))
+    assert "more than 4000 bytes" in fault(package, limits=ArchiveLimits(unpacked=4000))
+    assert "more than 3 files" in fault(package, limits=ArchiveLimits(entries=3))
     deep = package / "a" / "b" / "c"
     deep.mkdir(parents=True)
-    assert "folders deep" in fault(package, limits=BundleLimits(depth=3))
+    assert "folders deep" in fault(package, limits=ArchiveLimits(depth=3))
 
 
 def test_what_no_node_can_name_is_told(package: Path) -> None:
@@ -178,5 +178,5 @@ def test_what_no_node_can_name_is_told(package: Path) -> None:
 def test_a_file_that_changes_while_it_is_packed_is_noticed(package: Path) -> None:
     source = look_into(package)
     (package / "nodes" / "run.py").write_text("print('changed')\n")
-    with pytest.raises(BadBundle, match="changed while it was read"):
+    with pytest.raises(BadArchive, match="changed while it was read"):
         source.pack(io.BytesIO())

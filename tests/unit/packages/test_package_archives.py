@@ -17,12 +17,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce.bundles.archive import ArchiveWriter, read_archive
-from rce.bundles.contents import inspect
-from rce.bundles.exceptions import BadBundle
-from rce.bundles.limits import BundleLimits
-from rce.bundles.tree import Entry, Kind, Tree
-from rce.bundles.unpacking import unpack
+from rce.packages.archive import ArchiveWriter, read_archive
+from rce.packages.contents import inspect
+from rce.packages.exceptions import BadArchive
+from rce.packages.limits import ArchiveLimits
+from rce.packages.tree import Entry, Kind, Tree
+from rce.packages.unpacking import unpack
 
 MANIFEST = b"name: nav\nversion: '1.0'\n"
 END = bytes(1024)
@@ -60,9 +60,9 @@ def on_disk(data: bytes) -> BinaryIO:
     return opened
 
 
-def unpacked(data: bytes, into: Path, limits: BundleLimits | None = None) -> Tree:
+def unpacked(data: bytes, into: Path, limits: ArchiveLimits | None = None) -> Tree:
     with on_disk(data) as opened:
-        tree, _ = unpack(opened, into, limits or BundleLimits())
+        tree, _ = unpack(opened, into, limits or ArchiveLimits())
     return tree
 
 
@@ -131,13 +131,13 @@ HOSTILE: dict[str, tuple[bytes, str]] = {
 def test_hostile_archives_are_refused(name: str, tmp_path: Path) -> None:
     data, text = HOSTILE[name]
     packed = gzip.compress(data)
-    with on_disk(packed) as opened, pytest.raises(BadBundle, match=text):
+    with on_disk(packed) as opened, pytest.raises(BadArchive, match=text):
         inspect(opened)
     target = tmp_path / "deep" / "target"
     target.mkdir(parents=True)
     try:
         unpacked(packed, target)
-    except BadBundle:
+    except BadArchive:
         pass
     else:
         assert "manifest" in name or name == "another name", "only those are not the unpacking's concern"
@@ -154,31 +154,31 @@ def test_a_bomb_is_stopped_early(tmp_path: Path) -> None:
         for _ in range(64):
             opened.write(bytes(1 << 20))
         opened.write(END)
-    limits = BundleLimits(free=1 << 20)
-    with pytest.raises(BadBundle, match="unpacks to more than"):
+    limits = ArchiveLimits(free=1 << 20)
+    with pytest.raises(BadArchive, match="unpacks to more than"):
         unpacked(packed.getvalue(), tmp_path, limits)
     written = sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file())
     assert written < 16 << 20
     other = tmp_path / "other"
     other.mkdir()
-    with pytest.raises(BadBundle, match="its files have more than"):
-        unpacked(packed.getvalue(), other, BundleLimits(unpacked=1 << 20))
+    with pytest.raises(BadArchive, match="its files have more than"):
+        unpacked(packed.getvalue(), other, ArchiveLimits(unpacked=1 << 20))
     assert not (other / "nav" / "x").exists()
 
 
 def test_limits_of_the_archive_itself(tmp_path: Path) -> None:
     many = gzip.compress(START + b"".join(file(f"nav/x{number:03}") for number in range(100)) + END)
-    with pytest.raises(BadBundle, match="more than 50 files"):
-        unpacked(many, tmp_path, BundleLimits(entries=50))
-    with pytest.raises(BadBundle, match="the archive has more than"):
-        unpacked(many, tmp_path, BundleLimits(archive=100))
+    with pytest.raises(BadArchive, match="more than 50 files"):
+        unpacked(many, tmp_path, ArchiveLimits(entries=50))
+    with pytest.raises(BadArchive, match="the archive has more than"):
+        unpacked(many, tmp_path, ArchiveLimits(archive=100))
 
 
 @pytest.mark.parametrize(
     "spoil", [lambda d: d[:-20], lambda d: d[:40] + b"\xff" + d[41:], lambda d: b"x" + d]
 )
 def test_a_damaged_archive_is_told(spoil: Callable[[bytes], bytes], tmp_path: Path) -> None:
-    with pytest.raises(BadBundle):
+    with pytest.raises(BadArchive):
         unpacked(spoil(gzip.compress(START + END)), tmp_path)
 
 
@@ -224,7 +224,7 @@ def test_no_garbage_does_anything_but_be_refused(garbage: bytes, at: int) -> Non
     with tempfile.TemporaryDirectory() as scratch:
         target = Path(scratch) / "target"
         target.mkdir()
-        with contextlib.suppress(BadBundle):
+        with contextlib.suppress(BadArchive):
             unpacked(gzip.compress(data, 1), target)
         assert [path.name for path in Path(scratch).iterdir()] == ["target"]
         for path in target.rglob("*"):

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Collection
 from pathlib import Path
 
-from rce_container.bundles.disk import replicate, scratch
-from rce_container.environment.bundles import REQUIREMENTS
+from rce_container.environment.user_packages import REQUIREMENTS
+from rce_container.packages.disk import replicate, scratch
 from rce_container.trees import remove
 
 KEPT = 8
-"""Bundles that no node names any more stay, the newest so many: a node that still runs may read from them."""
+"""How many packages that no node names any more stay: a node that still runs may read from them."""
 _STAGING = "bundles.new"
 
 
@@ -32,11 +32,11 @@ class Shelf:
         return self._folder.is_dir()
 
     def has(self, sha256: str) -> bool:
-        """Tell whether a bundle is there."""
+        """Tell whether a package is there."""
         return (self._folder / sha256).is_dir()
 
     def place(self, sha256: str, tree: Path, requirements: Path | None) -> None:
-        """Put a bundle in. Blocks.
+        """Put a package in. Blocks.
 
         Args:
             sha256: Names it.

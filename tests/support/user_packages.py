@@ -6,9 +6,9 @@ import hashlib
 import io
 from pathlib import Path
 
-from rce.bundles.folder import look_into
-from rce.bundles.signing import SigningKey, statement
-from rce.control.model import BundleSpec
+from rce.control.model import PackageSpec
+from rce.packages.folder import look_into
+from rce.packages.signing import SigningKey, statement
 
 KEY = SigningKey.generate()
 
@@ -34,8 +34,8 @@ def pack(package: Path) -> bytes:
     return archive.getvalue()
 
 
-def sign(archive: bytes, name: str, version: str, user: str = "user", key: SigningKey = KEY) -> BundleSpec:
+def sign(archive: bytes, name: str, version: str, user: str = "user", key: SigningKey = KEY) -> PackageSpec:
     """What the master would say of a package."""
     sha256 = hashlib.sha256(archive).hexdigest()
     signature = key.sign(statement(user, name, version, sha256))
-    return BundleSpec(name=name, version=version, sha256=sha256, signature=signature, key=key.public)
+    return PackageSpec(name=name, version=version, sha256=sha256, signature=signature, key=key.public)

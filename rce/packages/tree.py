@@ -1,4 +1,4 @@
-"""The files of a bundle, and the rules they keep: the same where it is packed and where it is unpacked."""
+"""The files of a package, and the rules they keep: the same where it is packed and where it is unpacked."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import posixpath
 from dataclasses import dataclass
 from enum import Enum
 
-from rce.bundles.exceptions import BadBundle
-from rce.bundles.limits import DEFAULT_LIMITS, BundleLimits
+from rce.packages.exceptions import BadArchive
+from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
 
 _MAX_PART = 255
 _MAX_HOPS = 8
@@ -19,15 +19,15 @@ class Kind(Enum):
     FILE = "file"
     FOLDER = "folder"
     LINK = "link"
-    """A symbolic link to something inside the bundle."""
+    """A symbolic link to something inside the package."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Entry:
-    """A file, a folder or a link of a bundle."""
+    """A file, a folder or a link of a package."""
 
     path: str
-    """From the bundle's root, with ``/``; the first part is the package's name."""
+    """From the package's root, with ``/``; the first part is the package's name."""
     kind: Kind
     size: int = 0
     """Bytes; files only."""
@@ -43,9 +43,9 @@ class Entry:
 
 
 class Tree:
-    """All entries of a bundle. They come in the order of their paths, folders before what is in them."""
+    """All entries of a package. They come in the order of their paths, folders before what is in them."""
 
-    def __init__(self, limits: BundleLimits = DEFAULT_LIMITS) -> None:
+    def __init__(self, limits: ArchiveLimits = DEFAULT_LIMITS) -> None:
         self.entries: dict[str, Entry] = {}
         self.size = 0
         """Bytes of all files."""
@@ -66,34 +66,34 @@ class Tree:
         """Take the next entry.
 
         Raises:
-            BadBundle: It breaks a rule.
+            BadArchive: It breaks a rule.
         """
         fault = path_fault(entry.path) or self._place_fault(entry)
         if fault:
-            raise BadBundle(f"{entry.path!r}: {fault}")
+            raise BadArchive(f"{entry.path!r}: {fault}")
         self.entries[entry.path] = entry
         self._last = entry.parts
         self.size += entry.size
         if len(self.entries) > self._limits.entries:
-            raise BadBundle(f"it has more than {self._limits.entries} files, folders and links")
+            raise BadArchive(f"it has more than {self._limits.entries} files, folders and links")
         if self.size > self._limits.unpacked:
-            raise BadBundle(f"its files have more than {self._limits.unpacked} bytes")
+            raise BadArchive(f"its files have more than {self._limits.unpacked} bytes")
 
     def finish(self) -> None:
         """Check what can only be checked of the whole.
 
         Raises:
-            BadBundle: It is empty, or a link leads nowhere or out of it.
+            BadArchive: It is empty, or a link leads nowhere or out of it.
         """
         if not self.entries:
-            raise BadBundle("it is empty")
+            raise BadArchive("it is empty")
         faults = [
             f"{path!r}: {fault}"
             for path, entry in self.entries.items()
             if entry.kind is Kind.LINK and (fault := self._link_fault(entry))
         ]
         if faults:
-            raise BadBundle(faults)
+            raise BadArchive(faults)
 
     def _place_fault(self, entry: Entry) -> str:
         parts = entry.parts
@@ -107,7 +107,7 @@ class Tree:
             return f"it is more than {self._limits.depth} folders deep"
         parent = self.entries.get("/".join(parts[:-1]))
         if len(parts) > 1 and (parent is None or parent.kind is not Kind.FOLDER):
-            return "it is in no folder of the bundle"
+            return "it is in no folder of the package"
         return ""
 
     def _link_fault(self, entry: Entry) -> str:

@@ -1,4 +1,4 @@
-"""What a bundle holds: its manifest, and what nodes can be made of it."""
+"""What a package holds: its manifest, and what nodes can be made of it."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import BinaryIO
 
 from msgspec import Struct
 
-from rce.bundles import requirements
-from rce.bundles.archive import read_archive
-from rce.bundles.exceptions import BadBundle
-from rce.bundles.limits import DEFAULT_LIMITS, BundleLimits
-from rce.bundles.tree import Entry, Kind, Tree
+from rce.packages import requirements
+from rce.packages.archive import read_archive
+from rce.packages.exceptions import BadArchive
+from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
+from rce.packages.tree import Entry, Kind, Tree
 from rce.protocol.names import is_name
 from rce.ros.packages import FOLDERS, MANIFESTS, BadPackage, Package, parse_manifest
 
@@ -24,7 +24,7 @@ _MAX_DESCRIPTION = 1000
 
 
 class Contents(Struct, frozen=True, kw_only=True):
-    """What a bundle holds."""
+    """What a package holds."""
 
     name: str
     version: str = ""
@@ -45,11 +45,11 @@ class Contents(Struct, frozen=True, kw_only=True):
     """What is probably not meant so."""
 
 
-def inspect(file: BinaryIO, limits: BundleLimits = DEFAULT_LIMITS) -> Contents:
+def inspect(file: BinaryIO, limits: ArchiveLimits = DEFAULT_LIMITS) -> Contents:
     """Read an archive and tell what it holds. Blocks; unpacks nothing to a disk.
 
     Raises:
-        BadBundle: It is no bundle.
+        BadArchive: It is not a package's archive.
     """
     texts: dict[str, bytes] = {}
 
@@ -57,7 +57,7 @@ def inspect(file: BinaryIO, limits: BundleLimits = DEFAULT_LIMITS) -> Contents:
         inner = entry.parts[1:]
         if entry.kind is Kind.FILE and len(inner) == 1 and inner[0] in _TEXTS:
             if entry.size > limits.manifest:
-                raise BadBundle(f"{entry.path!r}: it has more than {limits.manifest} bytes")
+                raise BadArchive(f"{entry.path!r}: it has more than {limits.manifest} bytes")
             texts[inner[0]] = b"".join(data)
 
     tree, digest = read_archive(file, visit, limits)
@@ -76,7 +76,7 @@ def describe(tree: Tree, texts: dict[str, bytes], digest: str = "") -> Contents:
         digest: See :attr:`Contents.digest`.
 
     Raises:
-        BadBundle: There is no manifest, it cannot be read, or it names another package.
+        BadArchive: There is no manifest, it cannot be read, or it names another package.
     """
     package = _package(tree, texts)
     executables = tuple(_executables(tree, package))
@@ -99,18 +99,20 @@ def _package(tree: Tree, texts: dict[str, bytes]) -> Package:
         if manifest in texts:
             break
     else:
-        raise BadBundle(f"there is no {' or '.join(MANIFESTS)} at the top of the folder")
+        raise BadArchive(f"there is no {' or '.join(MANIFESTS)} at the top of the folder")
     try:
         package = parse_manifest(Path(manifest), texts[manifest], tree.name)
     except BadPackage as error:
-        raise BadBundle(str(error)) from error
+        raise BadArchive(str(error)) from error
     if not is_name(package.name):
-        raise BadBundle(
+        raise BadArchive(
             f"{manifest}: {package.name!r} cannot be named by a node: use letters, digits and '_', a letter"
             " first"
         )
     if package.name != tree.name:
-        raise BadBundle(f"{manifest}: it names the package {package.name!r}, but its folder is {tree.name!r}")
+        raise BadArchive(
+            f"{manifest}: it names the package {package.name!r}, but its folder is {tree.name!r}"
+        )
     return package
 
 

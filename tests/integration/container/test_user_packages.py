@@ -10,12 +10,12 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from support.bundles import pack, sign, write_package
 from support.containers import Machine, until
+from support.user_packages import pack, sign, write_package
 
 from rce.aio.backoff import Backoff
-from rce.control.model import BundleSpec, InterfaceSpec, NodeSpec, NodeState, ParameterSpec
-from rce_container.bundles.requirements import Installer, InstallerSettings
+from rce.control.model import InterfaceSpec, NodeSpec, NodeState, PackageSpec, ParameterSpec
+from rce_container.packages.requirements import Installer, InstallerSettings
 
 BOX = "user/box"
 SAY = "import sys, time\nprint({text!r}, *sys.argv[1:], flush=True)\ntime.sleep(600)\n"
@@ -52,7 +52,7 @@ def shop(machine: Machine) -> Machine:
 
 def offer(
     machine: Machine, name: str, version: str = "1.0", *, hold: bool = False, **files: str
-) -> BundleSpec:
+) -> PackageSpec:
     """Push a package to the machine's master."""
     archive = pack(write_package(machine.folder / "source" / version, name, **files))
     spec = sign(archive, name, version)
@@ -69,7 +69,7 @@ async def test_a_node_of_a_brought_package_runs(shop: Machine) -> None:
     async with shop.engine():
         nav = offer(shop, "nav", nodes__run=LOOK)
         other = offer(shop, "other", nodes__run=SAY.format(text="hi"))
-        await shop.put(BOX, nodes=(node("nav"),), bundles=(nav,))
+        await shop.put(BOX, nodes=(node("nav"),), packages=(nav,))
         await shop.put("eve/box", nodes=(node("own", "talk.py"),))
         seen = json.loads(await shop.log_holds(BOX, "node", "}"))
         assert Path(seen["file"]).parts[-4:] == (nav.sha256, "nav", "nodes", "run.py")
@@ -78,7 +78,7 @@ async def test_a_node_of_a_brought_package_runs(shop: Machine) -> None:
         if shop.runtime.isolated:
             assert seen["file"].startswith("/opt/rce/bundles/")
             assert (seen["write"], seen["add"], seen["chmod"]) == (False, False, False)
-        await shop.put(BOX, 2, nodes=(node("nav"), node("other", tag="more")), bundles=(nav, other))
+        await shop.put(BOX, 2, nodes=(node("nav"), node("other", tag="more")), packages=(nav, other))
         await shop.log_holds(BOX, "more", "hi")
         held = [path for path in shop.containers if list((path / "bundles").iterdir())]
         assert len(held) == 1, "a container has packages that its user did not bring"
@@ -90,7 +90,7 @@ async def test_a_node_of_a_brought_package_runs(shop: Machine) -> None:
 async def test_a_users_package_comes_before_the_machines(shop: Machine) -> None:
     async with shop.engine():
         own = offer(shop, "own", nodes__talk=SAY.format(text="mine"))
-        await shop.put(BOX, nodes=(node("own", "talk.py"),), bundles=(own,))
+        await shop.put(BOX, nodes=(node("own", "talk.py"),), packages=(own,))
         await shop.put("eve/box", nodes=(node("own", "talk.py"),))
         await shop.log_holds(BOX, "node", "mine")
         await shop.log_holds("eve/box", "node", "hello")
@@ -102,7 +102,7 @@ async def test_a_package_that_comes_late_holds_up_nothing_else(shop: Machine) ->
         archive = pack(shop.folder / "source" / "1.0" / "nav")
         parameters = (ParameterSpec(name="/map", value="$(find nav)/maps"),)
         nodes = (node("nav", args="$(find nav)"), node("own", "talk.py", tag="talk"))
-        await shop.put(BOX, nodes=nodes, bundles=(nav,), parameters=parameters)
+        await shop.put(BOX, nodes=nodes, packages=(nav,), parameters=parameters)
         await shop.log_holds(BOX, "talk", "hello")
         waiting = await shop.node_is(BOX, "node", NodeState.WAITING)
         assert waiting.detail == "waits for its package nav 1.0"
@@ -126,7 +126,7 @@ async def test_interfaces_wait_for_types_of_a_package_that_is_still_to_come(shop
             InterfaceSpec(tag="open", type="ServiceClientInterface", cls="Box/Open", addr="/open"),
             InterfaceSpec(tag="say", type="PublisherInterface", cls="std_msgs/String", addr="/say"),
         )
-        await shop.put(BOX, nodes=(node("Box"),), bundles=(box,), interfaces=interfaces)
+        await shop.put(BOX, nodes=(node("Box"),), packages=(box,), interfaces=interfaces)
         await until(lambda: (status := shop.status(BOX)) and set(status.interfaces) == {"say"})
         shop.contents[box.sha256] = archive
         await until(lambda: (status := shop.status(BOX)) and set(status.interfaces) == {"say", "open"})
@@ -138,11 +138,11 @@ async def test_a_new_version_comes_while_nodes_run(shop: Machine) -> None:
     async with shop.engine():
         old = offer(shop, "nav", "1.0", nodes__run=SAY.format(text="old"))
         new = offer(shop, "nav", "1.10", nodes__run=SAY.format(text="new"))
-        await shop.put(BOX, nodes=(node("nav"),), bundles=(old,))
+        await shop.put(BOX, nodes=(node("nav"),), packages=(old,))
         await shop.log_holds(BOX, "node", "old")
         before = await shop.node_pid(BOX, "node")
         nodes = (node("nav"), node("nav", tag="newer"), node("nav@1.0", tag="fixed"))
-        await shop.put(BOX, 2, nodes=nodes, bundles=(old, new))
+        await shop.put(BOX, 2, nodes=nodes, packages=(old, new))
         await shop.log_holds(BOX, "newer", "new")
         await shop.log_holds(BOX, "fixed", "old")
         assert shop.node(BOX, "node").pid == before
@@ -153,7 +153,7 @@ async def test_a_new_manager_goes_on_where_the_old_one_was(shop: Machine) -> Non
         nav = offer(shop, "nav", nodes__run=SAY.format(text="here"))
         late = offer(shop, "late", hold=True, nodes__run=SAY.format(text="late"))
         nodes = (node("nav"), node("late", tag="late"))
-        await shop.put(BOX, nodes=nodes, bundles=(nav, late))
+        await shop.put(BOX, nodes=nodes, packages=(nav, late))
         await shop.log_holds(BOX, "node", "here")
         before = await shop.node_pid(BOX, "node")
         await shop.node_is(BOX, "late", NodeState.WAITING)
@@ -161,7 +161,7 @@ async def test_a_new_manager_goes_on_where_the_old_one_was(shop: Machine) -> Non
     shop.library.open()
     async with shop.engine():
         shop.contents[late.sha256] = pack(shop.folder / "source" / "1.0" / "late")
-        await shop.put(BOX, nodes=nodes, bundles=(nav, late))
+        await shop.put(BOX, nodes=nodes, packages=(nav, late))
         await shop.log_holds(BOX, "late", "late")
         assert shop.node(BOX, "node").pid == before
         assert not (shop.folder / "bundles" / "incoming" / "half").exists()
@@ -174,8 +174,8 @@ async def test_what_was_not_signed_is_not_unpacked(shop: Machine) -> None:
         forged = sign(other, "nav", "1.0", user="eve")
         shop.contents[nav.sha256] = other
         shop.contents[forged.sha256] = other
-        await shop.put(BOX, nodes=(node("nav"),), bundles=(nav,))
-        await shop.put("user/box2", nodes=(node("nav"),), bundles=(forged,))
+        await shop.put(BOX, nodes=(node("nav"),), packages=(nav,))
+        await shop.put("user/box2", nodes=(node("nav"),), packages=(forged,))
         await until(lambda: len(shop.faults) == 2, what=lambda: shop.faults)
         assert any("not what was signed" in fault for fault in shop.faults)
         assert any("does not fit the key" in fault for fault in shop.faults)
@@ -209,7 +209,7 @@ async def test_requirements_are_installed_where_it_is_allowed(shop: Machine) -> 
         path = offer(shop, "path", nodes__run=USE, requirements="-e /etc\n")
         nodes = (node("hand"), node("bad", tag="bad"), node("path", tag="path"))
         nodes += (NodeSpec(tag="own", pkg="own", exe="end.py"),)
-        await shop.put(BOX, nodes=nodes, bundles=(hand, bad, path))
+        await shop.put(BOX, nodes=nodes, packages=(hand, bad, path))
         await shop.log_holds(BOX, "node", "forty-two")
         await until(lambda: len(shop.faults) >= 2, what=lambda: shop.faults)
         assert any("pip could not install" in text and "nowhere" in text for text in shop.faults)
@@ -223,7 +223,7 @@ async def test_requirements_are_installed_where_it_is_allowed(shop: Machine) -> 
 async def test_requirements_are_left_out_where_it_is_not_allowed(shop: Machine) -> None:
     async with shop.engine():
         hand = offer(shop, "hand", nodes__run=SAY.format(text="without"), requirements="six\n")
-        await shop.put(BOX, nodes=(node("hand"),), bundles=(hand,))
+        await shop.put(BOX, nodes=(node("hand"),), packages=(hand,))
         await shop.log_holds(BOX, "node", "without")
         await until(lambda: shop.faults, what="a warning")
         assert "--allow-requirements" in shop.faults[0]

@@ -1,8 +1,8 @@
 """What keeps a package from coming into a container.
 
-BundleTrouble              told to the owner as it is; it is tried again
+PackageTrouble              told to the owner as it is; it is tried again
 ├── Unfetched              the master is away, or does not have it
-├── Unverified             it is not what its owner signed, or no bundle at all
+├── Unverified             it is not what its owner signed, or not a package at all
 ├── NoSpace                the machine's disk cannot take it
 └── RequirementsTrouble    what it needs of Python cannot be installed
 """
@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 
-class BundleTrouble(Exception):  # noqa: N818 - base of what is told to a package's owner
+class PackageTrouble(Exception):  # noqa: N818 - base of what is told to a package's owner
     """A package cannot come into a container now; the text says why and what to do.
 
     Attributes:
@@ -22,19 +22,19 @@ class BundleTrouble(Exception):  # noqa: N818 - base of what is told to a packag
     patience: ClassVar[float] = 1.0
 
 
-class Unfetched(BundleTrouble):
+class Unfetched(PackageTrouble):
     """The master is away, or does not have it."""
 
 
-class Unverified(BundleTrouble):
-    """It is not what its owner signed, or no bundle at all."""
+class Unverified(PackageTrouble):
+    """It is not what its owner signed, or not a package at all."""
 
 
-class NoSpace(BundleTrouble):
+class NoSpace(PackageTrouble):
     """The machine's disk cannot take it."""
 
 
-class RequirementsTrouble(BundleTrouble):
+class RequirementsTrouble(PackageTrouble):
     """What it needs of Python cannot be installed."""
 
     patience = 10.0  # each attempt costs the machine, and whoever serves the distributions, a lot

@@ -8,20 +8,20 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rce.bundles.exceptions import BadKey, BadSignature
-from rce.bundles.signing import statement, verify
 from rce.control.messages import TaskSetKind
 from rce.guard.turns import CrowdedError, Turns
-from rce_master.bundles.uploads import MAX_UPLOADS, Uploads
+from rce.packages.exceptions import BadKey, BadSignature
+from rce.packages.signing import statement, verify
 from rce_master.exceptions import Busy, Forbidden, Invalid
+from rce_master.packages.uploads import MAX_UPLOADS, Uploads
 from rce_master.state import commands, packages
-from rce_master.state.records import Bundle, bundle_key, package_key_key
+from rce_master.state.records import UserPackage, package_key_key, user_package_key
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from rce.bundles.contents import Contents
-    from rce_master.bundles.contents import ContentStore, Incoming
+    from rce.packages.contents import Contents
+    from rce_master.packages.contents import ContentStore, Incoming
     from rce_master.state.changes import Changes
     from rce_master.state_service import StateService
 
@@ -47,7 +47,7 @@ class PushRequest:
     key: str
     """The public key of the signature, in hex."""
     signature: str
-    """In hex, over :func:`rce.bundles.signing.statement`."""
+    """In hex, over :func:`rce.packages.signing.statement`."""
 
 
 class PackageService:
@@ -80,7 +80,7 @@ class PackageService:
             await self._dirty.wait()
             self._dirty.clear()
             async with self._lock:
-                known = {bundle.sha256 for bundle in self._state_service.tables.bundles}
+                known = {package.sha256 for package in self._state_service.tables.packages}
                 try:
                     await asyncio.to_thread(self._store.sweep, known)
                 except OSError as error:
@@ -88,7 +88,7 @@ class PackageService:
 
     async def push(
         self, request: PushRequest, size: int, chunks: AsyncIterator[bytes]
-    ) -> tuple[Bundle, tuple[str, ...]]:
+    ) -> tuple[UserPackage, tuple[str, ...]]:
         """Take a version of a package.
 
         Args:
@@ -105,23 +105,23 @@ class PackageService:
         """
         self._check_early(request, size)
         async with self._uploads.one(request.user) as upload:
-            bundle, contents = await self._take(request, upload.counted(chunks))
-        kept = self._state_service.tables.bundles.get(bundle.id) or bundle
+            package, contents = await self._take(request, upload.counted(chunks))
+        kept = self._state_service.tables.packages.get(package.id) or package
         return kept, (*contents.warnings, *self._warnings(contents))
 
-    async def _take(self, request: PushRequest, chunks: AsyncIterator[bytes]) -> tuple[Bundle, Contents]:
+    async def _take(self, request: PushRequest, chunks: AsyncIterator[bytes]) -> tuple[UserPackage, Contents]:
         async with self._store.receive(chunks) as incoming:
             _verify(request, incoming)
             contents = await self._inspect(request.user, incoming)
-            bundle = self._bundle(request, incoming, contents)
-            packages.check_new(self._state_service.tables, bundle)
+            package = self._package(request, incoming, contents)
+            packages.check_new(self._state_service.tables, package)
             async with self._lock:
                 try:
                     await self._store.keep(incoming)
-                    await self._state_service.submit(commands.AddBundle(bundle=bundle))
+                    await self._state_service.submit(commands.AddPackage(package=package))
                 finally:
                     self._dirty.set()
-        return bundle, contents
+        return package, contents
 
     async def _inspect(self, user: str, incoming: Incoming) -> Contents:
         try:
@@ -135,13 +135,13 @@ class PackageService:
         tables, settings = self._state_service.tables, self._state_service.state.settings
         if package_key_key(request.user, request.key) not in tables.package_keys:
             raise Forbidden("the key is not registered with your account; run: rce package key register")
-        if bundle_key(request.user, request.name, request.version) not in tables.bundles:
+        if user_package_key(request.user, request.name, request.version) not in tables.packages:
             packages.check_room(tables, settings, request.user, size)
 
-    def _bundle(self, request: PushRequest, incoming: Incoming, contents: Contents) -> Bundle:
+    def _package(self, request: PushRequest, incoming: Incoming, contents: Contents) -> UserPackage:
         if contents.name != request.name:
             raise Invalid(f"the archive holds the package {contents.name!r}, not {request.name!r}")
-        return Bundle(
+        return UserPackage(
             user=request.user,
             name=request.name,
             version=request.version,

@@ -1,4 +1,4 @@
-"""Lays a bundle out on a disk."""
+"""Lays a package out on a disk."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from rce.bundles.archive import read_archive
-from rce.bundles.limits import DEFAULT_LIMITS, BundleLimits
-from rce.bundles.tree import Entry, Kind, Tree
+from rce.packages.archive import read_archive
+from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
+from rce.packages.tree import Entry, Kind, Tree
 
 _CREATE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _FOLDER, _FILE, _EXECUTABLE = 0o755, 0o444, 0o555
 
 
-def unpack(file: BinaryIO, into: Path, limits: BundleLimits = DEFAULT_LIMITS) -> tuple[Tree, str]:
+def unpack(file: BinaryIO, into: Path, limits: ArchiveLimits = DEFAULT_LIMITS) -> tuple[Tree, str]:
     """Unpack an archive. Blocks.
 
     Files come out read-only and readable by everybody, never with another right: who may reach them is
@@ -27,10 +27,10 @@ def unpack(file: BinaryIO, into: Path, limits: BundleLimits = DEFAULT_LIMITS) ->
         limits: How large it may be.
 
     Returns:
-        As :func:`rce.bundles.archive.read_archive`.
+        As :func:`rce.packages.archive.read_archive`.
 
     Raises:
-        BadBundle: It is no bundle. What was unpacked until then is left behind.
+        BadArchive: It is not a package's archive. What was unpacked until then is left behind.
         OSError: It cannot be written.
     """
 

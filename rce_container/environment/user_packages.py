@@ -1,6 +1,6 @@
 """Which of the packages that the user brought are there yet, and what a node is started with because of it.
 
-The manager puts each into the folder :attr:`rce_container.environment.messages.Boot.bundles`, as
+The manager puts each into the folder :attr:`rce_container.environment.messages.Boot.user_packages`, as
 ``SHA256/NAME``; it appears whole.
 """
 
@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import msgspec
 
-from rce.bundles.versions import newest, split_package
-from rce.control.model import BundleSpec, EndpointSpec, InterfaceSpec, NodeSpec
+from rce.control.model import EndpointSpec, InterfaceSpec, NodeSpec, PackageSpec
+from rce.packages.versions import newest, split_package
 from rce.ros.packages import PATH_VARIABLES, PackageIndex
 
 REQUIREMENTS = ".requirements"
@@ -32,7 +32,7 @@ class LaunchEnvironment(NamedTuple):
     """Folder with Python modules that the node's package asked for; empty for none."""
 
 
-class Bundles:
+class UserPackages:
     """The packages that a container's user brought.
 
     Args:
@@ -46,10 +46,10 @@ class Bundles:
     def __init__(self, folder: str, packages: Iterable[str]) -> None:
         self._folder = Path(folder)
         self._packages = tuple(packages)
-        self._wanted: tuple[BundleSpec, ...] = ()
+        self._wanted: tuple[PackageSpec, ...] = ()
         self.index = PackageIndex(self._packages)
 
-    def apply(self, wanted: tuple[BundleSpec, ...]) -> None:
+    def apply(self, wanted: tuple[PackageSpec, ...]) -> None:
         """Take over what is desired, and look at what is there."""
         self._wanted = wanted
         self.look()
@@ -67,9 +67,9 @@ class Bundles:
         """Tell which nodes cannot start because their package is still to come, and say so in words."""
         texts = {}
         for node in nodes:
-            bundle = self._find(node.pkg)
-            if bundle is not None and not self._is_there(bundle):
-                texts[node.tag] = f"waits for its package {bundle.name} {bundle.version}"
+            package = self._find(node.pkg)
+            if package is not None and not self._is_there(package):
+                texts[node.tag] = f"waits for its package {package.name} {package.version}"
         return texts
 
     def hold_back(self, spec: EndpointSpec, before: Collection[InterfaceSpec]) -> EndpointSpec:
@@ -79,7 +79,7 @@ class Bundles:
             spec: What is desired.
             before: Interfaces that are there; they stay.
         """
-        coming = {bundle.name for bundle in self._wanted if not self._is_there(bundle)}
+        coming = {package.name for package in self._wanted if not self._is_there(package)}
         if not coming:
             return spec
         kept = tuple(
@@ -98,35 +98,35 @@ class Bundles:
             node: The node.
             environ: The environment of all nodes.
         """
-        bundle = self._find(node.pkg)
-        path = self._path(bundle)
+        package = self._find(node.pkg)
+        path = self._path(package)
         joined = os.pathsep.join(map(str, path))
         env = {**environ, **dict.fromkeys(PATH_VARIABLES, joined)}
-        if bundle is None:
+        if package is None:
             return LaunchEnvironment(node, PackageIndex(path), env)
-        requirements = self._root(bundle) / REQUIREMENTS
+        requirements = self._root(package) / REQUIREMENTS
         return LaunchEnvironment(
-            msgspec.structs.replace(node, pkg=bundle.name),
+            msgspec.structs.replace(node, pkg=package.name),
             PackageIndex(path),
             env,
             str(requirements) if requirements.is_dir() else "",
         )
 
-    def _find(self, pkg: str) -> BundleSpec | None:
+    def _find(self, pkg: str) -> PackageSpec | None:
         """Find what a node names; None if its user brought no such package."""
         name, version = split_package(pkg)
         fitting = [one for one in self._wanted if one.name == name and version in ("", one.version)]
         return newest(fitting, lambda one: one.version)
 
-    def _path(self, first: BundleSpec | None) -> tuple[Path, ...]:
-        """The package path: of one bundle, of the newest ones of each name, of the others, of the machine."""
-        names = dict.fromkeys(bundle.name for bundle in self._wanted)
+    def _path(self, first: PackageSpec | None) -> tuple[Path, ...]:
+        """The package path: of one package, of the newest of each name, of the others, of the machine."""
+        names = dict.fromkeys(package.name for package in self._wanted)
         chosen = [first, *map(self._find, names), *self._wanted]
-        roots = [self._root(bundle) for bundle in chosen if bundle is not None and self._is_there(bundle)]
+        roots = [self._root(package) for package in chosen if package is not None and self._is_there(package)]
         return tuple(dict.fromkeys([*roots, *map(Path, self._packages)]))
 
-    def _is_there(self, bundle: BundleSpec) -> bool:
-        return self._root(bundle).is_dir()
+    def _is_there(self, package: PackageSpec) -> bool:
+        return self._root(package).is_dir()
 
-    def _root(self, bundle: BundleSpec) -> Path:
-        return self._folder / bundle.sha256
+    def _root(self, package: PackageSpec) -> Path:
+        return self._folder / package.sha256

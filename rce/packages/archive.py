@@ -15,9 +15,9 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator
 from typing import BinaryIO, Self
 
-from rce.bundles.exceptions import BadBundle
-from rce.bundles.limits import DEFAULT_LIMITS, BundleLimits
-from rce.bundles.tree import Entry, Kind, Tree
+from rce.packages.exceptions import BadArchive
+from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
+from rce.packages.tree import Entry, Kind, Tree
 
 _TYPES = {tarfile.REGTYPE: Kind.FILE, tarfile.DIRTYPE: Kind.FOLDER, tarfile.SYMTYPE: Kind.LINK}
 _LETTERS = {kind: letter for letter, kind in _TYPES.items()}
@@ -46,7 +46,7 @@ class ArchiveWriter:
         """Add an entry.
 
         Raises:
-            BadBundle: Its path does not fit into a header, or its data are not of its size.
+            BadArchive: Its path does not fit into a header, or its data are not of its size.
         """
         self._gzip.write(make_header(entry))
         left = entry.size
@@ -54,7 +54,7 @@ class ArchiveWriter:
             left -= len(chunk)
             self._gzip.write(chunk)
         if left:
-            raise BadBundle(f"{entry.path!r} changed while it was read")
+            raise BadArchive(f"{entry.path!r} changed while it was read")
         self._gzip.write(bytes(-entry.size % _BLOCK))
 
 
@@ -62,7 +62,7 @@ def make_header(entry: Entry) -> bytes:
     """Write an entry's header.
 
     Raises:
-        BadBundle: Its path, or a link's target, does not fit in.
+        BadArchive: Its path, or a link's target, does not fit in.
     """
     info = tarfile.TarInfo(entry.path)
     info.type = _LETTERS[entry.kind]
@@ -72,13 +72,13 @@ def make_header(entry: Entry) -> bytes:
     try:
         return info.tobuf(tarfile.USTAR_FORMAT, "utf-8", "strict")
     except ValueError as error:
-        raise BadBundle(f"{entry.path!r}: its path, or where it links to, is too long or no text") from error
+        raise BadArchive(f"{entry.path!r}: its path, or where it links to, is too long or no text") from error
 
 
 def read_archive(
     file: BinaryIO,
     visit: Callable[[Entry, Iterator[bytes]], None],
-    limits: BundleLimits = DEFAULT_LIMITS,
+    limits: ArchiveLimits = DEFAULT_LIMITS,
 ) -> tuple[Tree, str]:
     """Read an archive from its beginning.
 
@@ -93,7 +93,7 @@ def read_archive(
         trees have the same one.
 
     Raises:
-        BadBundle: It is not of the form, breaks a rule, or is too large; the text names the place.
+        BadArchive: It is not of the form, breaks a rule, or is too large; the text names the place.
     """
     stream = _Inflated(file, limits)
     tree = Tree(limits)
@@ -115,10 +115,10 @@ def _next(stream: _Inflated) -> Entry | None:
     try:
         info = tarfile.TarInfo.frombuf(header, "utf-8", "strict")
     except (tarfile.HeaderError, ValueError) as error:
-        raise BadBundle(f"it is no archive of a package: {error}") from error
+        raise BadArchive(f"it is no archive of a package: {error}") from error
     kind = _TYPES.get(info.type)
     if kind is None:
-        raise BadBundle(f"{info.name!r}: only files, folders and symbolic links may be in a package")
+        raise BadArchive(f"{info.name!r}: only files, folders and symbolic links may be in a package")
     entry = Entry(
         path=info.name,
         kind=kind,
@@ -128,7 +128,7 @@ def _next(stream: _Inflated) -> Entry | None:
     )
     told = (info.mode, info.uid, info.gid, info.uname, info.gname, info.mtime, bool(info.linkname))
     if told != (_mode(entry), 0, 0, "", "", 0, kind is Kind.LINK) or info.size != max(0, entry.size):
-        raise BadBundle(f"{info.name!r}: it has an owner, a time, a mode or a size that rce gives to none")
+        raise BadArchive(f"{info.name!r}: it has an owner, a time, a mode or a size that rce gives to none")
     return entry
 
 
@@ -141,10 +141,10 @@ def _mode(entry: Entry) -> int:
 class _Inflated:
     """What a compressed file holds, never more of it than the limits allow."""
 
-    def __init__(self, file: BinaryIO, limits: BundleLimits) -> None:
+    def __init__(self, file: BinaryIO, limits: ArchiveLimits) -> None:
         packed = os.fstat(file.fileno()).st_size
         if packed > limits.archive:
-            raise BadBundle(f"the archive has more than {limits.archive} bytes")
+            raise BadArchive(f"the archive has more than {limits.archive} bytes")
         headers = (limits.entries + 2) * 2 * _BLOCK
         self._most = min(limits.unpacked + headers, max(limits.free, packed * limits.ratio))
         self._gzip = gzip.GzipFile(fileobj=file, mode="rb")
@@ -155,7 +155,7 @@ class _Inflated:
         """Take exactly so many bytes."""
         data = self._read(count)
         if len(data) != count:
-            raise BadBundle("the archive ends too early")
+            raise BadArchive("the archive ends too early")
         return data
 
     def data(self, size: int) -> Iterator[bytes]:
@@ -166,20 +166,20 @@ class _Inflated:
             left -= len(chunk)
             yield chunk
         if any(self.take(-size % _BLOCK)):
-            raise BadBundle("there is something between two entries")
+            raise BadArchive("there is something between two entries")
 
     def finish(self) -> None:
         """Take the end."""
         if any(self.take(_BLOCK)) or self._read(1):
-            raise BadBundle("there is something behind the last entry")
+            raise BadArchive("there is something behind the last entry")
 
     def _read(self, count: int) -> bytes:
         try:
             data = self._gzip.read(count)
         except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-            raise BadBundle(f"the archive is damaged: {error}") from error
+            raise BadArchive(f"the archive is damaged: {error}") from error
         self._taken += len(data)
         if self._taken > self._most:
-            raise BadBundle(f"it unpacks to more than {self._most} bytes")
+            raise BadArchive(f"it unpacks to more than {self._most} bytes")
         self.digest.update(data)
         return data

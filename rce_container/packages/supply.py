@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rce.aio.backoff import Backoff
-from rce.bundles.requirements import FILE_NAME as REQUIREMENTS_FILE
-from rce.control.model import BundleSpec
+from rce.control.model import PackageSpec
 from rce.link.tasks import TaskScope
-from rce_container.bundles.cache import BundleCache, trouble_of
-from rce_container.bundles.disk import in_thread
-from rce_container.bundles.exceptions import BundleTrouble
-from rce_container.bundles.requirements import Installer
-from rce_container.bundles.shelf import Shelf
+from rce.packages.requirements import FILE_NAME as REQUIREMENTS_FILE
+from rce_container.packages.cache import PackageCache, trouble_of
+from rce_container.packages.disk import in_thread
+from rce_container.packages.exceptions import PackageTrouble
+from rce_container.packages.requirements import Installer
+from rce_container.packages.shelf import Shelf
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +33,7 @@ _NOT_INSTALLED = (
 class Library:
     """Where all containers of a machine get packages from."""
 
-    cache: BundleCache
+    cache: PackageCache
     installer: Installer | None = None
     """Installs what packages ask for in their ``requirements.txt``; None: that is not allowed here."""
     retry: Backoff = RETRY
@@ -78,20 +78,20 @@ class Supply:
         self._tell = tell
         self._on_arrival = on_arrival
         self._tasks = TaskScope()
-        self._coming: dict[BundleSpec, asyncio.Task[None]] = {}
+        self._coming: dict[PackageSpec, asyncio.Task[None]] = {}
         self._closed = False
 
-    def want(self, bundles: Iterable[BundleSpec]) -> None:
+    def want(self, packages: Iterable[PackageSpec]) -> None:
         """Get these, and no others."""
-        wanted = set(bundles)
+        wanted = set(packages)
         if self._closed or wanted == self._coming.keys():
             return
-        self._library.cache.hold(self._holder, {bundle.sha256 for bundle in wanted})
-        for bundle in self._coming.keys() - wanted:
-            self._coming.pop(bundle).cancel()
-        for bundle in wanted - self._coming.keys():
-            name = f"package {bundle.name} of {self._holder}"
-            self._coming[bundle] = self._tasks.spawn(self._get(bundle), name)
+        self._library.cache.hold(self._holder, {package.sha256 for package in wanted})
+        for package in self._coming.keys() - wanted:
+            self._coming.pop(package).cancel()
+        for package in wanted - self._coming.keys():
+            name = f"package {package.name} of {self._holder}"
+            self._coming[package] = self._tasks.spawn(self._get(package), name)
 
     async def close(self) -> None:
         """Stop, and need nothing any more."""
@@ -99,15 +99,15 @@ class Supply:
         await self._tasks.close()
         self._library.cache.hold(self._holder, set())
 
-    async def _get(self, bundle: BundleSpec) -> None:
+    async def _get(self, package: PackageSpec) -> None:
         """Get one package, however often it takes."""
         told = ""
         pauses = self._library.retry.start()
         while True:
             try:
-                await self._bring(bundle)
-            except BundleTrouble as trouble:
-                what = f"package {bundle.name} {bundle.version}"
+                await self._bring(package)
+            except PackageTrouble as trouble:
+                what = f"package {package.name} {package.version}"
                 text = f"{what} is not there yet: {trouble}; it is tried again"
                 if text != told:
                     log.warning("%s: %s", self._holder, text)
@@ -118,23 +118,23 @@ class Supply:
                 self._on_arrival()
                 return
 
-    async def _bring(self, bundle: BundleSpec) -> None:
-        if self._shelf.has(bundle.sha256):
+    async def _bring(self, package: PackageSpec) -> None:
+        if self._shelf.has(package.sha256):
             return
         try:
-            tree = await self._library.cache.ensure(self._user, bundle)
-            requirements = await self._install(bundle, tree)
-            await in_thread(self._shelf.place, bundle.sha256, tree, requirements)
+            tree = await self._library.cache.ensure(self._user, package)
+            requirements = await self._install(package, tree)
+            await in_thread(self._shelf.place, package.sha256, tree, requirements)
             await in_thread(self._shelf.tidy, {one.sha256 for one in self._coming})
         except OSError as error:
             if self._shelf.is_there:
                 raise trouble_of(error) from error
 
-    async def _install(self, bundle: BundleSpec, tree: Path) -> Path | None:
-        package = tree / bundle.name
-        if not (package / REQUIREMENTS_FILE).is_file():
+    async def _install(self, package: PackageSpec, tree: Path) -> Path | None:
+        folder = tree / package.name
+        if not (folder / REQUIREMENTS_FILE).is_file():
             return None
         if self._library.installer is None:
-            self._tell(f"package {bundle.name} {bundle.version}: {_NOT_INSTALLED}")
+            self._tell(f"package {package.name} {package.version}: {_NOT_INSTALLED}")
             return None
-        return await self._library.installer.install(self._user, package)
+        return await self._library.installer.install(self._user, folder)

@@ -1,12 +1,12 @@
-"""How large a bundle may be; checked where it is packed, where it is kept and where it is unpacked."""
+"""How large a package may be; checked where it is packed, where it is kept and where it is unpacked."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 
-class BundleLimits(NamedTuple):
-    """Limits of one bundle."""
+class ArchiveLimits(NamedTuple):
+    """Limits of one package."""
 
     archive: int = 256 << 20
     """Bytes, compressed."""
@@ -24,4 +24,4 @@ class BundleLimits(NamedTuple):
     """Bytes of the manifest, and of ``requirements.txt``."""
 
 
-DEFAULT_LIMITS = BundleLimits()
+DEFAULT_LIMITS = ArchiveLimits()

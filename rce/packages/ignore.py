@@ -9,7 +9,7 @@ from __future__ import annotations
 from fnmatch import fnmatchcase
 from typing import NamedTuple
 
-from rce.bundles.exceptions import BadBundle
+from rce.packages.exceptions import BadArchive
 
 FILE_NAME = ".rceignore"
 ALWAYS = (".git", ".hg", ".svn", "__pycache__", "*.pyc", FILE_NAME)
@@ -39,7 +39,7 @@ class Ignore:
         """Read a ``.rceignore``.
 
         Raises:
-            BadBundle: A line says something that is not understood.
+            BadArchive: A line says something that is not understood.
         """
         patterns = [_Pattern((name,), anchored=False, folders_only=False) for name in ALWAYS]
         faults = []
@@ -55,7 +55,7 @@ class Ignore:
                 anchored = "/" in words.rstrip("/")
                 patterns.append(_Pattern(parts, anchored, words.endswith("/")))
         if faults:
-            raise BadBundle(faults)
+            raise BadArchive(faults)
         return cls(patterns)
 
     def matches(self, parts: tuple[str, ...], *, is_folder: bool) -> bool:

@@ -1,6 +1,6 @@
-"""Bundles on this machine, each once: ``FOLDER/SHA256/NAME``, shared by all containers that need them.
+"""Packages on this machine, each once: ``FOLDER/SHA256/NAME``, shared by all containers that need them.
 
-A bundle is fetched, verified and unpacked in a scratch folder, and appears whole by one rename.
+A package is fetched, verified and unpacked in a scratch folder, and appears whole by one rename.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from collections import defaultdict
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 
-from rce.bundles.exceptions import BundleError
-from rce.bundles.limits import DEFAULT_LIMITS, BundleLimits
-from rce.bundles.signing import statement, verify
-from rce.bundles.unpacking import unpack
 from rce.control.contents import Piece
 from rce.control.exceptions import ContentError
-from rce.control.model import BundleSpec
+from rce.control.model import PackageSpec
 from rce.guard.turns import CrowdedError, Turns
-from rce_container.bundles.disk import forget_before_boot, in_thread, scratch_aside
-from rce_container.bundles.exceptions import BundleTrouble, NoSpace, Unfetched, Unverified
-from rce_container.bundles.locks import Locks
+from rce.packages.exceptions import ArchiveError
+from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
+from rce.packages.signing import statement, verify
+from rce.packages.unpacking import unpack
+from rce_container.packages.disk import forget_before_boot, in_thread, scratch_aside
+from rce_container.packages.exceptions import NoSpace, PackageTrouble, Unfetched, Unverified
+from rce_container.packages.locks import Locks
 from rce_container.trees import remove, size_of
 
 Fetch = Callable[[str, int], Awaitable[Piece]]
@@ -38,8 +38,8 @@ _MAX_WAITING = 1024
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
-class BundleCache:
-    """The bundles of one machine.
+class PackageCache:
+    """The packages of one machine.
 
     Args:
         folder: Belongs to this cache.
@@ -49,7 +49,7 @@ class BundleCache:
     """
 
     def __init__(
-        self, folder: Path, fetch: Fetch, *, space: int, limits: BundleLimits = DEFAULT_LIMITS
+        self, folder: Path, fetch: Fetch, *, space: int, limits: ArchiveLimits = DEFAULT_LIMITS
     ) -> None:
         self._folder = folder
         self._fetch = fetch
@@ -74,7 +74,7 @@ class BundleCache:
         self._sizes = {path.name: size_of(path) for path in found}
 
     def hold(self, holder: str, sha256s: set[str]) -> None:
-        """Note which bundles a container needs; they are not removed while it does."""
+        """Note which packages a container needs; they are not removed while it does."""
         for sha256 in [*self._holders]:
             self._holders[sha256].discard(holder)
             if not self._holders[sha256]:
@@ -82,36 +82,36 @@ class BundleCache:
         for sha256 in sha256s:
             self._holders[sha256].add(holder)
 
-    async def ensure(self, user: str, bundle: BundleSpec) -> Path:
-        """Have a bundle here. Several callers at once cause one fetch.
+    async def ensure(self, user: str, package: PackageSpec) -> Path:
+        """Have a package here. Several callers at once cause one fetch.
 
         Args:
             user: Who brought it.
-            bundle: What it is to be.
+            package: What it is to be.
 
         Returns:
             The folder that holds the package's folder.
 
         Raises:
-            BundleTrouble: It cannot be had now.
+            PackageTrouble: It cannot be had now.
             OSError: Somebody else changed the folder.
         """
-        _check_signature(user, bundle)
-        path = self._folder / bundle.sha256
+        _check_signature(user, package)
+        path = self._folder / package.sha256
         async with contextlib.AsyncExitStack() as stack:
-            if not self._has(bundle, path):
+            if not self._has(package, path):
                 # The turn first: two users may want the same, and neither waits for the other's turn.
                 await stack.enter_async_context(self._turn(user))
-            await stack.enter_async_context(self._locks.of(bundle.sha256))
-            if not self._has(bundle, path):
-                await self._bring(bundle, path)
-            self._sizes[bundle.sha256] = self._sizes.pop(bundle.sha256)
+            await stack.enter_async_context(self._locks.of(package.sha256))
+            if not self._has(package, path):
+                await self._bring(package, path)
+            self._sizes[package.sha256] = self._sizes.pop(package.sha256)
             await in_thread(os.utime, path)
         await self._make_room()
         return path
 
-    def _has(self, bundle: BundleSpec, path: Path) -> bool:
-        return bundle.sha256 in self._sizes and path.is_dir()
+    def _has(self, package: PackageSpec, path: Path) -> bool:
+        return package.sha256 in self._sizes and path.is_dir()
 
     @contextlib.asynccontextmanager
     async def _turn(self, user: str) -> AsyncIterator[None]:
@@ -121,26 +121,26 @@ class BundleCache:
         except CrowdedError:
             raise Unfetched("too many packages are fetched to its machine just now") from None
 
-    async def _bring(self, bundle: BundleSpec, path: Path) -> None:
-        self._sizes.pop(bundle.sha256, None)
+    async def _bring(self, package: PackageSpec, path: Path) -> None:
+        self._sizes.pop(package.sha256, None)
         try:
             async with scratch_aside(self._folder / _SCRATCH) as folder:
                 archive = folder / "archive"
-                await self._download(bundle, archive)
+                await self._download(package, archive)
                 tree = folder / "tree"
-                size = await in_thread(self._unpack, bundle, archive, tree)
+                size = await in_thread(self._unpack, package, archive, tree)
                 await in_thread(_replace, tree, path)
         except OSError as error:
             raise trouble_of(error) from error
-        self._sizes[bundle.sha256] = size
+        self._sizes[package.sha256] = size
 
-    async def _download(self, bundle: BundleSpec, archive: Path) -> None:
+    async def _download(self, package: PackageSpec, archive: Path) -> None:
         digest = hashlib.sha256()
         offset, size = 0, 1
         with archive.open("wb") as file:
             while offset < size:
                 try:
-                    piece = await self._fetch(bundle.sha256, offset)
+                    piece = await self._fetch(package.sha256, offset)
                 except ContentError as error:
                     advice = "; push it again: rce package push" if error.missing else ""
                     raise Unfetched(f"it cannot be fetched: {error}{advice}") from error
@@ -150,19 +150,19 @@ class BundleCache:
                     raise Unverified(f"it has more than {self._limits.archive} bytes")
                 digest.update(piece.data)
                 await in_thread(file.write, piece.data)
-        if digest.hexdigest() != bundle.sha256:
+        if digest.hexdigest() != package.sha256:
             raise Unverified(
                 "what the master handed out is not what was signed; push it again: rce package push"
             )
 
-    def _unpack(self, bundle: BundleSpec, archive: Path, tree: Path) -> int:
+    def _unpack(self, package: PackageSpec, archive: Path, tree: Path) -> int:
         tree.mkdir(mode=0o755)
         with archive.open("rb") as file:
             try:
                 found, _ = unpack(file, tree, self._limits)
-            except BundleError as error:
+            except ArchiveError as error:
                 raise Unverified(f"its archive cannot be unpacked: {error}") from error
-        if found.name != bundle.name:
+        if found.name != package.name:
             raise Unverified(f"its archive holds the package {found.name!r}")
         return found.size
 
@@ -176,18 +176,18 @@ class BundleCache:
                 await in_thread(remove, self._folder / sha256)
 
 
-def trouble_of(error: OSError) -> BundleTrouble:
+def trouble_of(error: OSError) -> PackageTrouble:
     """Say in words for the owner what a disk's error means."""
     if error.errno in _FULL:
         return NoSpace("the disk of the container's machine is full; tell its operator")
     return NoSpace(f"the container's machine cannot keep it: {error.strerror or error}; tell its operator")
 
 
-def _check_signature(user: str, bundle: BundleSpec) -> None:
-    signed = statement(user, bundle.name, bundle.version, bundle.sha256)
+def _check_signature(user: str, package: PackageSpec) -> None:
+    signed = statement(user, package.name, package.version, package.sha256)
     try:
-        verify(bundle.key, bundle.signature, signed)
-    except BundleError as error:
+        verify(package.key, package.signature, signed)
+    except ArchiveError as error:
         raise Unverified(f"{error}; push it again: rce package push") from error
 
 

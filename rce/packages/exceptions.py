@@ -1,9 +1,9 @@
-"""What can be wrong with a bundle.
+"""What can be wrong with a package.
 
 ::
 
-    BundleError
-    +-- BadBundle        a folder or an archive cannot be one; each fault is told
+    ArchiveError
+    +-- BadArchive        a folder or an archive cannot be one; each fault is told
     +-- BadSignature     it is not what its owner signed
     +-- BadKey           a key cannot be read
 """
@@ -15,12 +15,12 @@ from collections.abc import Iterable
 _SHOWN = 20
 
 
-class BundleError(Exception):
-    """Base of all that can be wrong with a bundle."""
+class ArchiveError(Exception):
+    """Base of all that can be wrong with a package."""
 
 
-class BadBundle(BundleError):  # noqa: N818
-    """A folder or an archive cannot be a bundle.
+class BadArchive(ArchiveError):  # noqa: N818
+    """A folder or an archive cannot be a package.
 
     Attributes:
         faults: All that is wrong with it, each with its place and what to do.
@@ -35,9 +35,9 @@ class BadBundle(BundleError):  # noqa: N818
         return "; ".join(self.faults[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
 
 
-class BadSignature(BundleError):  # noqa: N818
-    """A bundle is not what the owner of a key signed."""
+class BadSignature(ArchiveError):  # noqa: N818
+    """A package is not what the owner of a key signed."""
 
 
-class BadKey(BundleError):  # noqa: N818
+class BadKey(ArchiveError):  # noqa: N818
     """A key cannot be read."""
