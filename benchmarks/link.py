@@ -22,16 +22,10 @@ from typing import cast
 
 import uvloop
 
-from rce.control.model import (
-    ConnectionSpec,
-    EndpointKind,
-    EndpointSpec,
-    InterfaceSpec,
-    LinkAddress,
-    LinkSpec,
-)
+from rce.control.model import ConnectionSpec, EndpointKind, EndpointSpec, LinkAddress, LinkSpec
 from rce.link import Endpoint, Interface, LinkHub, Port
-from rce.protocol.names import EndpointId
+from rce.model.names import EndpointId
+from rce.model.specs import InterfaceSpec
 
 SIZES = (100, 1_000, 10_000, 100_000, 1_000_000, 10_000_000)
 ENDS = (
@@ -92,7 +86,7 @@ def spec(side: int, address: LinkAddress) -> EndpointSpec:
         kind=EndpointKind.ROBOT,
         revision=1,
         interfaces=tuple(
-            InterfaceSpec(tag=f"i{n}", type=ends[side], cls="a/B") for n, ends in enumerate(ENDS, 1)
+            InterfaceSpec(tag=f"i{n}", type=ends[side], message_type="a/B") for n, ends in enumerate(ENDS, 1)
         ),
         links=(LinkSpec(id="L", peer=f"user/e{1 - side}", token="t", dial=side == 0, address=address),),
         connections=tuple(

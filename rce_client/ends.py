@@ -15,9 +15,9 @@ from abc import ABC, abstractmethod
 from collections import deque
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
+from rce.model.names import Form, InterfaceType, Role
 from rce.protocol.codec import encode, encode_data
 from rce.protocol.messages import NO_ID, LatchedSources
-from rce.protocol.names import Form, InterfaceType, Role
 from rce_client.exceptions import CallError, CallTimeoutError, InterfaceError, NotConnectedError
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ class End(ABC):
         """Tell whether a message that came before this end was made is for it."""
         return (
             self.role is Role.PUBLISHER
-            and message.type == self.cls
+            and message.message_type == self.cls
             and self.raw is isinstance(message.msg, bytes | bytearray | memoryview)
         )
 

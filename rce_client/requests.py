@@ -111,7 +111,7 @@ class Requests(ABC):
     async def add_interface(self, endpoint: str, tag: str, type: str, cls: str, *, addr: str = "") -> None:  # noqa: A002
         """Make an interface of a container or a robot; ``addr`` is its ROS name at a container's end."""
         interface = AddInterface(
-            endpoint_tag=endpoint, interface_tag=tag, interface_type=type, class_name=cls, addr=addr
+            endpoint_tag=endpoint, interface_tag=tag, interface_type=type, message_type=cls, addr=addr
         )
         await self.request(ConfigureComponents(add_interfaces=(interface,)))
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import msgspec
 from msgspec import Struct
 
-from rce.protocol.names import EndpointId
+from rce.model.names import EndpointId
 from rce_container.exceptions import StateError
 from rce_container.logs import last_line
 from rce_container.trees import remove, size_of

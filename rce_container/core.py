@@ -13,7 +13,8 @@ import msgspec
 
 from rce.aio.backoff import Backoff
 from rce.control.messages import Fault, Gone, Status
-from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress, Resources
+from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress
+from rce.model.specs import Resources
 from rce_container.events import (
     Adopted,
     Apply,

@@ -17,7 +17,7 @@ from rce.control.execution import Command
 from rce.control.model import EndpointSpec, EndpointStatus, LinkAddress, NodeStatus
 from rce.link.handover import HandoverSender, LinkAcceptor
 from rce.link.tasks import TaskScope
-from rce.protocol.names import EndpointId
+from rce.model.names import EndpointId
 from rce_container import events, intake
 from rce_container.archive import LogArchive
 from rce_container.dial import dial

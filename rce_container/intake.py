@@ -16,7 +16,7 @@ from msgspec.structs import asdict, replace
 
 from rce.control.model import EndpointState, EndpointStatus, InterfaceUsage, LinkAddress, NodeStatus
 from rce.control.tags import Unknown
-from rce.protocol.names import is_name
+from rce.model.names import is_name
 from rce.protocol.printable import one_line
 from rce_container.environment import messages as m
 

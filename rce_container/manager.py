@@ -30,7 +30,7 @@ from rce.control.messages import (
 )
 from rce.control.model import EndpointStatus, LinkAddress
 from rce.control.usage import cpu_seconds, resident_bytes
-from rce.protocol.names import EndpointId
+from rce.model.names import EndpointId
 from rce_container import core, events
 from rce_container.environment import messages as m
 from rce_container.environment import proc

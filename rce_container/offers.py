@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from rce.control.model import Network
+from rce.model.specs import Network
 from rce_container.exceptions import NetworkError, RuntimeUnavailableError
 from rce_container.network import Networks
 from rce_container.runtimes.base import Runtime
@@ -21,7 +21,7 @@ class Offers(NamedTuple):
     runtimes: tuple[str, ...]
     """By name, the one of containers without an image first."""
     networks: tuple[str, ...]
-    """Values of :class:`rce.control.model.Network`."""
+    """Values of :class:`rce.model.specs.Network`."""
     detail: str
     """What is missing, in words; empty if nothing is."""
 

@@ -10,8 +10,8 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 from rce.control.limits import MEGABYTE, MIN_MEMORY
-from rce.control.model import Resources
-from rce.protocol.quantities import write_cores, write_memory
+from rce.model.quantities import write_cores, write_memory
+from rce.model.specs import Resources
 from rce_master.usage import STEP_S, WINDOW_S, rates_between
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce.protocol.quantities import read_cores, read_memory
+from rce.model.quantities import read_cores, read_memory
 from rce_master.exceptions import Invalid
 
 if TYPE_CHECKING:

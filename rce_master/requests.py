@@ -5,10 +5,10 @@ from __future__ import annotations
 from functools import singledispatch
 from typing import TYPE_CHECKING, Any
 
-from rce.control.model import InterfaceSpec, Network, NodeSpec, Resources, RestartPolicy
+from rce.model.quantities import read_bandwidth, read_cores, read_memory
+from rce.model.specs import InterfaceSpec, Network, NodeSpec, Resources, RestartPolicy
 from rce.protocol import messages
 from rce.protocol.exceptions import MessageError
-from rce.protocol.quantities import read_bandwidth, read_cores, read_memory
 from rce.protocol.reading import read_request
 from rce_master.state import commands
 
@@ -112,7 +112,7 @@ def _(item: messages.RemoveNode, user: str) -> commands.Request:
 @_command.register
 def _(item: messages.AddInterface, user: str) -> commands.Request:
     interface = InterfaceSpec(
-        tag=item.interface_tag, type=item.interface_type, cls=item.class_name, addr=item.addr
+        tag=item.interface_tag, type=item.interface_type, message_type=item.message_type, addr=item.addr
     )
     return commands.AddInterface(user=user, endpoint=item.endpoint_tag, interface=interface)
 

@@ -52,7 +52,7 @@ class Form(Protocol):
             UnreadableError: The payload is no such message.
         """
 
-    def pack(self, tag: str, cls: str, msg_id: str, msg: Any) -> Rendered:
+    def pack(self, tag: str, message_type: str, msg_id: str, msg: Any) -> Rendered:
         """Return the data message that carries what :meth:`show` returned."""
 
 
@@ -76,9 +76,9 @@ class ForwarderForm:
         """Return the payload."""
         return payload
 
-    def pack(self, tag: str, cls: str, msg_id: str, msg: Buffer) -> Serialized:
+    def pack(self, tag: str, message_type: str, msg_id: str, msg: Buffer) -> Serialized:
         """Put names beside the payload, which is not copied."""
-        names = b'"iTag":"%b","type":"%b","msgID":%b' % (tag.encode(), cls.encode(), _json(msg_id))
+        names = b'"iTag":"%b","type":"%b","msgID":%b' % (tag.encode(), message_type.encode(), _json(msg_id))
         return Serialized(names, msg)
 
 
@@ -115,15 +115,15 @@ class ConverterForm:
         """Make an object of the payload."""
         return self._converter.encode(payload)
 
-    def pack(self, tag: str, cls: str, msg_id: str, msg: Any) -> Outgoing:
+    def pack(self, tag: str, message_type: str, msg_id: str, msg: Any) -> Outgoing:
         """Write the object as JSON."""
         if self._is_plain:  # no search for binary values, and no way through a str
-            names = (tag.encode(), cls.encode(), _json(msg_id))
+            names = (tag.encode(), message_type.encode(), _json(msg_id))
             packed = bytearray(b'{"type":"DM","data":{"iTag":"%b","type":"%b","msgID":%b,"msg":' % names)
             _json_into(msg, packed, -1)  # in place: a large message is not copied once more
             packed += b"}}"
             return Outgoing(packed)
-        text, *binaries = encode_data(tag, cls, msg, msg_id)
+        text, *binaries = encode_data(tag, message_type, msg, msg_id)
         assert isinstance(text, str)
         return Outgoing(text.encode(), tuple((b"", frame) for frame in binaries if isinstance(frame, bytes)))
 

@@ -10,9 +10,9 @@ from websockets.protocol import State
 
 from rce.guard.loop_share import LoopShare
 from rce.guard.proxies import TrustedProxies
+from rce.model.names import EndpointId
 from rce.protocol.exceptions import HandshakeError
 from rce.protocol.http import FEATURES_HEADER, read_credentials, read_features
-from rce.protocol.names import EndpointId
 from rce_robot.session import Session
 from rce_robot.websocket import RobotSocket
 

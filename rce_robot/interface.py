@@ -126,7 +126,7 @@ class RobotInterface(Interface):
         self.form_in = form_in
         self.form_out = form_out
         self.tag = port.spec.tag
-        self.cls = port.spec.cls
+        self.message_type = port.spec.message_type
         self.offload = Offload(robot, port.spec)
         self.active = False
         self._warned: set[str] = set()
@@ -174,7 +174,7 @@ class RobotInterface(Interface):
 
     def pack(self, msg: Any, msg_id: str) -> Rendered:
         """Return the data message that carries ``msg`` to the robot."""
-        return self.form_out.pack(self.tag, self.cls, msg_id, msg)
+        return self.form_out.pack(self.tag, self.message_type, msg_id, msg)
 
     async def start(self) -> None:
         """Do nothing: a robot's interface can be used as soon as it is there."""

@@ -1,6 +1,6 @@
 """The robot's end of connections: four roles, each with messages as JSON objects or serialized.
 
-Roles are named from the engine's side (:class:`rce.protocol.names.Role`):
+Roles are named from the engine's side (:class:`rce.model.names.Role`):
 
 =================  ======================================  ==================================
 role               from the robot                          to the robot
@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce.protocol.names import Role
+from rce.model.names import Role
 from rce_robot.services import AnsweredByRobot, AskedByRobot
 from rce_robot.topics import FromRobot, ToRobot
 

@@ -16,19 +16,20 @@ import msgspec
 from rce.control.model import EndpointState, EndpointStatus, EndpointUsage
 from rce.guard.holdings import Holdings
 from rce.link import Endpoint, InterfaceError
+from rce.model.names import EndpointId, InterfaceType
 from rce.protocol.calls import call_at
 from rce.protocol.http import LATCH
-from rce.protocol.names import EndpointId, InterfaceType
 from rce_robot.exceptions import MisdirectedError
 from rce_robot.interfaces import make_interface
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
 
-    from rce.control.model import EndpointSpec, InterfaceSpec, LinkAddress
+    from rce.control.model import EndpointSpec, LinkAddress
     from rce.guard.budget import Ledger
     from rce.guard.holdings import Holding
     from rce.link import Interface, LinkHub, Port
+    from rce.model.specs import InterfaceSpec
     from rce.protocol.calls import CallId
     from rce.protocol.messages import DataMessage, Request
     from rce.protocol.stream import LargeData
@@ -199,9 +200,9 @@ class Namespace:
         if interface is None:
             name = call_at(message.i_tag, message.msg_id) or message.i_tag
             raise MisdirectedError(f"{name}: robot {self.id.tag} has no such interface")
-        if message.type != interface.cls:
+        if message.message_type != interface.message_type:
             name = call_at(message.i_tag, message.msg_id) or message.i_tag
-            problem = f"{name}: carries {interface.cls}, not {message.type}"
+            problem = f"{name}: carries {interface.message_type}, not {message.message_type}"
             interface.refused(message.msg_id, problem)
             raise MisdirectedError(problem)
         interface.take(message)
@@ -217,8 +218,8 @@ class Namespace:
         interface = self._interfaces.get(address.i_tag)
         if interface is None:
             raise MisdirectedError(f"{name}: robot {self.id.tag} has no such interface")
-        if address.type and address.type != interface.cls:
-            problem = f"carries {interface.cls}, not {address.type}"
+        if address.message_type and address.message_type != interface.message_type:
+            problem = f"carries {interface.message_type}, not {address.message_type}"
         elif not interface.form_in.readable:
             problem = "a Forwarder takes a serialized message as binary value 'msg*'"
         else:

@@ -13,7 +13,7 @@ from rce_robot.outgoing import Outgoing
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rce.control.model import InterfaceSpec
+    from rce.model.specs import InterfaceSpec
     from rce.protocol.stream import LargeData
     from rce_robot.conversion import Result
     from rce_robot.interface import RobotSide
@@ -50,8 +50,8 @@ class Offload:
         """Parse and serialize a message of which only the text is there. Does not raise."""
         job = ReadText(
             i_tag=large.address.i_tag,
-            type=large.address.type,
-            cls=self._spec.cls,
+            stated_type=large.address.message_type,
+            message_type=self._spec.message_type,
             interface_type=self._spec.type,
             ids=tuple(large.binaries),
         )
@@ -59,7 +59,9 @@ class Offload:
 
     async def read_value(self, packed: bytes) -> Read:
         """Serialize a message that :func:`pack_value` packed. Does not raise."""
-        return await self._read(ReadValue(cls=self._spec.cls, interface_type=self._spec.type), (packed,))
+        return await self._read(
+            ReadValue(message_type=self._spec.message_type, interface_type=self._spec.type), (packed,)
+        )
 
     async def show(self, payload: Buffer, msg_id: str) -> Outgoing:
         """Make the data message that carries a payload to the robot.
@@ -68,7 +70,7 @@ class Offload:
             UnreadableError: It is no message of the type, or cannot be shown.
         """
         spec = self._spec
-        job = Show(i_tag=spec.tag, cls=spec.cls, interface_type=spec.type, msg_id=msg_id)
+        job = Show(i_tag=spec.tag, message_type=spec.message_type, interface_type=spec.type, msg_id=msg_id)
         try:
             result, parts = await self._robot.convert(job, (payload,))
         except ConversionFailed as error:

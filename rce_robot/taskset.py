@@ -32,9 +32,9 @@ from rce.control.messages import (
 )
 from rce.control.usage import cpu_seconds, machine_memory, resident_bytes
 from rce.guard.budget import Ledger
+from rce.model.names import EndpointId
 from rce.protocol.exceptions import HandshakeError
 from rce.protocol.messages import type_of
-from rce.protocol.names import EndpointId
 from rce.ros.tcpros.allocator import give_back_free_memory
 from rce_robot.memory import UnusedMemory
 from rce_robot.namespace import Namespace

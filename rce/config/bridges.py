@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from rce.config.exceptions import Fault
-from rce.config.items import ClassName, Interface, Link, RosName
+from rce.config.items import Interface, Link, MessageTypeName, RosName
 from rce.config.validation import Strict
+from rce.model.names import MAX_NAME_LENGTH, Form, InterfaceType, Role, is_name
 from rce.protocol.messages import ROS_NAME_PATTERN
-from rce.protocol.names import MAX_NAME_LENGTH, Form, InterfaceType, Role, is_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -55,7 +55,7 @@ class Part(NamedTuple):
 
     name: str
     """Below the bridge's name; empty for the bridge itself."""
-    cls: str
+    message_type: str
     source: Role
     """The role of the interfaces at the bridge's first end; the others have its complement."""
     forward: bool = True
@@ -104,7 +104,7 @@ class Bridge(Strict):
     topic: RosName | None = None
     service: RosName | None = None
     action: RosName | None = None
-    type: ClassName | None = None
+    type: MessageTypeName | None = None
     """Of the messages, the service or the action; None: as the robot's graph has it."""
     source: EndText | None = Field(default=None, alias="from")
     """Where a topic's messages come from."""
@@ -233,9 +233,10 @@ class Wiring:
         addr = "/".join(filter(None, (end.name or bridge.name, part.name)))
         for index, one in enumerate(self.interfaces):
             if one.endpoint == endpoint and one.kind.role is role and _same(one.addr, addr):
-                if one.cls != part.cls:
+                if one.message_type != part.message_type:
                     where = self.origins.get(("interfaces", index), f"interfaces[{index}]")
-                    problem = f"{endpoint}:{addr} carries {part.cls} here and {one.cls} in {where}"
+                    here, there = part.message_type, one.message_type
+                    problem = f"{endpoint}:{addr} carries {here} here and {there} in {where}"
                     self.faults.append(Fault(place, problem))
                 return one
         form = Form.INTERFACE if not on_robot else Form(bridge.form.capitalize())
@@ -244,7 +245,7 @@ class Wiring:
                 "eTag": endpoint,
                 "iTag": self._tag(endpoint, addr, role),
                 "iType": str(InterfaceType(role, form)),
-                "iCls": part.cls,
+                "iCls": part.message_type,
                 "addr": addr,
             }
         )

@@ -136,7 +136,7 @@ class ClientConfig(Strict):
                     endpoint_tag=item.endpoint,
                     interface_tag=item.tag,
                     interface_type=item.type,
-                    class_name=item.cls,
+                    message_type=item.message_type,
                     addr=item.addr,
                 )
                 for item in self.interfaces

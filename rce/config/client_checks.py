@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from rce.config.exceptions import Fault
+from rce.model.names import Form, Role, is_name
 from rce.protocol.container_checks import container_faults, find_circle
-from rce.protocol.names import Form, Role, is_name
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Iterator, Mapping
@@ -182,5 +182,5 @@ def _check_pair(place: str, a: Interface, b: Interface) -> Iterator[Fault]:
     if a.kind.role is not b.kind.role.complement:
         needed = a.kind.role.complement.value
         yield Fault(place, f"{a.path} is a {a.type} and needs a {needed}, but {b.path} is a {b.type}")
-    if a.cls != b.cls:
-        yield Fault(place, f"{a.path} carries {a.cls}, but {b.path} carries {b.cls}")
+    if a.message_type != b.message_type:
+        yield Fault(place, f"{a.path} carries {a.message_type}, but {b.path} carries {b.message_type}")

@@ -27,7 +27,7 @@ from msgspec.structs import fields as struct_fields
 
 from rce.config.documents import join
 from rce.config.exceptions import Fault
-from rce.protocol.quantities import read_cores, read_memory, write_memory
+from rce.model.quantities import read_cores, read_memory, write_memory
 
 _WORDS = {
     "int": "an integer",

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from rce.config.validation import Strict
+from rce.model.names import InterfaceType
+from rce.model.quantities import read_bandwidth, read_cores, read_memory
 from rce.protocol import messages
 from rce.protocol.messages import CHOICES, HUMAN_PATTERNS, AddNode, ContainerData
-from rce.protocol.names import InterfaceType
-from rce.protocol.quantities import read_bandwidth, read_cores, read_memory
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -76,7 +76,7 @@ Name = Annotated[str, _matches(messages.Name)]
 PackageName = Annotated[str, _matches(messages.PackageName)]
 Text = Annotated[str, _matches(messages.Text)]
 RosName = Annotated[str, _matches(messages.RosName)]
-ClassName = Annotated[str, _matches(messages.ClassName)]
+MessageTypeName = Annotated[str, _matches(messages.MessageTypeName)]
 InterfacePath = Annotated[str, _matches(messages.InterfacePath)]
 
 
@@ -173,7 +173,7 @@ class Interface(Strict):
     endpoint: Name = Field(alias="eTag")
     tag: Name = Field(alias="iTag")
     type: Annotated[str, AfterValidator(_check_type)] = Field(alias="iType")
-    cls: ClassName = Field(alias="iCls")
+    message_type: MessageTypeName = Field(alias="iCls")
     addr: Annotated[str, _matches(messages.OptionalRosName)] = ""
     """ROS name of the topic or service: in the container, or (Forwarders) in the robot's own graph."""
 

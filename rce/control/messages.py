@@ -55,7 +55,7 @@ class MachineInfo(Struct, frozen=True, kw_only=True, omit_defaults=True, tag_fie
     limits: str = ""
     """How limits are enforced: ``cgroup2``, ``cgroup1``, ``rlimit``; container task sets only."""
     networks: tuple[str, ...] = ("none",)
-    """The values of :class:`rce.control.model.Network` that containers can have here."""
+    """The values of :class:`rce.model.specs.Network` that containers can have here."""
     runtimes: tuple[str, ...] = ()
     """All runtimes that work here."""
     draining: bool = False

@@ -21,11 +21,12 @@ from rce.link.tasks import TaskScope
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from rce.control.model import ConnectionSpec, EndpointSpec, InterfaceSpec, InterfaceUsage, LinkSpec
+    from rce.control.model import ConnectionSpec, EndpointSpec, InterfaceUsage, LinkSpec
     from rce.link.carrier import Carrier
     from rce.link.hub import LinkHub
     from rce.link.interface import InterfaceFactory
-    from rce.protocol.names import EndpointId
+    from rce.model.names import EndpointId
+    from rce.model.specs import InterfaceSpec
 
 log = logging.getLogger(__name__)
 

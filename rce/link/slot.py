@@ -11,15 +11,15 @@ from rce.link.channel import as_payload
 from rce.link.exceptions import MessageTooLarge, NotConnected
 from rce.link.latch import HeardSources, LatchedMessages
 from rce.link.queues import Counters
-from rce.protocol.names import InterfaceType, Role
+from rce.model.names import InterfaceType, Role
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
-    from rce.control.model import InterfaceSpec
     from rce.link.channel import Channel
     from rce.link.interface import Buffer, Interface, InterfaceFactory
     from rce.link.settings import LinkLimits, LinkTimeouts
+    from rce.model.specs import InterfaceSpec
 
 log = logging.getLogger(__name__)
 

@@ -8,12 +8,12 @@ from typing import BinaryIO
 
 from msgspec import Struct
 
+from rce.model.names import is_name
 from rce.packages import requirements
 from rce.packages.archive import read_archive
 from rce.packages.exceptions import BadArchive
 from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
 from rce.packages.tree import Entry, Kind, Tree
-from rce.protocol.names import is_name
 from rce.ros.packages import FOLDERS, MANIFESTS, BadPackage, Package, parse_manifest
 
 _DEFINITIONS = ("msg", "srv", "action")

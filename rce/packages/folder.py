@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+from rce.model.names import is_version
 from rce.packages import ignore
 from rce.packages.archive import ArchiveWriter, make_header
 from rce.packages.contents import Contents, describe
@@ -15,7 +16,6 @@ from rce.packages.exceptions import BadArchive
 from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
 from rce.packages.requirements import FILE_NAME as REQUIREMENTS
 from rce.packages.tree import Entry, Kind, Tree, path_fault
-from rce.protocol.names import is_version
 from rce.ros.packages import MANIFESTS, BadPackage, parse_manifest
 
 _CHUNK = 1 << 16

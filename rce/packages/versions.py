@@ -21,7 +21,7 @@ def version_key(version: str) -> VersionKey:
     """Make a sort key: numbers count as numbers, and whatever has a label comes before all that have none.
 
     Args:
-        version: As :func:`rce.protocol.names.is_version` allows it.
+        version: As :func:`rce.model.names.is_version` allows it.
     """
     numbers, dash, label = version.partition("-")
     parts = [int(part) for part in numbers.split(".")]

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from rce.model.names import is_name
 from rce.protocol.limits import MAX_MESSAGE_ID_LENGTH
 from rce.protocol.messages import NO_ID
-from rce.protocol.names import is_name
 
 
 class CallId(NamedTuple):

@@ -55,20 +55,20 @@ def encode(message: ClientMessage) -> list[Frame]:
         TypeError: It holds something that JSON cannot express.
     """
     if isinstance(message, DataMessage):
-        return encode_data(message.i_tag, message.type, message.msg, message.msg_id, message.latch)
+        return encode_data(message.i_tag, message.message_type, message.msg, message.msg_id, message.latch)
     if isinstance(message, ErrorReport):
         return encode_message("ER", message.text)
     return encode_message(type_of(message), msgspec.to_builtins(message))
 
 
 def encode_data(
-    i_tag: str, type_: str, msg: Any, msg_id: str = NO_ID, latch: str = "", *, single: bool = False
+    i_tag: str, message_type: str, msg: Any, msg_id: str = NO_ID, latch: str = "", *, single: bool = False
 ) -> list[Frame]:
     """Write a data message.
 
     Args:
         i_tag: Interface tag; a name, so it needs no escapes.
-        type_: Message or service class.
+        message_type: Message or service type.
         msg: The message as a JSON object that may hold binary values, or as binary as a whole.
         msg_id: Echoed in the answer to a service request.
         latch: The source whose latched message it is; for peers that know of such only.
@@ -79,11 +79,13 @@ def encode_data(
     """
     if isinstance(msg, _BINARY):
         if single and len(msg) <= MAX_PAYLOAD:
-            return [encode_single(i_tag, type_, msg, msg_id, latch)]
+            return [encode_single(i_tag, message_type, msg, msg_id, latch)]
         id_ = next(_fresh_ids)
-        data = {"iTag": i_tag, "type": type_, "msgID": msg_id, **_latch(latch), "msg*": id_}
+        data = {"iTag": i_tag, "type": message_type, "msgID": msg_id, **_latch(latch), "msg*": id_}
         return [_encode({"type": "DM", "data": data}).decode(), b"".join((id_.encode(), msg))]
-    return encode_message("DM", {"iTag": i_tag, "type": type_, "msgID": msg_id, **_latch(latch), "msg": msg})
+    return encode_message(
+        "DM", {"iTag": i_tag, "type": message_type, "msgID": msg_id, **_latch(latch), "msg": msg}
+    )
 
 
 def _latch(source: str) -> dict[str, str]:

@@ -9,7 +9,7 @@ import ipaddress
 import re
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rce.protocol.quantities import read_bandwidth, read_cores, read_memory
+from rce.model.quantities import read_bandwidth, read_cores, read_memory
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence

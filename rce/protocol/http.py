@@ -14,8 +14,8 @@ from urllib.parse import parse_qs, parse_qsl
 
 import msgspec
 
+from rce.model.names import is_name
 from rce.protocol.exceptions import HandshakeError
-from rce.protocol.names import is_name
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

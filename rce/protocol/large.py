@@ -46,10 +46,12 @@ def read_large(
         assembler.add_binary(b"".join((id_.encode(), data)), 0.0)
     message = message_from_json(value, ("DM",))
     assert isinstance(message, DataMessage)
-    if message.i_tag != address.i_tag or (address.type and message.type != address.type):
+    if message.i_tag != address.i_tag or (
+        address.message_type and message.message_type != address.message_type
+    ):
         raise MessageError(
             "data",
             f"in a large message iTag and type must come before msg, or after it within the last 4096 bytes; "
-            f"found {address.i_tag!r} and {address.type!r} there",
+            f"found {address.i_tag!r} and {address.message_type!r} there",
         )
     return message

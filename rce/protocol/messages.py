@@ -11,22 +11,22 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from msgspec import Meta, Struct, field
 
-from rce.protocol.limits import MAX_MESSAGE_ID_LENGTH
-from rce.protocol.names import (
-    CLASS_PATTERN,
+from rce.model.names import (
     MAX_NAME_LENGTH,
     MAX_VERSION_LENGTH,
+    MESSAGE_TYPE_PATTERN,
     NAME_PATTERN,
     VERSION_PATTERN,
     Form,
     Role,
 )
+from rce.protocol.limits import MAX_MESSAGE_ID_LENGTH
 
 ROS_NAME_PATTERN = r"[~/]?[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*"
 """What a ROS topic, service, parameter or namespace may be called."""
 
 _TYPE_PATTERN = f"({'|'.join(r.value for r in Role)})({'|'.join(f.value for f in Form)})"
-# Grouped, so that it is another text than CLASS_PATTERN and has words of its own in HUMAN_PATTERNS.
+# Grouped, so that it is another text than MESSAGE_TYPE_PATTERN and has words of its own in HUMAN_PATTERNS.
 _INTERFACE_PATH_PATTERN = rf"({NAME_PATTERN})/({NAME_PATTERN})"
 _EXECUTABLE_PATTERN = r"(?!/)(?!(.*/)?\.\.(/|\Z))[^\x00-\x1f\x7f]+"
 
@@ -40,7 +40,7 @@ PackageName = Annotated[
     ),
 ]
 """A package, ``NAME``, or a version of one that a user brought, ``NAME@VERSION``."""
-ClassName = Annotated[str, Meta(pattern=rf"^{CLASS_PATTERN}\Z", max_length=2 * MAX_NAME_LENGTH)]
+MessageTypeName = Annotated[str, Meta(pattern=rf"^{MESSAGE_TYPE_PATTERN}\Z", max_length=2 * MAX_NAME_LENGTH)]
 """A message or service class, ``package/Type``."""
 TypeName = Annotated[str, Meta(pattern=rf"^{_TYPE_PATTERN}\Z")]
 """An interface type such as ``PublisherConverter``."""
@@ -64,7 +64,7 @@ SourceName = Annotated[str, Meta(max_length=MAX_SOURCE_LENGTH)]
 Text = Annotated[str, Meta(max_length=65536, pattern=r"^[^\x00]*\Z")]
 """Free text without a NUL, which no argument and no file name may hold."""
 Quantity: TypeAlias = int | float | Text
-"""An amount, as :mod:`rce.protocol.quantities` reads it."""
+"""An amount, as :mod:`rce.model.quantities` reads it."""
 NetworkName: TypeAlias = Literal["", "none", "group", "host"]
 """What a container sees of the network; empty for the default."""
 RestartName: TypeAlias = Literal["never", "on-failure", "always"]
@@ -85,7 +85,7 @@ HUMAN_PATTERNS: dict[str, str] = {
         "must be a package's name (letters, digits and '_', a letter first), or NAME@VERSION such as"
         " nav@1.2.0"
     ),
-    rf"^{CLASS_PATTERN}\Z": "must be a class of the form package/Type",
+    rf"^{MESSAGE_TYPE_PATTERN}\Z": "must be a class of the form package/Type",
     rf"^{_TYPE_PATTERN}\Z": (
         f"must be an interface type: one of {', '.join(r.value for r in Role)},"
         f" followed by one of {', '.join(f.value for f in Form)}"
@@ -206,7 +206,7 @@ class AddInterface(_Part, frozen=True, kw_only=True, omit_defaults=True, rename=
     endpoint_tag: Name
     interface_tag: Name
     interface_type: TypeName
-    class_name: ClassName
+    message_type: MessageTypeName = field(name="className")
     addr: OptionalRosName = ""
     """ROS name of the topic or service; container ends need it."""
 
@@ -266,7 +266,7 @@ class DataMessage(Struct, frozen=True, omit_defaults=False):
     """``DM``: a message on a topic, a service request or its answer, at one interface."""
 
     i_tag: Name = field(name="iTag")
-    type: ClassName
+    message_type: MessageTypeName = field(name="type")
     msg: Any
     """A JSON object, or bytes where the message travels serialized."""
     msg_id: MessageId = field(name="msgID", default=NO_ID)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, AnyStr, Literal, TypeVar
 import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 
+from rce.model.names import Form
 from rce.protocol.calls import text_id
 from rce.protocol.container_checks import container_faults, resize_faults
 from rce.protocol.exceptions import MessageError
@@ -25,7 +26,6 @@ from rce.protocol.messages import (
     TYPES,
     AddInterface,
     AddNode,
-    ClassName,
     ClientMessage,
     ConfigureComponents,
     ConfigureConnections,
@@ -35,6 +35,7 @@ from rce.protocol.messages import (
     DeleteParam,
     ErrorReport,
     MessageId,
+    MessageTypeName,
     Name,
     RemoveInterface,
     RemoveNode,
@@ -43,7 +44,6 @@ from rce.protocol.messages import (
     SetParam,
     SourceName,
 )
-from rce.protocol.names import Form
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -60,7 +60,7 @@ class SerializedData(Struct):
     """A data message that travels serialized, as its text frame tells it."""
 
     i_tag: Name = field(name="iTag")
-    type: ClassName
+    message_type: MessageTypeName = field(name="type")
     binary: Annotated[str, Meta(pattern=r"^[0-9A-Fa-f]{32}\Z")] = field(name="msg*")
     """The id of the binary frame."""
     msg_id: MessageId = field(name="msgID", default=NO_ID)

@@ -100,7 +100,7 @@ class _Serialized:
     def message(self) -> DataMessage:
         """Return the message with the bytes that were put into ``holder``."""
         data = self._data
-        return DataMessage(data.i_tag, data.type, self.holder[0], data.msg_id, data.latch)
+        return DataMessage(data.i_tag, data.message_type, self.holder[0], data.msg_id, data.latch)
 
 
 class _WaitingLarge:

@@ -35,7 +35,7 @@ _MAX_LIGHT = 12 << 20
 _EDGE = 4096
 """Where the small values of a large message are: before its one large value, or after it."""
 _TAG = re.compile(rb'"iTag"\s*:\s*"([^"\\]{1,256})"')
-_CLASS = re.compile(rb'"type"\s*:\s*"([^"\\]{1,256}/[^"\\]{1,256})"')
+_MESSAGE_TYPE = re.compile(rb'"type"\s*:\s*"([^"\\]{1,256}/[^"\\]{1,256})"')
 _MSG_ID = re.compile(rb'"msgID"\s*:\s*"?([^"\\,}]{1,255})')
 _LATCH = re.compile(rb'"latch"\s*:\s*"([^"\\]{1,64})"')
 _MSG = re.compile(rb'"msg\*?"\s*:')
@@ -46,7 +46,7 @@ class Address(NamedTuple):
     """Where a data message goes, as its text seems to tell."""
 
     i_tag: str
-    type: str = ""
+    message_type: str = ""
     """Empty if it was not found."""
     msg_id: str = NO_ID
     latch: str = ""
@@ -124,9 +124,9 @@ def find_address(text: bytes) -> Address | None:
     head, tail = text[:_EDGE], text[-_EDGE:]
     msg = _MSG.search(head)
     head = head[: msg.start()] if msg is not None else head
-    tag, type_, msg_id = (_find(pattern, head, tail) for pattern in (_TAG, _CLASS, _MSG_ID))
+    tag, message_type, msg_id = (_find(pattern, head, tail) for pattern in (_TAG, _MESSAGE_TYPE, _MSG_ID))
     latch = _find(_LATCH, head, b"")
-    return Address(tag, type_, msg_id or NO_ID, latch) if tag else None
+    return Address(tag, message_type, msg_id or NO_ID, latch) if tag else None
 
 
 def _find(pattern: re.Pattern[bytes], head: bytes, tail: bytes) -> str:

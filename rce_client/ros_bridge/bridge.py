@@ -7,7 +7,7 @@ import contextlib
 import itertools
 from typing import TYPE_CHECKING
 
-from rce.protocol.names import Role
+from rce.model.names import Role
 from rce.ros.errors import MasterError
 from rce.ros.node import Node
 
@@ -72,26 +72,26 @@ async def lay(span: Span, conn: Connection, node: Node) -> None:
     """Join one interface with its topic or service. Messages are passed on as they are."""
     match span.role:
         case Role.SUBSCRIBER:
-            uplink = Uplink(conn, await conn.publisher(span.tag, span.cls, raw=True))
-            await node.listen(span.addr, span.cls, uplink)
+            uplink = Uplink(conn, await conn.publisher(span.tag, span.message_type, raw=True))
+            await node.listen(span.addr, span.message_type, uplink)
         case Role.PUBLISHER:
-            publisher = await node.advertise(span.addr, span.cls)
+            publisher = await node.advertise(span.addr, span.message_type)
             downlink = Downlink(publisher)
-            await conn.subscriber(span.tag, span.cls, downlink.received, raw=True, latches=downlink)
+            await conn.subscriber(span.tag, span.message_type, downlink.received, raw=True, latches=downlink)
         case Role.SERVICE_PROVIDER:
-            client = await conn.service_client(span.tag, span.cls, raw=True)
+            client = await conn.service_client(span.tag, span.message_type, raw=True)
 
             async def ask_cloud(request: bytes) -> bytes:
                 return bytes(await client(request, timeout=CALL_TIMEOUT))
 
-            await node.advertise_service_serialized(span.addr, span.cls, ask_cloud)
+            await node.advertise_service_serialized(span.addr, span.message_type, ask_cloud)
         case Role.SERVICE_CLIENT:
-            service = node.service_client(span.addr, span.cls)
+            service = node.service_client(span.addr, span.message_type)
 
             async def ask_robot(request: bytes) -> bytes:
                 return bytes(await service.call_serialized(request, timeout=CALL_TIMEOUT))
 
-            await conn.service_provider(span.tag, span.cls, ask_robot, raw=True)
+            await conn.service_provider(span.tag, span.message_type, ask_robot, raw=True)
 
 
 class Uplink:

@@ -6,7 +6,7 @@ import json
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rce.config.documents import write_items
-from rce.protocol.names import Role
+from rce.model.names import Role
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -26,7 +26,7 @@ class Wire(NamedTuple):
     source_name: str
     target: str
     target_name: str
-    cls: str
+    message_type: str
     is_service: bool
 
 
@@ -41,7 +41,7 @@ def wires(config: ClientConfig) -> Iterator[Wire]:
         yield Wire(
             *_end(source, interfaces),
             *_end(target, interfaces),
-            known.cls if known else "?",
+            known.message_type if known else "?",
             known is not None and known.kind.role.is_service,
         )
 
@@ -71,7 +71,7 @@ def picture(config: ClientConfig) -> str:
             if wire.source == source:
                 arrow = "<->" if wire.is_service else "-->"
                 target = f"{wire.target} {wire.target_name}"
-                lines.append(f"  {wire.source_name:<{width}}  {arrow}  {target}  [{wire.cls}]")
+                lines.append(f"  {wire.source_name:<{width}}  {arrow}  {target}  [{wire.message_type}]")
     return "\n".join(lines)
 
 
@@ -88,6 +88,6 @@ def dot(config: ClientConfig) -> str:
         both = ", dir=both" if wire.is_service else ""
         same = wire.source_name == wire.target_name
         names = wire.source_name if same else f"{wire.source_name} to {wire.target_name}"
-        label = json.dumps(f"{names}\n{wire.cls}")
+        label = json.dumps(f"{names}\n{wire.message_type}")
         lines.append(f"  {json.dumps(wire.source)} -> {json.dumps(wire.target)} [label={label}{both}];")
     return "\n".join([*lines, "}"])

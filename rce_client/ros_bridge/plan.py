@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from rce.config.exceptions import ConfigError, Fault
+from rce.model.names import Form, InterfaceType, Role
 from rce.protocol.messages import ConfigureComponents
-from rce.protocol.names import Form, InterfaceType, Role
 from rce.ros.types import TypesError
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ class Span:
     tag: str
     role: Role
     """As the engine names it: a robot's sensor is a ``SUBSCRIBER``."""
-    cls: str
+    message_type: str
     addr: str
     """Topic or service in the robot's graph."""
 
@@ -39,7 +39,7 @@ class Span:
         return str(InterfaceType(self.role, Form.FORWARDER))
 
     def __str__(self) -> str:
-        return f"{self.tag}: {_WORDS[self.role].format(self.addr)}, {self.cls}"
+        return f"{self.tag}: {_WORDS[self.role].format(self.addr)}, {self.message_type}"
 
 
 _WORDS = {
@@ -68,7 +68,9 @@ class Plan:
 def make_plan(config: ClientConfig) -> Plan:
     """Plan the bridge of a robot."""
     spans = tuple(
-        Span(item.tag, item.kind.role, item.cls, item.addr) for item in config.robot_interfaces if item.addr
+        Span(item.tag, item.kind.role, item.message_type, item.addr)
+        for item in config.robot_interfaces
+        if item.addr
     )
     bridged = {span.tag for span in spans}
     requests = [_without(request, config.robot, bridged) for request in config.setup()]
@@ -98,9 +100,9 @@ def check(config: ClientConfig, types: TypeRegistry, source: str) -> None:
         place = f"interfaces[{index}]"
         try:
             if item.kind.role.is_service:
-                types.service(item.cls)
+                types.service(item.message_type)
             else:
-                types.message(item.cls)
+                types.message(item.message_type)
         except TypesError as error:
             faults.append(Fault(f"{place}.iCls", str(error)))
         role = item.kind.role

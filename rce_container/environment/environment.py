@@ -13,11 +13,12 @@ from pathlib import Path
 import msgspec
 
 from rce.control.execution import FEATURE as EXEC
-from rce.control.model import EndpointKind, EndpointSpec, EndpointState, EndpointStatus, InterfaceSpec
+from rce.control.model import EndpointKind, EndpointSpec, EndpointState, EndpointStatus
 from rce.control.tags import Unknown
 from rce.link import Endpoint, LinkHub
 from rce.link.handover import HandoverReceiver
-from rce.protocol.names import EndpointId
+from rce.model.names import EndpointId
+from rce.model.specs import InterfaceSpec
 from rce.ros.core import Core
 from rce.ros.core.events import Change
 from rce.ros.core.rosout import AGGREGATE

@@ -8,12 +8,12 @@ from collections.abc import Awaitable, Callable, Collection
 from typing import TYPE_CHECKING
 
 from rce.link import Buffer, CallError, Interface, InterfaceError, Port
-from rce.protocol.names import Form, InterfaceType, Role
+from rce.model.names import Form, InterfaceType, Role
 from rce.ros import names
 from rce.ros.errors import RosError
 
 if TYPE_CHECKING:
-    from rce.control.model import InterfaceSpec
+    from rce.model.specs import InterfaceSpec
     from rce.ros.node import Node, Publisher, Service, ServiceClient, Subscriber
     from rce.ros.types import TypeRegistry
 
@@ -55,7 +55,7 @@ class RosInterface(Interface):
         self.node = node
         self.readiness = readiness
         self.addr = names.resolve(port.spec.addr, node.name)
-        self.cls = port.spec.cls
+        self.message_type = port.spec.message_type
 
     async def start(self) -> None:
         """Take up the topic or service, and wait until a starting node did so too."""
@@ -76,7 +76,7 @@ class PublisherInterface(RosInterface):
 
     async def open(self) -> None:
         """Advertise the topic."""
-        self.publisher = await self.node.advertise(self.addr, self.cls)
+        self.publisher = await self.node.advertise(self.addr, self.message_type)
         await self.readiness.wait(self.publisher.wait_for_subscribers(1))
 
     def receive(self, payload: bytes, *, latched: bool) -> None:
@@ -113,7 +113,7 @@ class SubscriberInterface(RosInterface):
 
     async def open(self) -> None:
         """Subscribe to the topic."""
-        self.subscriber = await self.node.listen(self.addr, self.cls, self)
+        self.subscriber = await self.node.listen(self.addr, self.message_type, self)
 
     def received(self, payload: bytes) -> None:
         """Send a node's message."""
@@ -142,7 +142,7 @@ class ServiceClientInterface(RosInterface):
 
     async def open(self) -> None:
         """Look for the service."""
-        self.client = self.node.service_client(self.addr, self.cls)
+        self.client = self.node.service_client(self.addr, self.message_type)
         await self.readiness.wait(self.node.wait_for_service(self.addr))
 
     async def serve(self, payload: bytes) -> Buffer:
@@ -163,7 +163,7 @@ class ServiceProviderInterface(RosInterface):
 
     async def open(self) -> None:
         """Advertise the service."""
-        self.service = await self.node.advertise_service_serialized(self.addr, self.cls, self._ask)
+        self.service = await self.node.advertise_service_serialized(self.addr, self.message_type, self._ask)
 
     async def _ask(self, payload: bytes) -> bytes:
         try:
@@ -219,7 +219,7 @@ class InterfaceMaker:
         if not spec.addr or not names.is_graph_name(spec.addr):
             raise ValueError(f"addr {spec.addr!r} is no ROS name; give the topic or service it stands for")
         if kind.role.is_service:
-            self._types.service(spec.cls)
+            self._types.service(spec.message_type)
         else:
-            self._types.message(spec.cls)
+            self._types.message(spec.message_type)
         return _KINDS[kind.role]

@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import msgspec
 
-from rce.control.model import EndpointSpec, InterfaceSpec, NodeSpec, PackageSpec
+from rce.control.model import EndpointSpec, PackageSpec
+from rce.model.specs import InterfaceSpec, NodeSpec
 from rce.packages.versions import newest, split_package
 from rce.ros.packages import PATH_VARIABLES, PackageIndex
 
@@ -85,7 +86,7 @@ class UserPackages:
         kept = tuple(
             interface
             for interface in spec.interfaces
-            if interface in before or interface.cls.partition("/")[0] not in coming
+            if interface in before or interface.message_type.partition("/")[0] not in coming
         )
         tags = {interface.tag for interface in kept}
         connections = tuple(one for one in spec.connections if one.interface in tags)

@@ -10,7 +10,7 @@ from collections.abc import Collection, Mapping
 from typing import ClassVar, NamedTuple, Protocol
 
 from rce.control.limits import MEGABYTE, MIN_MEMORY
-from rce.control.model import Resources
+from rce.model.specs import Resources
 
 
 class Limits(NamedTuple):

@@ -12,7 +12,7 @@ from ipaddress import IPv4Interface
 from pathlib import Path
 from typing import NamedTuple
 
-from rce.protocol.names import EndpointId
+from rce.model.names import EndpointId
 from rce_container.exceptions import NetworkError
 from rce_container.folder import Record
 from rce_container.network.addresses import choose

@@ -45,7 +45,7 @@ class Order(NamedTuple):
     host_network: bool = False
     """Whether the container sees the machine's own network."""
     image: str = ""
-    """See :attr:`rce.control.model.Resources.image`."""
+    """See :attr:`rce.model.specs.Resources.image`."""
     switch: str = ""
     """A file of the network namespace that joins its group; it stays as long as the container."""
 

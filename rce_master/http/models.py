@@ -12,7 +12,7 @@ Scalar = bool | int | float | str
 Value = Scalar | list[Scalar]
 ROLES = "^(viewer|user|operator|admin)$"
 Amount = int | float | str
-"""An amount as :mod:`rce.protocol.quantities` reads it."""
+"""An amount as :mod:`rce.model.quantities` reads it."""
 
 
 class _In(Model):

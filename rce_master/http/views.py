@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rce.control.messages import Usage
-    from rce.control.model import Resources
+    from rce.model.specs import Resources
     from rce_master.state.records import Endpoint, Link, Robot, TaskSet, User
     from rce_master.state.tables import Tables
 
@@ -124,7 +124,7 @@ class Views:
                 endpoint=endpoint.tag,
                 tag=tag,
                 type=interface.type,
-                cls=interface.cls,
+                cls=interface.message_type,
                 addr=interface.addr,
                 active=active.get(tag, False),
                 **_counters(usage.get(tag, _NO_INTERFACE_USAGE)),

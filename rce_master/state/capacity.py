@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from rce.control.limits import MEGABYTE, MIN_MEMORY
 from rce.control.messages import TaskSetKind
-from rce.control.model import Network, Resources
+from rce.model.specs import Network, Resources
 from rce.protocol.container_checks import DEFAULT_PREFIX
 from rce_master.exceptions import Conflict, Forbidden, Invalid
 from rce_master.state import limits

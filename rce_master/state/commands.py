@@ -9,11 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
-from rce.control.model import Resources
+from rce.model.specs import Resources
 
 if TYPE_CHECKING:
     from rce.control.messages import Hello
-    from rce.control.model import EndpointStatus, InterfaceSpec, NodeSpec, ParameterValue
+    from rce.control.model import EndpointStatus
+    from rce.model.specs import InterfaceSpec, NodeSpec, ParameterValue
     from rce_master.state.records import KnownLogin, PackageKey, Token, User, UserPackage, UserRole
 
 

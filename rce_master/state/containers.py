@@ -7,15 +7,8 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from rce.control.model import (
-    EndpointState,
-    EndpointStatus,
-    LinkAddress,
-    NodeSpec,
-    NodeState,
-    NodeStatus,
-    ParameterValue,
-)
+from rce.control.model import EndpointState, EndpointStatus, LinkAddress, NodeState, NodeStatus
+from rce.model.specs import NodeSpec, ParameterValue
 from rce.protocol.container_checks import find_circle
 from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
 from rce_master.state import capacity, draining, endpoints, limits, packages, placing

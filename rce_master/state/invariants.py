@@ -6,7 +6,7 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from rce.control.messages import TaskSetKind
-from rce.protocol.names import EndpointId, Form, InterfaceType, Role
+from rce.model.names import EndpointId, Form, InterfaceType, Role
 from rce_master.state import endpoints
 from rce_master.state.lifecycle import RobotSession
 from rce_master.state.records import Container, ContainerLive, Endpoint, Link, Robot, RobotLive
@@ -83,7 +83,7 @@ def _check_link(tables: Tables, link: Link) -> None:
         one, other = a.interfaces[connection.interface_a], b.interfaces[connection.interface_b]
         roles = InterfaceType.parse(one.type).role, InterfaceType.parse(other.type).role
         assert roles[0].complement is roles[1], f"{link.id}/{id_}: roles do not complete each other"
-        assert one.cls == other.cls, f"{link.id}/{id_}: classes differ"
+        assert one.message_type == other.message_type, f"{link.id}/{id_}: classes differ"
 
 
 def _check_connections(tables: Tables) -> None:

@@ -8,14 +8,14 @@ from msgspec.structs import asdict, replace
 
 from rce.control.limits import MEGABYTE
 from rce.control.messages import TaskSetKind
-from rce.protocol.quantities import write_cores
+from rce.model.quantities import write_cores
 from rce_master.exceptions import LimitReached, NotFound
 from rce_master.state.records import UserLimits, UserRole
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rce.control.model import Resources
+    from rce.model.specs import Resources
     from rce_master.state.changes import Transaction
     from rce_master.state.commands import SetLimits
     from rce_master.state.settings import StateSettings

@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from rce.control.limits import MEGABYTE
-from rce.control.model import Network, Resources
-from rce.protocol.quantities import write_cores
+from rce.model.quantities import write_cores
+from rce.model.specs import Network, Resources
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

@@ -11,15 +11,8 @@ from typing import TypeAlias
 from msgspec import Struct
 
 from rce.control.messages import MachineInfo, TaskSetKind
-from rce.control.model import (
-    EndpointKind,
-    EndpointStatus,
-    InterfaceSpec,
-    LinkAddress,
-    NodeSpec,
-    ParameterValue,
-    Resources,
-)
+from rce.control.model import EndpointKind, EndpointStatus, LinkAddress
+from rce.model.specs import InterfaceSpec, NodeSpec, ParameterValue, Resources
 from rce_master.state.lifecycle import ContainerPhase, RobotSession
 
 

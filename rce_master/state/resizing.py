@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from msgspec.structs import replace
 
 from rce.control.limits import MEGABYTE
-from rce.control.model import Resources
-from rce.protocol.quantities import write_bandwidth, write_cores
+from rce.model.quantities import write_bandwidth, write_cores
+from rce.model.specs import Resources
 from rce_master.exceptions import NoRoom
 from rce_master.state import capacity, endpoints, placing
 from rce_master.state.containers import find

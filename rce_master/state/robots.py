@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from rce.control.messages import TaskSetKind
 from rce.control.model import EndpointState, EndpointStatus
-from rce.protocol.names import EndpointId
+from rce.model.names import EndpointId
 from rce_master.exceptions import Conflict, Forbidden, Invalid, LimitReached, NotFound
 from rce_master.state import endpoints
 from rce_master.state.lifecycle import RobotEvent, RobotSession, next_session

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce.control.model import ConnectionSpec, EndpointSpec, LinkAddress, LinkSpec, ParameterSpec
+from rce.control.model import ConnectionSpec, EndpointSpec, LinkAddress, LinkSpec
+from rce.model.specs import ParameterSpec
 from rce_master.state import endpoints, packages
 from rce_master.state.records import Container, Link
 

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from rce.protocol.names import Form, InterfaceType, Role
+from rce.model.names import Form, InterfaceType, Role
 from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
 from rce_master.state import endpoints
 from rce_master.state.records import Connection, Container, Endpoint, Link
 
 if TYPE_CHECKING:
-    from rce.control.model import InterfaceSpec
+    from rce.model.specs import InterfaceSpec
     from rce_master.state.changes import Transaction
     from rce_master.state.commands import AddInterface, Connect, Disconnect, RemoveInterface
 
@@ -139,8 +139,11 @@ def _check_pair(tx: Transaction, pair: _Pair) -> None:
             f"{path_a!r} is a {one.type} and {path_b!r} a {other.type}: they do not complete each other; "
             f"a {role_a.value} connects to a {role_a.complement.value}"
         )
-    if one.cls != other.cls:
-        raise Invalid(f"{path_a!r} has the class {one.cls} and {path_b!r} {other.cls}; they must be the same")
+    if one.message_type != other.message_type:
+        raise Invalid(
+            f"{path_a!r} has the class {one.message_type} and {path_b!r} {other.message_type}; "
+            "they must be the same"
+        )
     for endpoint, interface, role in ((pair.a, one, role_a), (pair.b, other, role_b)):
         _check_room(tx, endpoint, interface, role)
 

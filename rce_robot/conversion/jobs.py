@@ -25,9 +25,9 @@ class ReadText(msgspec.Struct, frozen=True, kw_only=True, tag_field="job", tag="
     """Parse a data message and serialize what it carries. Parts: the text, then its binary values."""
 
     i_tag: str
-    type: str
-    """As they were found in the text; ``type`` may be empty."""
-    cls: str
+    stated_type: str
+    """As they were found in the text; ``stated_type`` may be empty."""
+    message_type: str
     interface_type: str
     ids: tuple[str, ...] = ()
     """Of the binary values."""
@@ -36,7 +36,7 @@ class ReadText(msgspec.Struct, frozen=True, kw_only=True, tag_field="job", tag="
 class ReadValue(msgspec.Struct, frozen=True, kw_only=True, tag_field="job", tag="value"):
     """Serialize a message that was parsed already. Part: the value in MessagePack."""
 
-    cls: str
+    message_type: str
     interface_type: str
 
 
@@ -44,7 +44,7 @@ class Show(msgspec.Struct, frozen=True, kw_only=True, tag_field="job", tag="show
     """Make the data message that carries a payload to the robot. Part: the payload."""
 
     i_tag: str
-    cls: str
+    message_type: str
     interface_type: str
     msg_id: str
 

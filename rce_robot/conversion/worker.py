@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from rce.buffers import unfilled
-from rce.control.model import InterfaceSpec
 from rce.link import InterfaceError
+from rce.model.names import InterfaceType
+from rce.model.specs import InterfaceSpec
 from rce.protocol.exceptions import ProtocolError
 from rce.protocol.large import read_large
-from rce.protocol.names import InterfaceType
 from rce.protocol.weight import Address
 from rce.ros.packages import PackageIndex
 from rce.ros.tcpros.allocator import give_back_free_memory
@@ -75,11 +75,11 @@ class Worker:
 
     def _read_text(self, job: ReadText, parts: list[bytes]) -> tuple[Result, list[Buffer]]:
         binaries = dict(zip(job.ids, parts[1:], strict=True))
-        message = read_large(parts[0], binaries, Address(job.i_tag, job.type))
+        message = read_large(parts[0], binaries, Address(job.i_tag, job.stated_type))
         if isinstance(message, list):
             return Result(ids=tuple(message)), []
-        if message.type != job.cls:
-            raise UnreadableError(f"carries {job.cls}, not {message.type}")
+        if message.message_type != job.message_type:
+            raise UnreadableError(f"carries {job.message_type}, not {message.message_type}")
         if isinstance(message.msg, str):
             return Result(text=message.msg[:4096], msg_id=message.msg_id), []
         return self._read(job, message.msg, message.msg_id)
@@ -94,7 +94,7 @@ class Worker:
 
     def _show(self, job: Show, payload: bytes) -> tuple[Result, list[Buffer]]:
         form = self._forms(job)[1]
-        outgoing = form.pack(job.i_tag, job.cls, job.msg_id, form.show(payload))
+        outgoing = form.pack(job.i_tag, job.message_type, job.msg_id, form.show(payload))
         assert isinstance(outgoing, Outgoing)  # a Forwarder's payload is never heavy
         if len(outgoing.text) > MAX_TEXT:
             size = len(outgoing.text) >> 20
@@ -106,7 +106,9 @@ class Worker:
 
     def _forms(self, job: Job) -> tuple[Form, Form]:
         type_ = InterfaceType.parse(job.interface_type)
-        return self._factory.pair(InterfaceSpec(tag="", type=job.interface_type, cls=job.cls), type_)
+        return self._factory.pair(
+            InterfaceSpec(tag="", type=job.interface_type, message_type=job.message_type), type_
+        )
 
 
 def serve(sock: socket.socket, worker: Worker) -> None:

@@ -32,15 +32,14 @@ from rce.control.model import (
     EndpointKind,
     EndpointSpec,
     EndpointStatus,
-    InterfaceSpec,
     LinkAddress,
     LinkSpec,
-    NodeSpec,
     NodeState,
 )
 from rce.link import Buffer, Endpoint, Interface, LinkHub, Port
 from rce.link.handover import LinkAcceptor
-from rce.protocol.names import EndpointId
+from rce.model.names import EndpointId
+from rce.model.specs import InterfaceSpec, NodeSpec
 from rce_container.environment import proc
 from rce_container.folder import Record, StateFolder
 from rce_container.limits import choose_limiter
@@ -393,9 +392,11 @@ def wiring(peer: str, dial: LinkAddress | None, tags: list[str]) -> dict[str, An
 
 STRING = "std_msgs/String"
 ECHO_INTERFACES = (
-    InterfaceSpec(tag="req", type="PublisherInterface", cls=STRING, addr="stringEchoReq"),
-    InterfaceSpec(tag="resp", type="SubscriberInterface", cls=STRING, addr="stringEchoResp"),
-    InterfaceSpec(tag="srv", type="ServiceClientInterface", cls="Test/StringEcho", addr="stringEchoService"),
+    InterfaceSpec(tag="req", type="PublisherInterface", message_type=STRING, addr="stringEchoReq"),
+    InterfaceSpec(tag="resp", type="SubscriberInterface", message_type=STRING, addr="stringEchoResp"),
+    InterfaceSpec(
+        tag="srv", type="ServiceClientInterface", message_type="Test/StringEcho", addr="stringEchoService"
+    ),
 )
 
 
@@ -458,7 +459,9 @@ class Peer:
         id_: str = "user/box",
     ) -> None:
         """Connect to a container's interfaces."""
-        own = tuple(InterfaceSpec(tag=i.tag, type=COMPLEMENT[i.type], cls=i.cls) for i in interfaces)
+        own = tuple(
+            InterfaceSpec(tag=i.tag, type=COMPLEMENT[i.type], message_type=i.message_type) for i in interfaces
+        )
         await self.endpoint.apply(
             EndpointSpec(
                 id="user/robot",

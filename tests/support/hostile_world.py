@@ -27,8 +27,9 @@ from unittest import mock
 import msgspec
 
 from rce.control.messages import Fault, Put
-from rce.control.model import EndpointState, InterfaceSpec, LinkSpec, NodeSpec, NodeState, Resources
+from rce.control.model import EndpointState, LinkSpec, NodeState
 from rce.link import LinkError
+from rce.model.specs import InterfaceSpec, NodeSpec, Resources
 from rce_container.environment import proc
 from rce_container.seccomp.library import FilterUnavailableError
 from support.containers import ECHO, ECHO_INTERFACES, MACHINE, Machine, Peer, container, until
@@ -347,7 +348,9 @@ class Hunger:
         node = NodeSpec(tag="hog", pkg="hostile", exe="starve.py", args=thing)
         limits = Resources(memory=MEMORY_MB * MB, cpu=0 if thing == "processors" else 0.8)
         interfaces = (
-            InterfaceSpec(tag="flap", type="PublisherInterface", cls="std_msgs/String", addr="/flap"),
+            InterfaceSpec(
+                tag="flap", type="PublisherInterface", message_type="std_msgs/String", addr="/flap"
+            ),
         )
         parts: dict[str, Any] = {"resources": limits, "interfaces": interfaces, "peer": "user/robot"}
         await machine.put(self._id, **parts)

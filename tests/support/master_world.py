@@ -5,15 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, TaskSetKind
-from rce.control.model import (
-    EndpointSpec,
-    EndpointState,
-    EndpointStatus,
-    InterfaceSpec,
-    LinkAddress,
-    NodeSpec,
-    Resources,
-)
+from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress
+from rce.model.specs import InterfaceSpec, NodeSpec, Resources
 from rce_master.state import commands
 from rce_master.state.changes import Changes
 from rce_master.state.core import State
@@ -100,7 +93,7 @@ class World:
         endpoint, tag = path.split("/")
         if addr is None:
             addr = f"/{tag}" if type_.endswith("Interface") else ""
-        spec = InterfaceSpec(tag=tag, type=type_, cls=cls, addr=addr)
+        spec = InterfaceSpec(tag=tag, type=type_, message_type=cls, addr=addr)
         return self.do(commands.AddInterface(user=user, endpoint=endpoint, interface=spec))
 
     def node(self, container: str, tag: str, exe: str = "run.py") -> Changes:

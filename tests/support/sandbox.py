@@ -13,7 +13,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from rce.control.model import EndpointState, NodeSpec
+from rce.control.model import EndpointState
+from rce.model.specs import NodeSpec
 from rce_container.environment import proc
 from support.containers import Machine, until
 

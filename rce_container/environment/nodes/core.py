@@ -11,7 +11,8 @@ from collections.abc import Iterator, Mapping
 from itertools import count
 
 from rce.aio.backoff import Backoff
-from rce.control.model import NodeSpec, NodeState, NodeStatus
+from rce.control.model import NodeState, NodeStatus
+from rce.model.specs import NodeSpec
 from rce_container.environment.nodes.events import (
     Beat,
     Desire,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
-from rce.control.model import NodeSpec
+from rce.model.specs import NodeSpec
 from rce.ros import names
 from rce.ros.errors import RosError
 from rce.ros.node import Node, Subscriber

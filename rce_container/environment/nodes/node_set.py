@@ -8,7 +8,8 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 
-from rce.control.model import NodeSpec, NodeStatus
+from rce.control.model import NodeStatus
+from rce.model.specs import NodeSpec
 from rce_container.environment.logs.files import remove_log
 from rce_container.environment.logs.node_log import NodeLog
 from rce_container.environment.nodes import events as e

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 
-from rce.control.model import NodeSpec
+from rce.model.specs import NodeSpec
 
 
 class StartOrder:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from rce.control.model import NodeSpec, NodeState, NodeStatus, RestartPolicy
+from rce.control.model import NodeState, NodeStatus
+from rce.model.specs import NodeSpec, RestartPolicy
 from rce_container.environment.nodes.life import WITH_PROCESS
 
 WELL_S = 30.0

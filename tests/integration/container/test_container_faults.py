@@ -17,7 +17,8 @@ import pytest
 from support.containers import ECHO, Machine, until
 from support.leaks import footprint
 
-from rce.control.model import EndpointState, NodeSpec, NodeState, RestartPolicy
+from rce.control.model import EndpointState, NodeState
+from rce.model.specs import NodeSpec, RestartPolicy
 
 BOX = "user/box"
 MB = 1 << 20

@@ -14,7 +14,8 @@ import pytest
 from support.containers import Machine, program_of, until
 
 from rce.control.messages import Drop
-from rce.control.model import EndpointState, NodeSpec, NodeState, Resources
+from rce.control.model import EndpointState, NodeState
+from rce.model.specs import NodeSpec, Resources
 from rce_container.environment import proc
 from rce_container.folder import ContainerFolder
 from rce_container.incarnation import Incarnation

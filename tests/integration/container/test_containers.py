@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 from support.containers import ECHO, ECHO_INTERFACES, MACHINE, Machine, joined, until
 
-from rce.control.model import EndpointState, InterfaceSpec, LinkAddress, NodeSpec, NodeState, ParameterSpec
+from rce.control.model import EndpointState, LinkAddress, NodeState
+from rce.model.specs import InterfaceSpec, NodeSpec, ParameterSpec
 from rce.ros.types import TypeRegistry
 from rce_container.environment import proc
 from rce_container.runtimes.namespace import HOME
@@ -136,9 +137,11 @@ async def test_bad_wishes_are_told_and_spoil_nothing_else(machine: Machine) -> N
                 own("talk.py"),
             ),
             interfaces=(
-                InterfaceSpec(tag="bad", type="PublisherInterface", cls="none/Such", addr="x"),
-                InterfaceSpec(tag="conv", type="PublisherConverter", cls="std_msgs/String"),
-                InterfaceSpec(tag="good", type="PublisherInterface", cls="std_msgs/String", addr="y"),
+                InterfaceSpec(tag="bad", type="PublisherInterface", message_type="none/Such", addr="x"),
+                InterfaceSpec(tag="conv", type="PublisherConverter", message_type="std_msgs/String"),
+                InterfaceSpec(
+                    tag="good", type="PublisherInterface", message_type="std_msgs/String", addr="y"
+                ),
             ),
             parameters=(ParameterSpec(name="p", value="$(find nowhere)"),),
         )
@@ -274,9 +277,11 @@ async def test_a_namespace_hides_the_machine(machine: Machine, monkeypatch: pyte
 
 async def test_containers_talk_to_each_other(machine: Machine) -> None:
     """One dials the other, which a container without a network can do through its manager only."""
-    request = InterfaceSpec(tag="srv", type="ServiceProviderInterface", cls="Test/StringEcho", addr="far")
+    request = InterfaceSpec(
+        tag="srv", type="ServiceProviderInterface", message_type="Test/StringEcho", addr="far"
+    )
     answer = InterfaceSpec(
-        tag="srv", type="ServiceClientInterface", cls="Test/StringEcho", addr="stringEchoService"
+        tag="srv", type="ServiceClientInterface", message_type="Test/StringEcho", addr="stringEchoService"
     )
     async with machine.engine():
         await machine.put("user/far", nodes=(ECHO,), interfaces=(answer,), peer="user/box")

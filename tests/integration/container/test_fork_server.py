@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 from support.containers import ECHO, Machine, program_of, until
 
-from rce.control.model import EndpointState, NodeSpec, NodeState
+from rce.control.model import EndpointState, NodeState
+from rce.model.specs import NodeSpec
 from rce_container.environment import proc
 from rce_container.runtimes.held import HeldHandle
 from rce_container.runtimes.namespace import NamespaceRuntime

@@ -14,7 +14,8 @@ import pytest
 from support.containers import Machine, until
 
 from rce.control.messages import Fault
-from rce.control.model import EndpointState, Network, NodeSpec, NodeState, Resources
+from rce.control.model import EndpointState, NodeState
+from rce.model.specs import Network, NodeSpec, Resources
 from rce_container.exceptions import NetworkError
 from rce_container.network.namespaces import open_namespace
 

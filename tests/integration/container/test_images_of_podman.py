@@ -19,7 +19,8 @@ from support.containers import ECHO, ECHO_INTERFACES, Machine, joined, program_o
 from support.rootfs import image_of, make_rootfs
 
 from rce.control.messages import Fault
-from rce.control.model import EndpointState, Network, NodeSpec, NodeState, Resources
+from rce.control.model import EndpointState, NodeState
+from rce.model.specs import Network, NodeSpec, Resources
 from rce.ros.types import TypeRegistry
 from rce_container.environment import proc
 

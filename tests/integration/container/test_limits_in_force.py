@@ -13,7 +13,8 @@ import pytest
 from support.containers import Machine, until
 
 from rce.control.messages import Gone
-from rce.control.model import EndpointState, NodeSpec, NodeState, NodeUsage, Resources
+from rce.control.model import EndpointState, NodeState, NodeUsage
+from rce.model.specs import NodeSpec, Resources
 from rce_container.environment import proc
 from rce_container.folder import StateFolder
 from rce_container.limits import Limits, RlimitLimiter, choose_limiter

@@ -12,7 +12,8 @@ from support.containers import Machine, joined, until
 
 from rce.control.logs import LogLevel, LogQuery, LogStream
 from rce.control.messages import LogChunk, ReadLog, Status
-from rce.control.model import EndpointState, InterfaceSpec, NodeSpec, NodeState, RestartPolicy
+from rce.control.model import EndpointState, NodeState
+from rce.model.specs import InterfaceSpec, NodeSpec, RestartPolicy
 from rce.ros.types import TypeRegistry
 
 BOX = "user/box"
@@ -197,7 +198,9 @@ async def test_a_node_whose_heart_stops_is_restarted(machine: Machine) -> None:
 
 
 async def test_what_is_sent_when_st_is_true_is_heard_by_nodes_that_start_late(machine: Machine) -> None:
-    interface = InterfaceSpec(tag="req", type="PublisherInterface", cls="std_msgs/String", addr="late")
+    interface = InterfaceSpec(
+        tag="req", type="PublisherInterface", message_type="std_msgs/String", addr="late"
+    )
     async with machine.engine():
         await machine.put(
             BOX,

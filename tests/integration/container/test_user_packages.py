@@ -14,7 +14,8 @@ from support.containers import Machine, until
 from support.user_packages import pack, sign, write_package
 
 from rce.aio.backoff import Backoff
-from rce.control.model import InterfaceSpec, NodeSpec, NodeState, PackageSpec, ParameterSpec
+from rce.control.model import NodeState, PackageSpec
+from rce.model.specs import InterfaceSpec, NodeSpec, ParameterSpec
 from rce_container.packages.requirements import Installer, InstallerSettings
 
 BOX = "user/box"
@@ -123,8 +124,8 @@ async def test_interfaces_wait_for_types_of_a_package_that_is_still_to_come(shop
         archive = pack(shop.folder / "source" / "1.0" / "Box")
         box = sign(archive, "Box", "1.0")
         interfaces = (
-            InterfaceSpec(tag="open", type="ServiceClientInterface", cls="Box/Open", addr="/open"),
-            InterfaceSpec(tag="say", type="PublisherInterface", cls="std_msgs/String", addr="/say"),
+            InterfaceSpec(tag="open", type="ServiceClientInterface", message_type="Box/Open", addr="/open"),
+            InterfaceSpec(tag="say", type="PublisherInterface", message_type="std_msgs/String", addr="/say"),
         )
         await shop.put(BOX, nodes=(node("Box"),), packages=(box,), interfaces=interfaces)
         await until(lambda: (status := shop.status(BOX)) and set(status.interfaces) == {"say"})

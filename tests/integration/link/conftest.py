@@ -13,17 +13,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rce.aio.backoff import Backoff
-from rce.control.model import (
-    ConnectionSpec,
-    EndpointKind,
-    EndpointSpec,
-    InterfaceSpec,
-    LinkAddress,
-    LinkSpec,
-)
+from rce.control.model import ConnectionSpec, EndpointKind, EndpointSpec, LinkAddress, LinkSpec
 from rce.link import Endpoint, Interface, InterfaceError, LinkHub, LinkLimits, LinkTimeouts, PeerFault
 from rce.link.handover import HandoverReceiver, HandoverSender, LinkAcceptor
-from rce.protocol.names import EndpointId
+from rce.model.names import EndpointId
+from rce.model.specs import InterfaceSpec
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterator
@@ -153,7 +147,8 @@ class Party:
             interfaces=old.interfaces
             if interfaces is None
             else tuple(
-                InterfaceSpec(tag=t, type=k, cls="test/Any", addr=addr) for t, k in interfaces.items()
+                InterfaceSpec(tag=t, type=k, message_type="test/Any", addr=addr)
+                for t, k in interfaces.items()
             ),
             links=old.links if links is None else tuple(links),
             connections=old.connections if connections is None else tuple(connections),

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import msgspec
 import pytest
 
-from rce.control.model import ConnectionSpec, LinkSpec, Resources
+from rce.control.model import ConnectionSpec, LinkSpec
 from rce.link.frames import Frame, FrameType, encode
 from rce.link.socket_carrier import SocketCarrier
+from rce.model.specs import Resources
 
 if TYPE_CHECKING:
     from conftest import Party, Rig

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 from msgspec.structs import replace
 
-from rce.control.model import ConnectionSpec, InterfaceSpec, LinkSpec
+from rce.control.model import ConnectionSpec, LinkSpec
+from rce.model.specs import InterfaceSpec
 
 if TYPE_CHECKING:
     from .conftest import Rig
@@ -65,9 +66,9 @@ async def test_bad_interfaces_do_not_hurt_others(rig: Rig) -> None:
     await rig.join(a, b, [TOPIC_OUT])
     good = a.spec.interfaces
     bad = (
-        InterfaceSpec(tag="b1", type="SubscriberConverter", cls="a/B", addr="/unmakable"),
-        InterfaceSpec(tag="b2", type="SubscriberConverter", cls="a/B", addr="/bad"),
-        InterfaceSpec(tag="b3", type="Nonsense", cls="a/B"),
+        InterfaceSpec(tag="b1", type="SubscriberConverter", message_type="a/B", addr="/unmakable"),
+        InterfaceSpec(tag="b2", type="SubscriberConverter", message_type="a/B", addr="/bad"),
+        InterfaceSpec(tag="b3", type="Nonsense", message_type="a/B"),
     )
     stray = (
         ConnectionSpec(id=8, link="L", interface="nothing", peer_interface="x"),

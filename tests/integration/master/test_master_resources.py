@@ -13,15 +13,8 @@ from rich.console import Console
 from support.engine import until
 
 from rce.control.messages import Drop, Gone, MachineInfo, Put, TaskSetKind, Usage
-from rce.control.model import (
-    EndpointState,
-    EndpointStatus,
-    EndpointUsage,
-    NodeState,
-    NodeStatus,
-    NodeUsage,
-    RestartPolicy,
-)
+from rce.control.model import EndpointState, EndpointStatus, EndpointUsage, NodeState, NodeStatus, NodeUsage
+from rce.model.specs import RestartPolicy
 from rce_master.auth import client_digest
 from rce_master.cli import machines, top
 from rce_master.cli.client import ApiClient

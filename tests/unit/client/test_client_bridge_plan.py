@@ -9,8 +9,8 @@ import pytest
 
 from rce.config.client import ClientConfig, loads
 from rce.config.exceptions import ConfigError
+from rce.model.names import Role
 from rce.protocol.messages import ConfigureComponents, ConfigureConnections, CreateContainer
-from rce.protocol.names import Role
 from rce.ros.types import TypeRegistry
 from rce_client.ros_bridge.plan import check, make_plan
 

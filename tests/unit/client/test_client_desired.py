@@ -34,7 +34,7 @@ def components(**items: object) -> ConfigureComponents:
 
 def interface(endpoint: str, tag: str) -> AddInterface:
     return AddInterface(
-        endpoint_tag=endpoint, interface_tag=tag, interface_type="PublisherConverter", class_name="p/T"
+        endpoint_tag=endpoint, interface_tag=tag, interface_type="PublisherConverter", message_type="p/T"
     )
 
 

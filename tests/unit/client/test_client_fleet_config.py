@@ -8,7 +8,7 @@ import pytest
 
 from rce.config.client import ClientConfig, load, loads
 from rce.config.documents import write_items
-from rce.protocol.names import Role
+from rce.model.names import Role
 from rce_client.ros_bridge.explain import wires
 from rce_fleet.wiring import Account, fleet_config, robot_config
 
@@ -67,6 +67,6 @@ def test_every_interface_is_connected_with_its_complement() -> None:
     for link in config.connections:
         a, b = interfaces[link.a], interfaces[link.b]
         assert (a.kind.role, b.kind.role) == (Role.SUBSCRIBER, Role.PUBLISHER)
-        assert a.cls == b.cls
+        assert a.message_type == b.message_type
         used |= {link.a, link.b}
     assert used == set(interfaces)

@@ -33,7 +33,7 @@ def faults(*bridges: dict[str, Any], **more: Any) -> list[str]:
 
 
 def interfaces(config: ClientConfig) -> dict[str, tuple[str, str, str]]:
-    return {one.path: (one.type, one.cls, one.addr) for one in config.interfaces}
+    return {one.path: (one.type, one.message_type, one.addr) for one in config.interfaces}
 
 
 def connections(config: ClientConfig) -> list[tuple[str, str]]:

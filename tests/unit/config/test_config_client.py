@@ -119,7 +119,7 @@ def test_setup_makes_containers_then_components_then_connections() -> None:
         endpoint_tag="testRobot_1",
         interface_tag="amclPoseSender_1",
         interface_type="SubscriberForwarder",
-        class_name="geometry_msgs/PoseWithCovarianceStamped",
+        message_type="geometry_msgs/PoseWithCovarianceStamped",
         addr="/amcl_pose",
     )
     assert connections == ConfigureConnections(

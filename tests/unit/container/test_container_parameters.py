@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rce.control.model import ParameterSpec
+from rce.model.specs import ParameterSpec
 from rce.ros.packages import PackageIndex
 from rce_container.environment.parameters import difference, evaluate_all
 

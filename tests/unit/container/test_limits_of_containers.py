@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 import pytest
 
-from rce.control.model import Resources
+from rce.model.specs import Resources
 from rce_container.exceptions import LimitError
 from rce_container.limits import ControlGroup, ControlGroupUsage, Limits, RlimitLimiter, limits_of
 from rce_container.limits.base import Troubles, in_megabytes

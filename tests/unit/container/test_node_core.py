@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce.control.model import NodeSpec, NodeState, NodeStatus, RestartPolicy
+from rce.control.model import NodeState, NodeStatus
+from rce.model.specs import NodeSpec, RestartPolicy
 from rce_container.environment.nodes import events as e
 from rce_container.environment.nodes.core import FIRST_BEAT_WITHIN_S, NodesCore
 from rce_container.environment.nodes.life import NEXT, WITH_PROCESS, LifeEvent, after

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rce.control.model import NodeSpec
+from rce.model.specs import NodeSpec
 from rce.ros.packages import PackageIndex
 from rce_container.environment.exceptions import NodeError
 from rce_container.environment.nodes import system

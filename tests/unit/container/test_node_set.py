@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from rce.control.model import NodeSpec, NodeState
+from rce.control.model import NodeState
+from rce.model.specs import NodeSpec
 from rce_container.environment.exceptions import NodeError
 from rce_container.environment.nodes import node_set
 from rce_container.environment.nodes.node_life import NodeContext

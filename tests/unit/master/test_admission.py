@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 from support.master_world import World
 
-from rce.control.model import EndpointState, EndpointStatus, Network, NodeSpec
+from rce.control.model import EndpointState, EndpointStatus
+from rce.model.specs import Network, NodeSpec
 from rce_master.exceptions import Conflict, Forbidden, Invalid, LimitReached, NoRoom
 from rce_master.state import commands, placing
 from rce_master.state.records import UserRole

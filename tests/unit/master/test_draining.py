@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 from support.master_world import World
 
-from rce.control.model import EndpointState, EndpointStatus, LinkAddress, Network, NodeState, NodeStatus
+from rce.control.model import EndpointState, EndpointStatus, LinkAddress, NodeState, NodeStatus
+from rce.model.specs import Network
 from rce_master.exceptions import NoRoom, NotFound
 from rce_master.state import commands
 from rce_master.state.changes import Changes

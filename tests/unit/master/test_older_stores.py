@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rce.control.model import Network, RestartPolicy
+from rce.model.specs import Network, RestartPolicy
 from rce_master.state.core import State
 
 # As the first release wrote them.

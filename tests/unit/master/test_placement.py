@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rce.control.messages import MachineInfo
-from rce.control.model import Network, Resources
+from rce.model.specs import Network, Resources
 from rce_master.state.placement import DETOUR, Room, choose, refusals
 
 MB = 1 << 20

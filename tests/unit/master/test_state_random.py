@@ -8,15 +8,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, TaskSetKind
-from rce.control.model import (
-    EndpointState,
-    EndpointStatus,
-    InterfaceSpec,
-    LinkAddress,
-    Network,
-    NodeSpec,
-    Resources,
-)
+from rce.control.model import EndpointState, EndpointStatus, LinkAddress
+from rce.model.specs import InterfaceSpec, Network, NodeSpec, Resources
 from rce_master.exceptions import Refused
 from rce_master.state import capacity, commands
 from rce_master.state.core import State
@@ -215,7 +208,7 @@ class Histories(RuleBasedStateMachine):
 
     @rule(user=USERS, tag=TAGS, interface=INTERFACES, type_=TYPES)
     def add_interface(self, user: str, tag: str, interface: str, type_: str) -> None:
-        spec = InterfaceSpec(tag=interface, type=type_, cls="p/T", addr="/x")
+        spec = InterfaceSpec(tag=interface, type=type_, message_type="p/T", addr="/x")
         self.do(commands.AddInterface(user=user, endpoint=tag, interface=spec))
 
     @rule(user=USERS, tag=TAGS, interface=INTERFACES)

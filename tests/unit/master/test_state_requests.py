@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from support.master_world import World
 
-from rce.control.model import ParameterSpec, ParameterValue
+from rce.model.specs import ParameterSpec, ParameterValue
 from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound, Refused
 from rce_master.state import commands
 from rce_master.state.records import UserRole

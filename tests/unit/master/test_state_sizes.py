@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from support.master_world import World
 
-from rce.control.model import InterfaceSpec, NodeSpec, ParameterValue
+from rce.model.specs import InterfaceSpec, NodeSpec, ParameterValue
 from rce_master.exceptions import LimitReached
 from rce_master.state import commands
 from rce_master.state.records import Container
@@ -59,7 +59,7 @@ def test_a_user_holds_so_much_in_all(world: World) -> None:
 def test_what_is_taken_out_counts_no_more(world: World) -> None:
     before = size(world)
     node = NodeSpec(tag="n", pkg="p", exe="e")
-    interface = InterfaceSpec(tag="i", type="PublisherInterface", cls="a/B", addr="/x")
+    interface = InterfaceSpec(tag="i", type="PublisherInterface", message_type="a/B", addr="/x")
     world.do(commands.AddNode(user="anna", container="c", node=node))
     world.do(commands.AddInterface(user="anna", endpoint="c", interface=interface))
     put(world, "a", 1)

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rce.control.messages import MachineInfo, Usage
-from rce.control.model import EndpointUsage, NodeUsage, Resources
+from rce.control.model import EndpointUsage, NodeUsage
+from rce.model.specs import Resources
 from rce_master.advice import Advice, for_container, for_machine
 from rce_master.state.placement import Room
 from rce_master.usage import STEP_S, WINDOW_S, History, UsageBook

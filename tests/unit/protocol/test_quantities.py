@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce.protocol.quantities import (
+from rce.model.quantities import (
     MAX_BANDWIDTH,
     MAX_CORES,
     MAX_MEMORY,

@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rce.model.names import MAX_NAME_LENGTH
 from rce.protocol.codec import encode_data
 from rce.protocol.http import FEATURES, read_features
 from rce.protocol.limits import DEFAULT_LIMITS, MAX_MESSAGE_ID_LENGTH, Limits
 from rce.protocol.messages import NO_ID, DataMessage
-from rce.protocol.names import MAX_NAME_LENGTH
 from rce.protocol.single import MARK, MAX_HEADER, MAX_PAYLOAD
 from rce.protocol.stream import Event, Fault, ProtocolStream
 
@@ -57,7 +57,7 @@ def test_message_makes_the_round_trip(
             assert isinstance(message.msg, memoryview)
             assert message.msg.obj is frame
             assert bytes(message.msg) == payload
-            told = (message.i_tag, message.type, message.msg_id, message.latch)
+            told = (message.i_tag, message.message_type, message.msg_id, message.latch)
             assert told == (tag, f"{package}/Type", msg_id, latch)
 
 
@@ -169,7 +169,7 @@ def test_example_of_the_page_is_such_a_frame() -> None:
     rows = [re.sub(r"\s*\|.*", "", row) for row in block.splitlines()]
     message = feed(bytes.fromhex("".join(rows)))
     assert isinstance(message, DataMessage)
-    assert (message.i_tag, message.type, bytes(message.msg)) == (
+    assert (message.i_tag, message.message_type, bytes(message.msg)) == (
         "say",
         "std_msgs/String",
         b"\x05\0\0\0hello",

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from rce.control.model import InterfaceSpec
 from rce.guard.holdings import Holding, Holdings
 from rce.link import CallTimeout, InterfaceError, NotConnected, Overloaded, PeerFault, PeerLost
+from rce.model.names import InterfaceType
+from rce.model.specs import InterfaceSpec
 from rce.protocol.messages import DataMessage
-from rce.protocol.names import InterfaceType
 from rce.protocol.stream import LargeData
 from rce.protocol.weight import Address
 from rce.ros.types import TypeRegistry
@@ -37,7 +37,7 @@ WORKER = Worker(FormFactory(TypeRegistry()), 1 << 30)
 
 class FakePort:
     def __init__(self, type_: str, cls: str) -> None:
-        self.spec = InterfaceSpec(tag="tag", type=type_, cls=cls)
+        self.spec = InterfaceSpec(tag="tag", type=type_, message_type=cls)
         self.sent: list[bytes] = []
         self.latched: dict[str, bytes] = {}
         self.answer: bytes | Exception | asyncio.Future[bytes] = b""
@@ -139,7 +139,9 @@ class Setup:
         self.interface = make_interface(kind.role, self.port, self.robot, *forms, call_timeout=call_timeout)
 
     def take(self, msg: Any, msg_id: str = "nil") -> None:
-        self.interface.take(DataMessage(i_tag="tag", type=self.port.spec.cls, msg=msg, msg_id=msg_id))
+        self.interface.take(
+            DataMessage(i_tag="tag", message_type=self.port.spec.message_type, msg=msg, msg_id=msg_id)
+        )
 
 
 def shown(outgoing: Outgoing) -> Any:

@@ -12,8 +12,8 @@ from enum import Enum
 NAME_PATTERN = r"[A-Za-z][A-Za-z0-9_]*"
 """What a user, robot, container, node, interface or parameter segment may be called."""
 
-CLASS_PATTERN = rf"{NAME_PATTERN}/{NAME_PATTERN}"
-"""What a message or service class may be called: ``package/Type``."""
+MESSAGE_TYPE_PATTERN = rf"{NAME_PATTERN}/{NAME_PATTERN}"
+"""What a message or service type may be called: ``package/Type``."""
 
 VERSION_PATTERN = r"[0-9]{1,9}(\.[0-9]{1,9}){0,3}(-[0-9A-Za-z]+(\.[0-9A-Za-z]+)*)?"
 """What a package's version looks like: up to four numbers, and a label of what comes before a release."""
@@ -22,7 +22,7 @@ MAX_NAME_LENGTH = 128
 MAX_VERSION_LENGTH = 64
 
 _NAME = re.compile(NAME_PATTERN)
-_CLASS = re.compile(CLASS_PATTERN)
+_MESSAGE_TYPE = re.compile(MESSAGE_TYPE_PATTERN)
 _VERSION = re.compile(VERSION_PATTERN)
 
 
@@ -31,9 +31,9 @@ def is_name(text: str) -> bool:
     return len(text) <= MAX_NAME_LENGTH and _NAME.fullmatch(text) is not None
 
 
-def is_class_name(text: str) -> bool:
-    """Tell whether ``text`` may name a message or service class (``std_msgs/String``)."""
-    return len(text) <= 2 * MAX_NAME_LENGTH and _CLASS.fullmatch(text) is not None
+def is_message_type(text: str) -> bool:
+    """Tell whether ``text`` may name a message or service type (``std_msgs/String``)."""
+    return len(text) <= 2 * MAX_NAME_LENGTH and _MESSAGE_TYPE.fullmatch(text) is not None
 
 
 def is_version(text: str) -> bool:
