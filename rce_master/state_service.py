@@ -11,16 +11,17 @@ from typing import TYPE_CHECKING
 from rce_master.exceptions import MasterError, Refused, StoreError
 from rce_master.state.changes import make_row
 from rce_master.state.core import State
+from rce_master.state.migration import conversion
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from rce.control.model import EndpointSpec
-    from rce_master.state.changes import Changes
+    from rce_master.state.changes import Changes, Touched
     from rce_master.state.commands import Command
     from rce_master.state.settings import StateSettings
     from rce_master.state.tables import Tables
-    from rce_master.store import Store
+    from rce_master.store import Snapshot, Store
 
 logger = logging.getLogger(__name__)
 
@@ -84,7 +85,7 @@ class StateService:
         """
         if revision is None:
             revision = time.time_ns() // 1_000_000
-        state = State.load(await store.load(), clock(), settings, revision=revision)
+        state = State.load(await load_converted(store), clock(), settings, revision=revision)
         return cls(state, store, clock)
 
     @property
@@ -209,10 +210,29 @@ class StateService:
                 job.done.set_result([outcome or error for outcome in job.outcomes])
 
 
+async def load_converted(store: Store) -> Snapshot:
+    """Read a store; one of the release before is converted in it, in one transaction.
+
+    Raises:
+        StoreError: It cannot be read or written.
+    """
+    snapshot = await store.load()
+    rows = conversion(snapshot)
+    if not rows:
+        return snapshot
+    logger.info("converting the store of an earlier release: %d records", len(rows))
+    await store.save(rows)
+    return await store.load()
+
+
 def _touch_once(done: Sequence[Changes]) -> None:
     """Leave each endpoint touched by the last of several changes only: its spec holds them all by now."""
-    later: set[str] = set()
+    later: dict[str, Touched] = {}
     for changes in reversed(done):
-        once = {id_: None for id_ in changes.touched if id_ not in later}
-        later.update(changes.touched)
+        once = {}
+        for id_, touched in changes.touched.items():
+            if id_ in later:
+                later[id_].include(touched)
+            else:
+                once[id_] = later[id_] = touched
         changes.touched = once

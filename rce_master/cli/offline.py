@@ -24,6 +24,7 @@ from rce_master.cli.exceptions import CliError, NotLoggedIn
 from rce_master.exceptions import StoreBusy
 from rce_master.settings import state_settings
 from rce_master.state.core import State
+from rce_master.state_service import load_converted
 from rce_master.store import SqliteStore
 
 if TYPE_CHECKING:
@@ -100,7 +101,7 @@ async def open_state(state_dir: Path) -> AsyncIterator[OfflineState]:
         raise CliError(f"{error}; to work over its API, log in there: rce login") from error
     audit = AuditLog(folder / "audit", time.time)
     try:
-        state = State.load(await store.load(), time.monotonic(), settings=settings)
+        state = State.load(await load_converted(store), time.monotonic(), settings=settings)
         yield OfflineState(state, store, audit, folder)
     finally:
         audit.close()

@@ -11,7 +11,8 @@ from rce_master.http.views import Views
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rce_master.state.records import Endpoint, Link
+    from rce_master.state.records import Endpoint
+    from rce_master.state.wiring_records import Link
 
 routes = RouteTable("fleet")
 

@@ -111,9 +111,9 @@ class EngineCollector(Collector):
         )
 
     def _connections(self) -> Iterator[Metric]:
-        shown = [c for link in self._tables.links for c in self._views.connections(link)]
-        established = sum(c.established for c in shown)
-        values = {"established": established, "waiting": len(shown) - established}
+        connections = self._tables.connections
+        established = sum(map(self._views.is_established, connections))
+        values = {"established": established, "waiting": len(connections) - established}
         yield _gauge("rce_connections", "Connections by state.", "state", values)
 
     def _task_sets(self) -> Iterator[Metric]:
@@ -165,7 +165,8 @@ class ConsumptionCollector(Collector):
             usage = self._usage_of(endpoint)
             if isinstance(endpoint, Container):
                 self._container(families, endpoint, usage)
-            for tag in endpoint.interfaces:
+            for interface in self._tables.interfaces.by("endpoint", endpoint.id):
+                tag = interface.spec.tag
                 _interface(families, endpoint.id, tag, usage.interfaces.get(tag))
         for room in capacity.rooms(self._tables, away=True).values():
             _machine(families, room)

@@ -8,14 +8,16 @@ from rce.control.model import EndpointUsage, InterfaceUsage, NodeStatus
 from rce_master.http import models
 from rce_master.state import capacity
 from rce_master.state.records import Container
+from rce_master.state.wiring_records import open_end_key
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rce.control.messages import Usage
     from rce.model.specs import Resources
-    from rce_master.state.records import Endpoint, Link, Robot, TaskSet, User
+    from rce_master.state.records import Endpoint, Robot, TaskSet, User
     from rce_master.state.tables import Tables
+    from rce_master.state.wiring_records import Connection, Link
 
 _NO_USAGE = EndpointUsage()
 _NO_INTERFACE_USAGE = InterfaceUsage()
@@ -52,7 +54,7 @@ class Views:
             state=self._tables.robot_live(robot.id).session.value,
             task_set=robot.task_set,
             revision=robot.revision,
-            interfaces=len(robot.interfaces),
+            interfaces=self._tables.interfaces.count("endpoint", robot.id),
         )
 
     def container(self, container: Container) -> models.ContainerOut:
@@ -71,7 +73,7 @@ class Views:
             revision=container.revision,
             incarnation=live.status.incarnation if live.status else "",
             nodes=len(container.nodes),
-            interfaces=len(container.interfaces),
+            interfaces=self._tables.interfaces.count("endpoint", container.id),
             cpu_s=usage.cpu_s,
             memory=usage.memory,
             wish=_requested(container.resources),
@@ -115,37 +117,34 @@ class Views:
 
     def interfaces(self, endpoint: Endpoint) -> list[models.InterfaceOut]:
         """Show the interfaces of a robot or container."""
-        status = self._tables.live[endpoint.id].status
-        active = status.interfaces if status else {}
         usage = self.usage_of(endpoint).interfaces
         return [
             models.InterfaceOut(
                 user=endpoint.user,
                 endpoint=endpoint.tag,
-                tag=tag,
-                type=interface.type,
-                cls=interface.message_type,
-                addr=interface.addr,
-                active=active.get(tag, False),
-                **_counters(usage.get(tag, _NO_INTERFACE_USAGE)),
+                tag=interface.spec.tag,
+                type=interface.spec.type,
+                cls=interface.spec.message_type,
+                addr=interface.spec.addr,
+                active=interface.id in self._tables.active,
+                **_counters(usage.get(interface.spec.tag, _NO_INTERFACE_USAGE)),
             )
-            for tag, interface in endpoint.interfaces.items()
+            for interface in self._tables.interfaces.by("endpoint", endpoint.id)
         ]
 
     def connections(self, link: Link) -> list[models.ConnectionOut]:
         """Show the connections of a link."""
         user, _, tag_a = link.a.partition("/")
         tag_b = link.b.partition("/")[2]
-        open_ = self._open(link.a) & self._open(link.b)
         return [
             models.ConnectionOut(
                 id=c.id,
                 user=user,
                 tag_a=f"{tag_a}/{c.interface_a}",
                 tag_b=f"{tag_b}/{c.interface_b}",
-                established=c.id in open_,
+                established=self.is_established(c),
             )
-            for c in link.connections.values()
+            for c in self._tables.connections.by("link", link.id)
         ]
 
     def machine(self, task_set: TaskSet) -> models.MachineOut:
@@ -198,9 +197,10 @@ class Views:
         usage = self._usage.get(endpoint.task_set)
         return usage.endpoints.get(endpoint.id, _NO_USAGE) if usage else _NO_USAGE
 
-    def _open(self, endpoint: str) -> set[int]:
-        status = self._tables.live[endpoint].status
-        return set(status.connections) if status else set()
+    def is_established(self, connection: Connection) -> bool:
+        """Tell whether both ends report a connection as established."""
+        ends = (open_end_key(endpoint, connection.id) for endpoint in (connection.a, connection.b))
+        return all(key in self._tables.open_ends for key in ends)
 
 
 def _requested(requested: Resources) -> models.RequestedOut:

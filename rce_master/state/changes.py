@@ -14,7 +14,6 @@ from rce_master.state.records import (
     Drain,
     Endpoint,
     KnownLogin,
-    Link,
     Move,
     PackageKey,
     Presence,
@@ -27,6 +26,7 @@ from rce_master.state.records import (
     UserLimits,
     UserPackage,
 )
+from rce_master.state.wiring_records import ActiveInterface, Connection, Interface, Link, OpenEnd
 from rce_master.store.base import Row
 
 if TYPE_CHECKING:
@@ -69,6 +69,30 @@ class StateEvent:
     text: str
 
 
+@dataclass(slots=True)
+class Touched:
+    """Which parts of an endpoint's spec changed; the tables tell what they are now, or that they are gone."""
+
+    since: int = 0
+    """The endpoint's revision before."""
+    contents: bool = False
+    """Whether it is (also) something else than interfaces, links and connections."""
+    interfaces: dict[str, None] = field(default_factory=dict)
+    """By tag."""
+    links: dict[str, None] = field(default_factory=dict)
+    """By id."""
+    connections: dict[int, None] = field(default_factory=dict)
+    """By id."""
+
+    def include(self, earlier: Touched) -> None:
+        """Include what changed before this."""
+        self.since = earlier.since
+        self.contents |= earlier.contents
+        self.interfaces = {**earlier.interfaces, **self.interfaces}
+        self.links = {**earlier.links, **self.links}
+        self.connections = {**earlier.connections, **self.connections}
+
+
 @dataclass(frozen=True, slots=True)
 class _Write:
     table: Table[Any]
@@ -80,8 +104,8 @@ class _Write:
 class Changes:
     """All that one command changed and that has to follow."""
 
-    touched: dict[str, None] = field(default_factory=dict)
-    """Ids of the endpoints whose spec changed and that are still desired."""
+    touched: dict[str, Touched] = field(default_factory=dict)
+    """What changed in the specs of endpoints that are still desired, by their ids."""
     withdrawals: list[Withdrawal] = field(default_factory=list)
     notices: list[Notice] = field(default_factory=list)
     events: list[StateEvent] = field(default_factory=list)
@@ -144,6 +168,11 @@ class Transaction:
         | PackageKey
         | UserPackage
         | Endpoint
+        | Interface
+        | Link
+        | Connection
+        | ActiveInterface
+        | OpenEnd
         | TaskSet
         | RobotLive
         | ContainerLive
@@ -155,15 +184,6 @@ class Transaction:
         """Write a record into its table."""
         self._assign(self._table_of(record), record)
 
-    def put_link(self, link: Link) -> None:
-        """Write a link; one without connections is removed. Both ends are touched."""
-        if link.connections:
-            self._assign(self.tables.links, link)
-        else:
-            self.delete(self.tables.links, link.id)
-        self.touch(link.a)
-        self.touch(link.b)
-
     def delete(self, table: Table[Any], key: str) -> None:
         """Remove a record if it is there."""
         if key in table:
@@ -171,8 +191,24 @@ class Transaction:
             table.assign(key, None)
 
     def touch(self, endpoint: str) -> None:
-        """Note that an endpoint's spec changed."""
-        self.changes.touched[endpoint] = None
+        """Note that an endpoint's spec changed in something else than interfaces, links and connections."""
+        self._touched(endpoint).contents = True
+
+    def touch_interface(self, endpoint: str, tag: str) -> None:
+        """Note that an endpoint got or lost an interface."""
+        self._touched(endpoint).interfaces[tag] = None
+
+    def touch_link(self, endpoint: str, link: str) -> None:
+        """Note that an endpoint's end of a link changed."""
+        self._touched(endpoint).links[link] = None
+
+    def touch_connection(self, connection: Connection) -> None:
+        """Note that two endpoints got or lost a connection."""
+        for endpoint in (connection.a, connection.b):
+            self._touched(endpoint).connections[connection.id] = None
+
+    def _touched(self, endpoint: str) -> Touched:
+        return self.changes.touched.setdefault(endpoint, Touched())
 
     def next_number(self, counter: str) -> int:
         """Take the next number of a counter."""
@@ -213,11 +249,12 @@ class Transaction:
         """Give every touched endpoint its new revision and hand out what was done."""
         touched = self.changes.touched
         self.changes.touched = {}
-        for id_ in touched:
+        for id_, parts in touched.items():
             endpoint = self.tables.endpoints.get(id_)
             if endpoint is not None:
+                parts.since = endpoint.revision
                 self.put(replace(endpoint, revision=self.next_number("revision")))
-                self.changes.touched[id_] = None
+                self.changes.touched[id_] = parts
         return self.changes
 
     def connected_task_sets(self, kind: TaskSetKind) -> Iterable[TaskSet]:
@@ -242,6 +279,11 @@ class Transaction:
             UserPackage: tables.packages,
             Robot: tables.endpoints,
             Container: tables.endpoints,
+            Interface: tables.interfaces,
+            Link: tables.links,
+            Connection: tables.connections,
+            ActiveInterface: tables.active,
+            OpenEnd: tables.open_ends,
             TaskSet: tables.task_sets,
             RobotLive: tables.live,
             ContainerLive: tables.live,

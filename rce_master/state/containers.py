@@ -11,7 +11,7 @@ from rce.control.model import EndpointState, EndpointStatus, LinkAddress, NodeSt
 from rce.model.specs import NodeSpec, ParameterValue
 from rce.protocol.container_checks import find_circle
 from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
-from rce_master.state import capacity, draining, endpoints, limits, packages, placing
+from rce_master.state import activity, capacity, draining, endpoints, limits, packages, placing
 from rce_master.state.lifecycle import ContainerEvent, ContainerPhase, next_phase
 from rce_master.state.records import Container, ContainerLive
 
@@ -190,7 +190,7 @@ def _unbind(tx: Transaction, container: Container, event: ContainerEvent) -> Non
     _move(tx, container, LinkAddress())
     tx.put(replace(tx.tables.endpoints[container.id], task_set=""))
     placing.happened(tx, container.id, event)
-    tx.put(replace(tx.tables.container_live(container.id), status=None))
+    _forget_status(tx, container)
 
 
 def missing(tx: Transaction, container: Container) -> None:
@@ -198,8 +198,13 @@ def missing(tx: Transaction, container: Container) -> None:
     live = tx.tables.container_live(container.id)
     if live.phase is not ContainerPhase.PLACED:
         placing.happened(tx, container.id, ContainerEvent.PLACE)
-    tx.put(replace(tx.tables.container_live(container.id), status=None))
+    _forget_status(tx, container)
     _move(tx, container, LinkAddress())
+
+
+def _forget_status(tx: Transaction, container: Container) -> None:
+    tx.put(replace(tx.tables.container_live(container.id), status=None))
+    activity.forget(tx, container.id)
 
 
 def reported(tx: Transaction, container: Container, status: EndpointStatus) -> None:
@@ -212,7 +217,8 @@ def reported(tx: Transaction, container: Container, status: EndpointStatus) -> N
     elif before.status and before.status.incarnation != status.incarnation:
         tx.happen("container_restarted", container.id, status.detail)
     _compare_nodes(tx, container.id, before.status, status)
-    tx.put(replace(tx.tables.container_live(container.id), status=status))
+    header = activity.note(tx, status)
+    tx.put(replace(tx.tables.container_live(container.id), status=header))
     _move(tx, container, status.address)
 
 

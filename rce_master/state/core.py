@@ -25,6 +25,7 @@ from rce_master.state import (
 )
 from rce_master.state.changes import Changes, Transaction
 from rce_master.state.invariants import validate
+from rce_master.state.migration import converted
 from rce_master.state.settings import StateSettings
 from rce_master.state.specs import build_spec
 from rce_master.state.tables import Tables
@@ -109,7 +110,8 @@ class State:
         """Go on from what the store holds.
 
         Args:
-            snapshot: What the store holds.
+            snapshot: What the store holds, of this release or the one before; a store that is written to
+                must be converted first (:func:`rce_master.state.migration.conversion`).
             now: Seconds of a clock that never goes back.
             settings: Limits and times.
             revision: Revisions go on above this, also if the store is an old copy. It must grow from one
@@ -121,6 +123,7 @@ class State:
         """
         state = cls(settings)
         try:
+            snapshot = converted(snapshot)
             for table in state.tables.all:
                 table.load(snapshot.get(table.name, {}))
         except msgspec.MsgspecError as error:

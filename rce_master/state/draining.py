@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from rce.control.messages import TaskSetKind
 from rce.control.model import EndpointState, EndpointStatus, NodeState
 from rce_master.exceptions import NotFound
-from rce_master.state import capacity, endpoints, placing
+from rce_master.state import activity, capacity, endpoints, placing
 from rce_master.state.lifecycle import ContainerEvent
 from rce_master.state.placement import Room, choose, refusals
 from rce_master.state.records import Container, Drain, Move, TaskSet, tombstone_key
@@ -192,7 +192,7 @@ def _switch(tx: Transaction, move: Move) -> None:
     tx.delete(tx.tables.moves, move.id)
     endpoints.withdraw(tx, container, "it was handed over to another machine")
     _settle(tx, container, move)
-    tx.put(replace(tx.tables.container_live(move.id), status=move.status))
+    tx.put(replace(tx.tables.container_live(move.id), status=activity.note(tx, move.status)))
     placing.happened(tx, move.id, _PHASES[move.status.state])
     tx.put(replace(tx.tables.endpoints[move.id], address=move.status.address))
     tx.happen("container_moved", move.id, f"from {container.task_set} to {move.to}")
@@ -220,6 +220,7 @@ def promote(tx: Transaction, container: Container) -> bool:
     tx.delete(tx.tables.moves, move.id)
     _settle(tx, container, move)
     tx.put(replace(tx.tables.container_live(move.id), status=None))
+    activity.forget(tx, move.id)
     tx.happen("container_moved", move.id, f"to {move.to}, before it was up there")
     return True
 

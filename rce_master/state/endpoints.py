@@ -5,15 +5,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import msgspec
-from msgspec.structs import replace
 
 from rce.control.model import EndpointKind, LinkAddress
 from rce_master.exceptions import LimitReached
-from rce_master.state.records import Container, Endpoint, Link, Robot, Tombstone
+from rce_master.state import activity
+from rce_master.state.records import Container, Endpoint, Robot, Tombstone
 
 if TYPE_CHECKING:
     from rce_master.state.changes import Transaction
     from rce_master.state.tables import Tables
+    from rce_master.state.wiring_records import Connection, Link
 
 _SMALL = 32 * 2**10
 """Endpoints up to this size are so small that their number limits them well enough."""
@@ -35,7 +36,8 @@ def grown(tx: Transaction, endpoint: Endpoint, part: object, instead_of: object 
     if size > settings.max_endpoint_bytes:
         raise LimitReached(f"{endpoint.tag!r} would hold more than {settings.max_endpoint_bytes} bytes")
     if size > _SMALL:
-        others = sum(e.size for e in tx.tables.endpoints.by("user", endpoint.user) if e.id != endpoint.id)
+        there = tx.tables.endpoints.get(endpoint.id)
+        others = tx.tables.endpoints.total(endpoint.user) - (there.size if there is not None else 0)
         if others + size > settings.max_user_bytes:
             raise LimitReached(
                 f"your robots and containers would hold more than {settings.max_user_bytes} bytes"
@@ -47,12 +49,25 @@ def remove(tx: Transaction, id_: str, reason: str) -> None:
     """Remove an endpoint with its links and have its task set drop it."""
     endpoint = tx.tables.endpoints[id_]
     drop_copy(tx, id_, reason)
-    for link in tx.tables.links.by("endpoint", id_):
-        tx.put_link(replace(link, connections={}))
+    for connection in tx.tables.connections.by("endpoint", id_):
+        remove_connection(tx, connection)
+    for interface in tx.tables.interfaces.by("endpoint", id_):
+        tx.delete(tx.tables.interfaces, interface.id)
+    activity.forget(tx, id_)
     tx.delete(tx.tables.endpoints, id_)
     tx.delete(tx.tables.live, id_)
     if endpoint.task_set:
         withdraw(tx, endpoint, reason)
+
+
+def remove_connection(tx: Transaction, connection: Connection) -> None:
+    """Remove a connection, and its link with the last one."""
+    tx.delete(tx.tables.connections, str(connection.id))
+    tx.touch_connection(connection)
+    if not tx.tables.connections.count("link", connection.link):
+        tx.delete(tx.tables.links, connection.link)
+        for endpoint in (connection.a, connection.b):
+            tx.touch_link(endpoint, connection.link)
 
 
 def withdraw(tx: Transaction, endpoint: Endpoint, reason: str) -> None:
@@ -97,7 +112,7 @@ def address(tables: Tables, id_: str) -> LinkAddress:
 
 
 def touch_dialers(tx: Transaction, id_: str) -> None:
-    """Touch all endpoints that dial this one: its address changed."""
+    """Touch the links of all endpoints that dial this one: its address changed."""
     for link in tx.tables.links.by("endpoint", id_):
         if not dials(tx.tables, link, id_):
-            tx.touch(link.peer(id_))
+            tx.touch_link(link.peer(id_), link.id)

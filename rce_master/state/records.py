@@ -12,7 +12,7 @@ from msgspec import Struct
 
 from rce.control.messages import MachineInfo, TaskSetKind
 from rce.control.model import EndpointKind, EndpointStatus, LinkAddress
-from rce.model.specs import InterfaceSpec, NodeSpec, ParameterValue, Resources
+from rce.model.specs import NodeSpec, ParameterValue, Resources
 from rce_master.state.lifecycle import ContainerPhase, RobotSession
 
 
@@ -174,8 +174,6 @@ class _Endpoint(Struct, frozen=True, kw_only=True):
     revision: int = 0
     task_set: str = ""
     """Process name of the task set that is responsible; empty: none."""
-    interfaces: dict[str, InterfaceSpec] = {}
-    """By tag."""
     size: int = 0
     """Bytes of all that its user put into it, as :func:`rce_master.state.endpoints.size_of` counts them."""
 
@@ -226,30 +224,6 @@ class Container(_Endpoint, frozen=True, kw_only=True, tag=True):
 
 
 Endpoint: TypeAlias = Robot | Container
-
-
-class Connection(Struct, frozen=True, kw_only=True):
-    """A connection of an interface of a link's endpoint ``a`` with one of its endpoint ``b``."""
-
-    id: int
-    interface_a: str
-    interface_b: str
-
-
-class Link(Struct, frozen=True, kw_only=True):
-    """What joins two endpoints of a user, or two interfaces of one; it is there while it has a connection."""
-
-    id: str
-    a: str
-    """Endpoint id; never the greater one of the two."""
-    b: str
-    token: str
-    connections: dict[int, Connection] = {}
-    """By id, which is the channel number."""
-
-    def peer(self, endpoint: str) -> str:
-        """Tell the other endpoint's id."""
-        return self.b if endpoint == self.a else self.a
 
 
 class TaskSet(Struct, frozen=True, kw_only=True):

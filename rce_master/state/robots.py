@@ -10,7 +10,7 @@ from rce.control.messages import TaskSetKind
 from rce.control.model import EndpointState, EndpointStatus
 from rce.model.names import EndpointId
 from rce_master.exceptions import Conflict, Forbidden, Invalid, LimitReached, NotFound
-from rce_master.state import endpoints
+from rce_master.state import activity, endpoints
 from rce_master.state.lifecycle import RobotEvent, RobotSession, next_session
 from rce_master.state.records import Robot, RobotLive
 
@@ -52,7 +52,7 @@ def login(tx: Transaction, command: RobotLogin) -> None:
 
 
 def _new(tx: Transaction, name: EndpointId) -> None:
-    if len(tx.tables.robots(name.user)) >= tx.settings.max_robots:
+    if tx.tables.endpoints.count("robots_of", name.user) >= tx.settings.max_robots:
         raise LimitReached(f"user {name.user!r} has {tx.settings.max_robots} robots already")
     tx.put(Robot(id=str(name)))
     tx.put(RobotLive(id=str(name), session=RobotSession.OFFLINE, since=tx.now))
@@ -78,6 +78,7 @@ def _enter(tx: Transaction, command: RobotLogin) -> None:
         endpoints.touch_dialers(tx, id_)
     tx.put(replace(robot, credential=command.credential))
     tx.put(replace(live, session=next_session(live.session, RobotEvent.LOGIN), since=tx.now, status=None))
+    activity.forget(tx, id_)
 
 
 def left(tx: Transaction, command: RobotLeft) -> None:
@@ -92,6 +93,7 @@ def leave(tx: Transaction, robot: Robot, reason: str) -> None:
     live = tx.tables.robot_live(robot.id)
     if live.session is RobotSession.CONNECTED:
         tx.put(replace(live, session=next_session(live.session, RobotEvent.LEAVE), since=tx.now, status=None))
+        activity.forget(tx, robot.id)
         tx.happen("robot_left", robot.id, reason)
 
 
@@ -117,7 +119,7 @@ def reported(tx: Transaction, robot: Robot, status: EndpointStatus) -> None:
             return
         leave(tx, robot, status.detail)
         live = tx.tables.robot_live(robot.id)
-    tx.put(replace(live, status=status))
+    tx.put(replace(live, status=activity.note(tx, status)))
 
 
 def expire(tx: Transaction) -> None:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 from rce.control.model import ConnectionSpec, EndpointSpec, LinkAddress, LinkSpec
 from rce.model.specs import ParameterSpec
 from rce_master.state import endpoints, packages
-from rce_master.state.records import Container, Link
+from rce_master.state.records import Container
+from rce_master.state.wiring_records import Connection, Link
 
 if TYPE_CHECKING:
     from rce_master.state.tables import Tables
@@ -27,9 +28,13 @@ def build_spec(tables: Tables, id_: str) -> EndpointSpec:
         id=id_,
         kind=endpoint.kind,
         revision=endpoint.revision,
-        interfaces=tuple(endpoint.interfaces.values()),
-        links=tuple(_link_spec(tables, link, id_) for link in links),
-        connections=tuple(spec for link in links for spec in _connection_specs(link, id_)),
+        interfaces=tuple(interface.spec for interface in tables.interfaces.by("endpoint", id_)),
+        links=tuple(link_spec(tables, link, id_) for link in links),
+        connections=tuple(
+            connection_spec(connection, id_)
+            for link in links
+            for connection in tables.connections.by("link", link.id)
+        ),
     )
     return _with_contents(tables, common, endpoint) if isinstance(endpoint, Container) else common
 
@@ -49,7 +54,8 @@ def _with_contents(tables: Tables, spec: EndpointSpec, container: Container) -> 
     )
 
 
-def _link_spec(tables: Tables, link: Link, id_: str) -> LinkSpec:
+def link_spec(tables: Tables, link: Link, id_: str) -> LinkSpec:
+    """Return one end of a link."""
     peer = link.peer(id_)
     dial = peer != id_ and endpoints.dials(tables, link, id_)
     return LinkSpec(
@@ -61,13 +67,12 @@ def _link_spec(tables: Tables, link: Link, id_: str) -> LinkSpec:
     )
 
 
-def _connection_specs(link: Link, id_: str) -> list[ConnectionSpec]:
-    return [
-        ConnectionSpec(
-            id=connection.id,
-            link=link.id,
-            interface=connection.interface_a if id_ == link.a else connection.interface_b,
-            peer_interface=connection.interface_b if id_ == link.a else connection.interface_a,
-        )
-        for _, connection in sorted(link.connections.items())
-    ]
+def connection_spec(connection: Connection, id_: str) -> ConnectionSpec:
+    """Return one end of a connection; of a link with one endpoint only, that of the link's end ``a``."""
+    is_a = id_ == connection.a
+    return ConnectionSpec(
+        id=connection.id,
+        link=connection.link,
+        interface=connection.interface_a if is_a else connection.interface_b,
+        peer_interface=connection.interface_b if is_a else connection.interface_a,
+    )

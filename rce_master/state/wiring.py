@@ -10,7 +10,8 @@ from msgspec.structs import replace
 from rce.model.names import Form, InterfaceType, Role
 from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
 from rce_master.state import endpoints
-from rce_master.state.records import Connection, Container, Endpoint, Link
+from rce_master.state.records import Container, Endpoint
+from rce_master.state.wiring_records import Connection, Interface, Link, interface_key
 
 if TYPE_CHECKING:
     from rce.model.specs import InterfaceSpec
@@ -22,18 +23,19 @@ def add_interface(tx: Transaction, command: AddInterface) -> None:
     """Make an interface; the same one again is accepted silently."""
     endpoint = _endpoint(tx, command.user, command.endpoint)
     interface = _checked(endpoint, command.interface)
-    there = endpoint.interfaces.get(interface.tag)
+    there = tx.tables.interface(endpoint.id, interface.tag)
     if there == interface:
         return
     if there is not None:
         raise Conflict(
             f"interface {_path(endpoint, interface.tag)!r} exists with other settings; remove it first"
         )
-    if len(endpoint.interfaces) >= tx.settings.max_interfaces:
+    if tx.tables.interfaces.count("endpoint", endpoint.id) >= tx.settings.max_interfaces:
         raise LimitReached(f"{endpoint.tag!r} has {tx.settings.max_interfaces} interfaces already")
     size = endpoints.grown(tx, endpoint, interface)
-    tx.put(replace(endpoint, interfaces={**endpoint.interfaces, interface.tag: interface}, size=size))
-    tx.touch(endpoint.id)
+    tx.put(replace(endpoint, size=size))
+    tx.put(Interface(endpoint=endpoint.id, number=tx.next_number("interface"), spec=interface))
+    tx.touch_interface(endpoint.id, interface.tag)
 
 
 def _checked(endpoint: Endpoint, interface: InterfaceSpec) -> InterfaceSpec:
@@ -62,44 +64,49 @@ def _checked(endpoint: Endpoint, interface: InterfaceSpec) -> InterfaceSpec:
 def remove_interface(tx: Transaction, command: RemoveInterface) -> None:
     """Remove an interface with its connections."""
     endpoint = _endpoint(tx, command.user, command.endpoint)
-    if command.tag not in endpoint.interfaces:
+    interface = tx.tables.interface(endpoint.id, command.tag)
+    if interface is None:
         raise NotFound(f"there is no interface {_path(endpoint, command.tag)!r}")
-    kept = {t: i for t, i in endpoint.interfaces.items() if t != command.tag}
-    size = endpoint.size - endpoints.size_of(endpoint.interfaces[command.tag])
-    tx.put(replace(endpoint, interfaces=kept, size=size))
-    tx.touch(endpoint.id)
-    for link in tx.tables.links.by("endpoint", endpoint.id):
-        rest = {
-            n: c for n, c in link.connections.items() if command.tag not in _ends_at(link, c, endpoint.id)
-        }
-        if len(rest) < len(link.connections):
-            tx.put_link(replace(link, connections=rest))
+    tx.put(replace(endpoint, size=endpoint.size - endpoints.size_of(interface)))
+    key = interface_key(endpoint.id, command.tag)
+    tx.delete(tx.tables.interfaces, key)
+    tx.touch_interface(endpoint.id, command.tag)
+    for connection in tx.tables.connections.by("end", key):
+        endpoints.remove_connection(tx, connection)
 
 
 def connect(tx: Transaction, command: Connect) -> None:
     """Join two interfaces; joined ones are accepted silently."""
     pair = _pair(tx, command.user, command.tag_a, command.tag_b)
     link = tx.tables.link_between(pair.a.id, pair.b.id)
-    if link is not None and _connection(link, pair) is not None:
+    if _connection(tx, pair) is not None:
         return
     _check_pair(tx, pair)
     if link is None:
         number = tx.next_number("link")
         link = Link(id=f"link{number}", a=pair.a.id, b=pair.b.id, token=tx.new_token())
-    id_ = tx.next_number("connection")
-    made = Connection(id=id_, interface_a=pair.interface_a.tag, interface_b=pair.interface_b.tag)
-    tx.put_link(replace(link, connections={**link.connections, id_: made}))
+        tx.put(link)
+        for endpoint in (link.a, link.b):
+            tx.touch_link(endpoint, link.id)
+    made = Connection(
+        id=tx.next_number("connection"),
+        link=link.id,
+        a=link.a,
+        interface_a=pair.interface_a.tag,
+        b=link.b,
+        interface_b=pair.interface_b.tag,
+    )
+    tx.put(made)
+    tx.touch_connection(made)
 
 
 def disconnect(tx: Transaction, command: Disconnect) -> None:
     """Part two interfaces."""
     pair = _pair(tx, command.user, command.tag_a, command.tag_b)
-    link = tx.tables.link_between(pair.a.id, pair.b.id)
-    connection = link and _connection(link, pair)
-    if link is None or connection is None:
+    connection = _connection(tx, pair)
+    if connection is None:
         raise NotFound(f"{command.tag_a!r} and {command.tag_b!r} are not connected")
-    rest = {n: c for n, c in link.connections.items() if n != connection.id}
-    tx.put_link(replace(link, connections=rest))
+    endpoints.remove_connection(tx, connection)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +131,7 @@ def _locate(tx: Transaction, user: str, path: str) -> tuple[Endpoint, InterfaceS
     if not slash:
         raise Invalid(f"{path!r} does not name an interface; write ENDPOINT/INTERFACE")
     endpoint = _endpoint(tx, user, tag)
-    interface = endpoint.interfaces.get(interface_tag)
+    interface = tx.tables.interface(endpoint.id, interface_tag)
     if interface is None:
         raise NotFound(f"there is no interface {path!r}; add it first")
     return endpoint, interface
@@ -149,31 +156,22 @@ def _check_pair(tx: Transaction, pair: _Pair) -> None:
 
 
 def _check_room(tx: Transaction, endpoint: Endpoint, interface: InterfaceSpec, role: Role) -> None:
-    links = tx.tables.links.by("endpoint", endpoint.id)
-    if role is Role.SERVICE_PROVIDER:
-        taken = any(
-            interface.tag in _ends_at(link, c, endpoint.id)
-            for link in links
-            for c in link.connections.values()
+    connections = tx.tables.connections
+    if role is Role.SERVICE_PROVIDER and connections.count("end", interface_key(endpoint.id, interface.tag)):
+        raise Conflict(
+            f"{_path(endpoint, interface.tag)!r} is a ServiceProvider and connected already; "
+            "it takes one connection: disconnect it first"
         )
-        if taken:
-            raise Conflict(
-                f"{_path(endpoint, interface.tag)!r} is a ServiceProvider and connected already; "
-                "it takes one connection: disconnect it first"
-            )
-    if sum(len(link.connections) for link in links) >= tx.settings.max_connections:
+    if connections.count("endpoint", endpoint.id) >= tx.settings.max_connections:
         raise LimitReached(f"{endpoint.tag!r} has {tx.settings.max_connections} connections already")
 
 
-def _connection(link: Link, pair: _Pair) -> Connection | None:
-    wanted = (pair.interface_a.tag, pair.interface_b.tag)
-    return next((c for c in link.connections.values() if (c.interface_a, c.interface_b) == wanted), None)
-
-
-def _ends_at(link: Link, connection: Connection, endpoint: str) -> tuple[str, ...]:
-    """Return the tags of the interfaces of an endpoint that a connection joins: both, if it has no other."""
-    ends = ((link.a, connection.interface_a), (link.b, connection.interface_b))
-    return tuple(tag for id_, tag in ends if id_ == endpoint)
+def _connection(tx: Transaction, pair: _Pair) -> Connection | None:
+    ends = (
+        interface_key(pair.a.id, pair.interface_a.tag),
+        interface_key(pair.b.id, pair.interface_b.tag),
+    )
+    return next(iter(tx.tables.connections.by("ends", " ".join(ends))), None)
 
 
 def _endpoint(tx: Transaction, user: str, tag: str) -> Endpoint:

@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 
     from rce_master.store.base import Row, Snapshot
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+"""1: interfaces were stored in their endpoints and connections in their links. The form of the table is the
+same: what the rows hold is converted by who reads them (:mod:`rce_master.state.migration`)."""
+_CONVERTIBLE = 1
 FILE_NAME = "rce.sqlite"
 
 _SCHEMA = """
@@ -149,6 +152,10 @@ async def _prepare(database: aiosqlite.Connection, path: Path) -> None:
     version = row[0] if row else 0
     if version == 0:
         await database.execute(_SCHEMA)
+        await database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+        await database.commit()
+    elif version == _CONVERTIBLE:
+        # Set before anything is converted: the release that wrote it must not open what is half converted.
         await database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         await database.commit()
     elif version != SCHEMA_VERSION:

@@ -86,7 +86,7 @@ class Histories(RuleBasedStateMachine):
             assert drop.revision > self.revisions.get(drop.id, 0) or drop.id in changes.touched
 
     def connection_ids(self) -> set[int]:
-        return {id_ for link in self.state.tables.links for id_ in link.connections}
+        return {connection.id for connection in self.state.tables.connections}
 
     def image(self, *, persistent_only: bool) -> dict[str, dict[str, bytes]]:
         return {
