@@ -1,20 +1,24 @@
-"""What can go wrong in the fleet room.
+"""Errors of the fleet system.
 
 ::
 
     FleetError
     +-- MapError            a map or scenario file that cannot be read
-    +-- ScenarioError       no scenario of the wanted size exists on the map
+    +-- ScenarioError       no scenario of the requested size exists on the map
     +-- OccupiedError       a box cannot stand where a robot is
     +-- TransitionError     an event that the life cycle of a robot does not allow
-    +-- InvariantError      the planner's books contradict each other: a bug
+    +-- InvariantError      the planner's records contradict each other: a bug
+    +-- StationError        a request to the operator station was not carried out
+    |   +-- StationUnavailableError    station or planner cannot be reached; try again later
+    |   +-- RequestRefusedError        the station refused the request
+    +-- DemoError           errors of ``rce demo``, see rce_fleet.demo.exceptions
 """
 
 from __future__ import annotations
 
 
 class FleetError(Exception):
-    """Base of everything that this room raises on purpose."""
+    """Base of the errors of the fleet system."""
 
 
 class MapError(FleetError):
@@ -34,7 +38,7 @@ class MapError(FleetError):
 
 
 class ScenarioError(FleetError):
-    """No scenario of the wanted size exists on the map."""
+    """No scenario of the requested size exists on the map."""
 
 
 class OccupiedError(FleetError):
@@ -51,7 +55,7 @@ class OccupiedError(FleetError):
         super().__init__(cell, robots)
 
     def __str__(self) -> str:
-        return f"no box can stand in cell {self.cell}: {', '.join(self.robots)} is in its way"
+        return f"cell {self.cell} cannot get a box: robot {', '.join(self.robots)} is in the way"
 
 
 class TransitionError(FleetError):
@@ -59,4 +63,16 @@ class TransitionError(FleetError):
 
 
 class InvariantError(FleetError):
-    """The planner's books contradict each other. Always a bug, never a matter of input."""
+    """The planner's records contradict each other. Always a bug."""
+
+
+class StationError(FleetError):
+    """A request to the operator station was not carried out."""
+
+
+class StationUnavailableError(StationError):
+    """The station, or the planner behind it, cannot be reached now; try again later."""
+
+
+class RequestRefusedError(StationError):
+    """The station refused a request; its text says why."""

@@ -28,7 +28,7 @@ _CELLS = "std_msgs/Int32MultiArray"
 
 
 @dataclass(frozen=True, slots=True)
-class Account:
+class FleetAccount:
     """Where the engine is, and whose robots these are."""
 
     url: str = "http://localhost:9000/"
@@ -37,14 +37,14 @@ class Account:
     robot_prefix: str = "testRobot_"
 
 
-def robot_config(number: int, account: Account | None = None) -> dict[str, Any]:
+def robot_config(number: int, account: FleetAccount | None = None) -> dict[str, Any]:
     """Return the config of robot ``number``, counted from 1.
 
     Args:
         number: Names robot (``testRobot_1``), container (``cTag_01``) and namespace (``Robot1``).
         account: Engine and user; the development ones if None.
     """
-    account = account or Account()
+    account = account or FleetAccount()
     robot, container, namespace = f"{account.robot_prefix}{number}", f"cTag_{number:02}", f"Robot{number}"
     return {
         "url": account.url,
@@ -66,7 +66,8 @@ def robot_config(number: int, account: Account | None = None) -> dict[str, Any]:
 
 
 def fleet_config(
-    account: Account | None = None, parameters: dict[str, bool | int | float | str | list[Any]] | None = None
+    account: FleetAccount | None = None,
+    parameters: dict[str, bool | int | float | str | list[Any]] | None = None,
 ) -> dict[str, Any]:
     """Return the operator's config: the container with the planner.
 
@@ -74,7 +75,7 @@ def fleet_config(
         account: Engine and user; the development ones if None.
         parameters: The planner's parameters by name, such as ``rows``; those of an 8 x 8 floor if None.
     """
-    account = account or Account()
+    account = account or FleetAccount()
     given = {"rows": 8, "columns": 8, "cell_size": 1.0} if parameters is None else parameters
     return {
         "url": account.url,

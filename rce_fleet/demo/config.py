@@ -1,4 +1,4 @@
-"""What the demo runs, and where."""
+"""Configuration of the demo."""
 
 from __future__ import annotations
 
@@ -7,58 +7,58 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from rce_fleet.demo.ports import LOOPBACK, Ports
+from rce_fleet.demo.resources import LOOPBACK, Ports
 from rce_fleet.drivers.scene import scene_of
 from rce_fleet.planning.scenario import Scenario
-from rce_fleet.wiring import Account
+from rce_fleet.wiring import FleetAccount
 
 
 class Mode(StrEnum):
     """What carries the fleet's messages."""
 
     CLOUD = "cloud"
-    """The engine: planner and move clients in containers, each robot a ROS graph that is bridged to them."""
+    """The engine: planner and move clients in containers, each robot a ROS graph bridged to them."""
     SINGLE = "single"
-    """One ROS core for everybody, robots in namespaces."""
+    """One ROS core for all nodes, robots in namespaces."""
     MULTI = "multi"
     """A ROS core for each robot and one for the planner, which share a few topics."""
 
 
-class CoreKind(StrEnum):
-    """Which program is the ROS core of the mode ``single``."""
+class CoreProgram(StrEnum):
+    """The program that is the ROS core of the mode ``single``."""
 
     RCE = "rce"
     """``rce core``."""
     ROSCORE = "roscore"
-    """The one of an installed ROS."""
+    """``roscore`` of an installed ROS."""
 
 
-class Machines(StrEnum):
+class MachineBackend(StrEnum):
     """What stands for the machines of the mode ``multi``."""
 
     AUTO = "auto"
-    """Namespaces where they can be made, else ports."""
+    """Namespaces if they can be created, else ports."""
     NAMESPACES = "namespaces"
-    """A network namespace for each machine, with an address of its own. Only root can make them."""
+    """A network namespace for each machine, with its own address. Needs root."""
     PORTS = "ports"
     """Ports of the loopback interface."""
 
 
 @dataclass(frozen=True, slots=True)
 class DemoConfig:
-    """What the demo runs, and where.
+    """Configuration of the demo.
 
     Attributes:
         scenario: Robots, boxes and goals.
-        seed: Of the errors of the robots' senses.
-        ports: All that the mode needs are chosen.
-        folder: For configs, logs and state; must exist.
-        runtime: How containers are kept apart; the engine's choice if empty.
+        seed: Seed of the sensors' noise.
+        ports: Ports; those that the mode needs are chosen.
+        folder: Folder for configs, logs and state; must exist.
+        runtime: The containers' runtime; the engine's default if empty.
         mode: What carries the fleet's messages.
-        core: Which program is the core of the mode ``single``.
-        core_uri: A ROS master that runs already and takes that program's place; none if empty.
+        core: The program that is the core of the mode ``single``.
+        core_uri: A running ROS master to use instead of that program; none if empty.
         machines: What stands for the machines of the mode ``multi``.
-        blocked_cells: How many cells a headless run blocks while robots drive.
+        blocked_cells: Cells that a headless run blocks while robots drive.
     """
 
     scenario: Scenario
@@ -67,29 +67,29 @@ class DemoConfig:
     folder: Path
     runtime: str = ""
     mode: Mode = Mode.CLOUD
-    core: CoreKind = CoreKind.RCE
+    core: CoreProgram = CoreProgram.RCE
     core_uri: str = ""
-    machines: Machines = Machines.AUTO
+    machines: MachineBackend = MachineBackend.AUTO
     blocked_cells: int = 1
 
     @property
-    def account(self) -> Account:
+    def account(self) -> FleetAccount:
         """The engine's address and the development user."""
-        return Account(url=f"http://{LOOPBACK}:{self.ports.http}/")
+        return FleetAccount(url=f"http://{LOOPBACK}:{self.ports.http}/")
 
     @property
     def scene(self) -> Path:
-        """What stands where at the beginning."""
+        """File with the initial state of the simulated world."""
         return self.folder / "scene.json"
 
     @property
     def report(self) -> Path:
-        """Where the world says what truly happened."""
+        """File that the simulated world writes its reports to."""
         return self.folder / "world.json"
 
     @property
     def planner_parameters(self) -> dict[str, Any]:
-        """What the planner is told of the floor. It is not told of hidden boxes."""
+        """The planner's parameters: the map without hidden boxes."""
         scenario, grid = self.scenario, self.scenario.grid
         cells = {"walls": sorted(grid.blocked), "blocked": list(scenario.known_boxes)}
         known = {name: value for name, value in cells.items() if value}
@@ -97,11 +97,11 @@ class DemoConfig:
 
     @property
     def map_parameters(self) -> dict[str, Any]:
-        """Size and cells of the map."""
+        """Parameters for the size of the map and its cells."""
         grid = self.scenario.grid
         return {"rows": grid.rows, "columns": grid.columns, "cell_size": grid.cell_size}
 
     def write_scene(self) -> None:
-        """Write the file that the world reads."""
+        """Write the file that the simulated world reads."""
         scene = scene_of(self.scenario, self.seed)
         self.scene.write_text(scene.model_dump_json(indent=1), encoding="utf-8")

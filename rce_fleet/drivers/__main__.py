@@ -15,8 +15,7 @@ from rce.config.exceptions import ConfigError
 from rce.config.logs import start_logging
 from rce.ros.types import TypeRegistry
 from rce_client.exceptions import RefusedError
-from rce_fleet.drivers.account import Account
-from rce_fleet.drivers.block_watch import BlockWatch
+from rce_fleet.drivers.block_watch import BlockWatch, WorldAccount
 from rce_fleet.drivers.cell_watch import CellWatch, GraphCellWatch
 from rce_fleet.drivers.cores import Cores
 from rce_fleet.drivers.program import Simulation
@@ -54,7 +53,7 @@ def simulate(
     if planner_core:
         watch = GraphCellWatch(planner_core, types)
     elif master:
-        watch = BlockWatch(Account(master, user, password, robot_id), container)
+        watch = BlockWatch(WorldAccount(master, user, password, robot_id), container)
     cores = Cores.read(core or ())
     try:
         simulation = Simulation(load_scene(scene), types, typer.echo, report=report, watch=watch, cores=cores)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from rce_client.connection import Connection
@@ -11,13 +12,28 @@ from rce_fleet.drivers.cell_watch import CELLS, TOPIC, cells_of
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rce_fleet.drivers.account import Account
-
 OWN_TAG = "blockedCells"
 JOIN_TIMEOUT = 3.0
 """Seconds after which the interface is asked for again."""
 LOOK_EVERY = 1.0
 """Seconds between two looks whether it is still joined."""
+
+
+@dataclass(frozen=True, slots=True)
+class WorldAccount:
+    """The simulated world's user account at the engine.
+
+    Attributes:
+        url: URL of the master.
+        user: User ID.
+        password: The user's password.
+        robot: The robotID with which the world connects.
+    """
+
+    url: str
+    user: str
+    password: str = field(repr=False)
+    robot: str = "world"
 
 
 class BlockWatch:
@@ -31,7 +47,7 @@ class BlockWatch:
         container: Tag of the planner's container.
     """
 
-    def __init__(self, account: Account, container: str) -> None:
+    def __init__(self, account: WorldAccount, container: str) -> None:
         self._account = account
         self._container = container
         self.joined = asyncio.Event()

@@ -14,10 +14,10 @@ import pytest
 from support.demo import clean_folder, environment, run_headless, running_demo
 from support.engine import command_line, engine_processes, until
 
-from rce_fleet.demo.exceptions import StationAwayError
-from rce_fleet.demo.floor import draw
-from rce_fleet.demo.station import StationApi
+from rce_fleet.demo.scenario import choose_scenario
 from rce_fleet.drivers.report import read_report
+from rce_fleet.exceptions import StationUnavailableError
+from rce_fleet.station.client import StationClient
 
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("pymunk")]
 
@@ -97,7 +97,7 @@ async def test_a_run_that_is_too_short_says_so() -> None:
     code, report, text = await run_headless("--robots", 1, timeout=1)
     assert code == 1
     assert report["ok"] is False
-    assert "the time of 1 s is over" in text
+    assert "timeout: the run was not complete after 1 s" in text
     assert report["robots"][0]["reached"] is False
 
 
@@ -170,13 +170,13 @@ async def test_a_planner_that_is_killed_comes_back_and_knows_what_was_wanted() -
         running_demo("--robots", 1, "--seed", 2, "--runtime", "process", "--no-auto") as demo,
         aiohttp.ClientSession() as session,
     ):
-        station = StationApi(session, demo.page)
+        station = StationClient(session, demo.page)
         await until(lambda: states(station, "idle"), timeout=30, what="the robot is in its place")
         (robot,) = (await station.fleet()).robots
-        scenario = draw(1, 2)
+        scenario = choose_scenario(1, 2)
         known = {*scenario.starts, *scenario.goals, *scenario.boxes}
         corner = next(cell for cell in scenario.grid.free if cell not in known)
-        await station.block(corner, blocked=True)
+        await station.set_blocked(corner, blocked=True)
         await station.set_goal(robot.id, scenario.goals[0])
         await until(lambda: states(station, "driving"), timeout=30, what="the robot drives")
         (planner,) = [
@@ -191,9 +191,9 @@ async def test_a_planner_that_is_killed_comes_back_and_knows_what_was_wanted() -
         assert corner in fleet.blocked
 
 
-async def states(station: StationApi, wanted: str) -> bool:
+async def states(station: StationClient, wanted: str) -> bool:
     try:
         fleet = await station.fleet()
-    except StationAwayError:
+    except StationUnavailableError:
         return False
     return bool(fleet.robots) and all(robot.state == wanted for robot in fleet.robots)

@@ -17,7 +17,7 @@ from typing import Any
 
 import psutil
 
-from rce_fleet.demo.ports import Ports, option_of
+from rce_fleet.demo.resources import Ports, option_of
 from support.engine import command_line, engine_processes, until
 from support.leaks import sweep_cgroups
 from support.ports import free_ports

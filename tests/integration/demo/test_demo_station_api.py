@@ -11,9 +11,10 @@ from aiohttp import web
 from aiohttp.test_utils import TestServer
 from support.fleet_states import fleet, robot
 
-from rce_fleet.demo.counters import Counters, read_counters
-from rce_fleet.demo.exceptions import DemoError, StationAwayError, WishRefusedError
-from rce_fleet.demo.station import StationApi
+from rce_fleet.demo.exceptions import DemoError
+from rce_fleet.demo.traffic import MessageTotals, read_engine_totals
+from rce_fleet.exceptions import RequestRefusedError, StationUnavailableError
+from rce_fleet.station.client import StationClient
 
 FLEET = fleet(robot("Robot1", cell=3), blocked=[5])
 
@@ -72,11 +73,11 @@ async def session() -> AsyncIterator[aiohttp.ClientSession]:
 
 
 async def test_state_and_requests(played: Played, server: TestServer, session: aiohttp.ClientSession) -> None:
-    station = StationApi(session, str(server.make_url("/")))
+    station = StationClient(session, str(server.make_url("/")))
     assert await station.fleet() == FLEET
     await station.set_goal("Robot1", 7)
     await station.set_goal("Robot1", None)
-    await station.block(9, blocked=True)
+    await station.set_blocked(9, blocked=True)
     assert played.heard == [
         ("robots/Robot1/goal", {"cell": 7}),
         ("robots/Robot1/goal", {"cell": None}),
@@ -85,7 +86,8 @@ async def test_state_and_requests(played: Played, server: TestServer, session: a
 
 
 @pytest.mark.parametrize(
-    ("status", "error"), [(409, WishRefusedError), (404, WishRefusedError), (503, StationAwayError)]
+    ("status", "error"),
+    [(409, RequestRefusedError), (404, RequestRefusedError), (503, StationUnavailableError)],
 )
 async def test_refusals(
     status: int,
@@ -96,32 +98,32 @@ async def test_refusals(
 ) -> None:
     played.answer = web.json_response({"error": "cell 9 is a wall"}, status=status)
     with pytest.raises(error, match="cell 9 is a wall"):
-        await StationApi(session, str(server.make_url("/"))).block(9, blocked=True)
+        await StationClient(session, str(server.make_url("/"))).set_blocked(9, blocked=True)
 
 
 async def test_an_answer_that_is_no_state(
     played: Played, server: TestServer, session: aiohttp.ClientSession
 ) -> None:
     played.answer = web.json_response({"robots": 3})
-    with pytest.raises(WishRefusedError, match="cannot be read"):
-        await StationApi(session, str(server.make_url("/"))).fleet()
+    with pytest.raises(RequestRefusedError, match="is not a fleet's state"):
+        await StationClient(session, str(server.make_url("/"))).fleet()
 
 
 async def test_nobody_there(server: TestServer, session: aiohttp.ClientSession) -> None:
     url = str(server.make_url("/"))
     await server.close()
-    with pytest.raises(StationAwayError):
-        await StationApi(session, url).fleet()
+    with pytest.raises(StationUnavailableError):
+        await StationClient(session, url).fleet()
     with pytest.raises(DemoError):
-        await read_counters(url, "u", "p")
+        await read_engine_totals(url, "u", "p")
 
 
 async def test_counters_are_summed_and_the_token_is_given_back(played: Played, server: TestServer) -> None:
-    assert await read_counters(str(server.make_url("/")), "u", "p") == Counters(7, 1)
+    assert await read_engine_totals(str(server.make_url("/")), "u", "p") == MessageTotals(7, 1)
     assert played.heard == [("logout", "Bearer abc")]
 
 
 async def test_a_refused_login(played: Played, server: TestServer) -> None:
     played.answer = web.json_response({"error": "wrong"}, status=401)
     with pytest.raises(DemoError, match="401"):
-        await read_counters(str(server.make_url("/")), "u", "p")
+        await read_engine_totals(str(server.make_url("/")), "u", "p")

@@ -10,7 +10,7 @@ from rce.config.client import ClientConfig, load, loads
 from rce.config.documents import write_items
 from rce.model.names import Role
 from rce_client.ros_bridge.explain import wires
-from rce_fleet.wiring import Account, fleet_config, robot_config
+from rce_fleet.wiring import FleetAccount, fleet_config, robot_config
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 
@@ -37,7 +37,7 @@ def test_the_long_form_says_the_same_as_the_short_one() -> None:
 
 
 def made(number: int) -> ClientConfig:
-    return loads(write_items(robot_config(number, Account(url="http://cloud:1/", user="u"))))
+    return loads(write_items(robot_config(number, FleetAccount(url="http://cloud:1/", user="u"))))
 
 
 @pytest.mark.parametrize("number", [1, 12, 100])

@@ -7,15 +7,14 @@ from pathlib import Path
 
 from rce.config.client import loads
 from rce.config.documents import write_items
-from rce_fleet.demo.bus import received
 from rce_fleet.demo.config import DemoConfig
-from rce_fleet.demo.floor import draw
-from rce_fleet.demo.machine import node_names, planner_argv, world_argv
-from rce_fleet.demo.multi import PLANNER, sync_argv
-from rce_fleet.demo.ports import Ports
+from rce_fleet.demo.resources import Ports
+from rce_fleet.demo.ros_modes import PLANNER, node_names, planner_argv, sync_argv, world_argv
+from rce_fleet.demo.scenario import choose_scenario
+from rce_fleet.demo.traffic import received
 from rce_fleet.wiring import fleet_config
 
-CONFIG = DemoConfig(draw(3, 0), 0, Ports(), Path("/folder"))
+CONFIG = DemoConfig(choose_scenario(3, 0), 0, Ports(), Path("/folder"))
 
 
 def test_the_planner_is_not_told_of_hidden_boxes() -> None:
@@ -41,7 +40,7 @@ def test_each_robot_of_the_world_joins_its_own_core() -> None:
 
 
 def test_only_the_demos_own_nodes_are_counted() -> None:
-    one = replace(CONFIG, scenario=draw(1, 0))
+    one = replace(CONFIG, scenario=choose_scenario(1, 0))
     assert node_names(one) == {
         *("/Robot1/robot", "/Robot1/move_client"),
         *("/fleet_planner", "/operator_station", "/world"),

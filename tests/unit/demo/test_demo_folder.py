@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rce_fleet.demo.folder import LOCK, PREFIX, remove_abandoned, run_folder
+from rce_fleet.demo.resources import LOCK, PREFIX, remove_abandoned, run_folder
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 OWNER = """
 import os, sys
 from pathlib import Path
-from rce_fleet.demo.folder import run_folder
+from rce_fleet.demo.resources import run_folder
 with run_folder() as folder:
     (folder / "data").write_text("x")
     print(folder, flush=True)

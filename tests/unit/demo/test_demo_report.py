@@ -9,24 +9,24 @@ from typing import Any
 import pytest
 from support.fleet_states import truth
 
-from rce_fleet.demo.counters import Counters
-from rce_fleet.demo.floor import draw
-from rce_fleet.demo.mission import Mission
-from rce_fleet.demo.result import Result
+from rce_fleet.demo.headless import RunReport
+from rce_fleet.demo.scenario import choose_scenario
+from rce_fleet.demo.scenario_run import ScenarioRun
+from rce_fleet.demo.traffic import MessageTotals
 
-SCENARIO = draw(2, 0)
+SCENARIO = choose_scenario(2, 0)
 ROBOTS = dict(zip(SCENARIO.robots, SCENARIO.goals, strict=True))
 
 
-def result(reached: set[str], problem: str = "", **world: Any) -> Result:
+def make_report(reached: set[str], problem: str = "", **world: Any) -> RunReport:
     unused: Any = None
-    mission = Mission(unused, SCENARIO, lambda: None, lambda _: None)
-    mission.reached = reached
-    return Result(SCENARIO, 0, mission, truth(apart=0.5, **ROBOTS, **world), Counters(10, 1), problem)
+    run = ScenarioRun(unused, SCENARIO, lambda: None, lambda _: None)
+    run.reached = reached
+    return RunReport(SCENARIO, 0, run, truth(apart=0.5, **ROBOTS, **world), MessageTotals(10, 1), problem)
 
 
 def test_a_good_run() -> None:
-    report = result(set(ROBOTS)).as_json()
+    report = make_report(set(ROBOTS)).as_json()
     assert report["ok"] is True
     assert report["collisions"] == 0
     assert report["min_separation_m"] == 0.5
@@ -47,13 +47,13 @@ def test_a_good_run() -> None:
 @pytest.mark.parametrize(
     ("bad", "words"),
     [
-        (result({"Robot1"}), "not at their goals: Robot2"),
-        (result(set(ROBOTS), collisions=2), "touched something 2 times"),
-        (result(set(ROBOTS), problem="the time is over"), "the time is over"),
-        (Result(SCENARIO, 0, None, None, None, "no engine"), "no engine"),
+        (make_report({"Robot1"}), "not at their goals: Robot2"),
+        (make_report(set(ROBOTS), collisions=2), "robots collided 2 times"),
+        (make_report(set(ROBOTS), problem="the time is over"), "the time is over"),
+        (RunReport(SCENARIO, 0, None, None, None, "no engine"), "no engine"),
     ],
 )
-def test_a_bad_run_says_why(bad: Result, words: str, tmp_path: Path) -> None:
+def test_a_bad_run_says_why(bad: RunReport, words: str, tmp_path: Path) -> None:
     assert not bad.ok
     bad.write(tmp_path / "r.json")
     report = json.loads((tmp_path / "r.json").read_text())

@@ -12,9 +12,9 @@ from typing import Any
 import psutil
 import pytest
 
-from rce_fleet.demo import children as children_module
-from rce_fleet.demo.children import Children
-from rce_fleet.demo.exceptions import ChildDiedError, DemoError, NotReadyError
+from rce_fleet.demo import programs as programs_module
+from rce_fleet.demo.exceptions import DemoError, NotReadyError, ProgramEndedError
+from rce_fleet.demo.programs import ProgramGroup
 
 TALKER = "import time\nprint('talker ready: 42')\ntime.sleep(600)"
 DEAF = "import signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\nprint('up')\ntime.sleep(600)"
@@ -35,33 +35,33 @@ async def for_ever() -> None:
 
 async def test_lines_are_logged_shown_and_waited_for(tmp_path: Path) -> None:
     shown: list[str] = []
-    async with Children(tmp_path, shown.append) as children:
-        talker = await children.start("talker", python(TALKER))
-        assert await children.wait_line(talker, "talker ready:", 20) == "42"
+    async with ProgramGroup(tmp_path, shown.append) as group:
+        talker = await group.start("talker", python(TALKER))
+        assert await group.wait_line(talker, "talker ready:", 20) == "42"
     assert shown == ["[talker] talker ready: 42"]
     assert (tmp_path / "talker.log").read_text() == "talker ready: 42\n"
     assert talker.child.returncode == -signal.SIGTERM
 
 
 async def test_a_program_that_dies_is_named_with_its_last_words(tmp_path: Path) -> None:
-    async with Children(tmp_path, ignore) as children:
-        talker = await children.start("talker", python(TALKER))
-        await children.start("dying", python(DYING))
-        with pytest.raises(ChildDiedError, match="dying ended with exit code 3\n    something is wrong"):
-            await asyncio.wait_for(children.while_alive(for_ever()), 20)
+    async with ProgramGroup(tmp_path, ignore) as group:
+        talker = await group.start("talker", python(TALKER))
+        await group.start("dying", python(DYING))
+        with pytest.raises(ProgramEndedError, match="dying ended with exit code 3\n    something is wrong"):
+            await asyncio.wait_for(group.run_while_alive(for_ever()), 20)
     assert not psutil.pid_exists(talker.child.pid)
 
 
 async def test_a_program_that_can_be_is_started_again(tmp_path: Path) -> None:
     told: asyncio.Queue[str] = asyncio.Queue()
-    async with Children(tmp_path, ignore) as children:
-        talker = await children.start("talker", python(TALKER), revivable=True)
-        await children.wait_line(talker, "talker ready:", 20)
-        children.revive(told.put_nowait)
+    async with ProgramGroup(tmp_path, ignore) as group:
+        talker = await group.start("talker", python(TALKER), restartable=True)
+        await group.wait_line(talker, "talker ready:", 20)
+        group.enable_restarts(told.put_nowait)
         former = talker.child
         os.kill(former.pid, signal.SIGKILL)
-        work = asyncio.create_task(children.while_alive(for_ever()))
-        assert await told.get() == "talker was ended by SIGKILL; it is started again"
+        work = asyncio.create_task(group.run_while_alive(for_ever()))
+        assert await told.get() == "talker was ended by SIGKILL; restarting it"
         async with asyncio.timeout(20):
             while (tmp_path / "talker.log").read_text().count("talker ready: 42") < 2:
                 await asyncio.sleep(0.05)
@@ -74,34 +74,34 @@ async def test_a_program_that_can_be_is_started_again(tmp_path: Path) -> None:
 async def test_a_program_that_dies_again_and_again_stays_dead(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(children_module, "REVIVAL_FIRST", 0.01)
+    monkeypatch.setattr(programs_module, "MIN_RESTART_DELAY", 0.01)
     told: list[str] = []
-    async with Children(tmp_path, ignore) as children:
-        children.revive(told.append)
-        await children.start("dying", python(DYING), revivable=True)
-        with pytest.raises(ChildDiedError, match="dying ended with exit code 3"):
-            await asyncio.wait_for(children.while_alive(for_ever()), 30)
-    assert len(told) == children_module.DEATHS_MOST - 1
+    async with ProgramGroup(tmp_path, ignore) as group:
+        group.enable_restarts(told.append)
+        await group.start("dying", python(DYING), restartable=True)
+        with pytest.raises(ProgramEndedError, match="dying ended with exit code 3"):
+            await asyncio.wait_for(group.run_while_alive(for_ever()), 30)
+    assert len(told) == programs_module.MAX_EARLY_EXITS - 1
 
 
 async def test_nothing_is_started_again_while_all_are_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(children_module, "REVIVAL_FIRST", 100.0)
+    monkeypatch.setattr(programs_module, "MIN_RESTART_DELAY", 100.0)
     told = asyncio.Event()
-    async with Children(tmp_path, ignore) as children:
-        children.revive(lambda _: told.set())
-        dying = await children.start("dying", python(DYING), revivable=True)
+    async with ProgramGroup(tmp_path, ignore) as group:
+        group.enable_restarts(lambda _: told.set())
+        dying = await group.start("dying", python(DYING), restartable=True)
         former = dying.child
         await told.wait()
     assert dying.child is former
 
 
 async def test_a_program_that_does_not_get_ready_is_named(tmp_path: Path) -> None:
-    async with Children(tmp_path, ignore) as children:
-        talker = await children.start("talker", python(TALKER))
+    async with ProgramGroup(tmp_path, ignore) as group:
+        talker = await group.start("talker", python(TALKER))
         with pytest.raises(NotReadyError, match="talker was not ready"):
-            await children.wait_line(talker, "never:", 0.05)
+            await group.wait_line(talker, "never:", 0.05)
 
 
 async def test_work_returns_its_result_and_its_errors(tmp_path: Path) -> None:
@@ -111,21 +111,21 @@ async def test_work_returns_its_result_and_its_errors(tmp_path: Path) -> None:
     async def fail() -> None:
         raise DemoError("no")
 
-    async with Children(tmp_path, ignore) as children:
-        await children.start("talker", python(TALKER))
-        assert await children.while_alive(answer()) == 42
+    async with ProgramGroup(tmp_path, ignore) as group:
+        await group.start("talker", python(TALKER))
+        assert await group.run_while_alive(answer()) == 42
         with pytest.raises(DemoError, match="no"):
-            await children.while_alive(fail())
+            await group.run_while_alive(fail())
 
 
 async def test_a_program_that_does_not_listen_is_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(children_module, "STOP_TIMEOUT", 0.1)
-    async with Children(tmp_path, ignore) as children:
-        await children.start("talker", python(TALKER))
-        deaf = await children.start("deaf", python(DEAF))
-        await children.wait_line(deaf, "up", 20)
+    monkeypatch.setattr(programs_module, "STOP_TIMEOUT", 0.1)
+    async with ProgramGroup(tmp_path, ignore) as group:
+        await group.start("talker", python(TALKER))
+        deaf = await group.start("deaf", python(DEAF))
+        await group.wait_line(deaf, "up", 20)
     assert deaf.child.returncode == -signal.SIGKILL
 
 
@@ -134,10 +134,10 @@ async def test_all_end_when_the_work_is_cancelled(tmp_path: Path) -> None:
     pids: list[int] = []
 
     async def run() -> None:
-        async with Children(tmp_path, ignore) as children:
-            pids.extend([(await children.start(name, python(TALKER))).child.pid for name in ("a", "b")])
+        async with ProgramGroup(tmp_path, ignore) as group:
+            pids.extend([(await group.start(name, python(TALKER))).child.pid for name in ("a", "b")])
             started.set()
-            await children.while_alive(for_ever())
+            await group.run_while_alive(for_ever())
 
     task = asyncio.create_task(run())
     await started.wait()
@@ -152,10 +152,10 @@ async def test_what_others_need_is_ended_after_them(tmp_path: Path) -> None:
     leaving = (
         "import signal, time\nsignal.signal(signal.SIGTERM, lambda *_: exit())\nprint('up')\ntime.sleep(600)"
     )
-    async with Children(tmp_path, ignore) as children:
-        for name, needed in (("network", True), ("core", True), ("node", False)):
-            program = await children.start(name, python(leaving), needed=needed)
-            await children.wait_line(program, "up", 20)
+    async with ProgramGroup(tmp_path, ignore) as group:
+        for name, stop_last in (("network", True), ("core", True), ("node", False)):
+            program = await group.start(name, python(leaving), stop_last=stop_last)
+            await group.wait_line(program, "up", 20)
             stop = program.child.stop
 
             async def noted(name: str = name, stop: Any = stop, **options: float) -> None:

@@ -1,4 +1,4 @@
-"""The headless run, with a station and a world that are played."""
+"""ScenarioRun with a simulated planner and world."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 from support.fleet_states import fleet, robot, truth
 
-from rce_fleet.demo import mission as mission_module
-from rce_fleet.demo.exceptions import StationAwayError, WishRefusedError
-from rce_fleet.demo.mission import Mission
+from rce_fleet.demo import scenario_run as scenario_run_module
+from rce_fleet.demo.scenario_run import ScenarioRun
 from rce_fleet.drivers.report import WorldReport
+from rce_fleet.exceptions import RequestRefusedError, StationUnavailableError
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.scenario import Scenario
 from rce_fleet.station.api import FleetModel
@@ -27,7 +27,7 @@ SCENARIO = Scenario(
 ROW = [0, 1, 2, 3]
 
 
-class PlayedStation:
+class FakeStation:
     """A planner whose one robot needs some looks for everything."""
 
     def __init__(self) -> None:
@@ -47,7 +47,7 @@ class PlayedStation:
         await asyncio.sleep(0)
         self.looks += 1
         if self.looks in self.away_at:
-            raise StationAwayError("away")
+            raise StationUnavailableError("away")
         if self.looks == self.restart_at:
             self.goal, self.blocked, self._replans = None, [], 0
         if self.looks < 3:
@@ -65,10 +65,10 @@ class PlayedStation:
         self.goals.append((name, cell))
         self.goal = cell
 
-    async def block(self, cell: int, *, blocked: bool) -> None:
+    async def set_blocked(self, cell: int, *, blocked: bool) -> None:
         if self.refuse_blocks:
             self.refuse_blocks -= 1
-            raise WishRefusedError("no")
+            raise RequestRefusedError("no")
         self.blocks.append((cell, blocked))
         self.blocked = [cell] if blocked else []
         self._replans += blocked
@@ -80,64 +80,64 @@ class PlayedStation:
 
 @pytest.fixture(autouse=True)
 def _no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mission_module, "LOOK_EVERY", 0.0)
+    monkeypatch.setattr(scenario_run_module, "POLL_S", 0.0)
 
 
-def make(station: Any) -> Mission:
-    return Mission(station, SCENARIO, station.truth, lambda _: None)
+def make(station: Any) -> ScenarioRun:
+    return ScenarioRun(station, SCENARIO, station.truth, lambda _: None)
 
 
 async def test_a_robot_is_sent_a_cell_is_blocked_and_it_arrives() -> None:
-    station = PlayedStation()
-    mission = make(station)
-    assert mission.duration == 0.0
-    await asyncio.wait_for(mission.run(), 5)
+    station = FakeStation()
+    run = make(station)
+    assert run.duration == 0.0
+    await asyncio.wait_for(run.run(), 5)
     assert station.goals == [("Robot1", 3)]
     (blocked,) = station.blocks
-    assert blocked == (mission.block.done[0], True)
-    assert mission.reached == {"Robot1"}
-    assert mission.replans == {"Robot1": 1}
-    ended = mission.duration
+    assert blocked == (run.blocker.done[0], True)
+    assert run.reached == {"Robot1"}
+    assert run.replans == {"Robot1": 1}
+    ended = run.duration
     await asyncio.sleep(0.01)
-    assert mission.duration == ended > 0
+    assert run.duration == ended > 0
 
 
 async def test_a_station_that_is_away_for_a_while_is_waited_for() -> None:
-    station = PlayedStation()
+    station = FakeStation()
     station.away_at = {1, 5, 6, 9}
     await asyncio.wait_for(make(station).run(), 5)
 
 
 async def test_a_planner_that_was_restarted_is_told_again() -> None:
-    station = PlayedStation()
+    station = FakeStation()
     station.restart_at = 10
-    mission = make(station)
-    await asyncio.wait_for(mission.run(), 5)
+    run = make(station)
+    await asyncio.wait_for(run.run(), 5)
     assert station.goals == [("Robot1", 3)] * 2
-    assert station.blocks == [(mission.block.done[0], True)] * 2
-    assert mission.replans["Robot1"] == 2, "what the first planner counted is not forgotten"
+    assert station.blocks == [(run.blocker.done[0], True)] * 2
+    assert run.replans["Robot1"] == 2, "what the first planner counted is not forgotten"
 
 
 async def test_no_cell_is_blocked_when_none_is_asked_for() -> None:
-    station = PlayedStation()
-    mission = Mission(station, SCENARIO, station.truth, lambda _: None, blocked_cells=0)  # type: ignore[arg-type]
-    await asyncio.wait_for(mission.run(), 5)
+    station = FakeStation()
+    run = ScenarioRun(station, SCENARIO, station.truth, lambda _: None, blocked_cells=0)  # type: ignore[arg-type]
+    await asyncio.wait_for(run.run(), 5)
     assert station.blocks == []
-    assert mission.block.done == []
+    assert run.blocker.done == []
 
 
 async def test_a_refused_block_is_tried_again() -> None:
-    station = PlayedStation()
+    station = FakeStation()
     station.refuse_blocks = 2
-    mission = make(station)
-    await asyncio.wait_for(mission.run(), 5)
-    assert len(mission.block.done) == 1
+    run = make(station)
+    await asyncio.wait_for(run.run(), 5)
+    assert len(run.blocker.done) == 1
 
 
 async def test_the_planners_word_is_not_enough() -> None:
-    station = PlayedStation()
+    station = FakeStation()
     station.truly_at_goal = False
-    mission = make(station)
+    run = make(station)
     with pytest.raises(TimeoutError):
-        await asyncio.wait_for(mission.run(), 0.2)
-    assert mission.reached == set()
+        await asyncio.wait_for(run.run(), 0.2)
+    assert run.reached == set()
