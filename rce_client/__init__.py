@@ -1,23 +1,27 @@
 """The client side: :class:`Connection`; the bridge of ROS graphs is :mod:`rce_client.ros_bridge`."""
 
 from rce_client.connection import Connection, State
-from rce_client.ends import Publisher, ServiceClient, ServiceProvider, Subscriber
 from rce_client.exceptions import (
     CallError,
     CallTimeoutError,
     ClientError,
     InterfaceError,
+    InUseError,
     LostError,
     NotConnectedError,
     RefusedError,
     UnavailableError,
+    UntrustedError,
 )
+from rce_client.services import ServiceClient, ServiceProvider
+from rce_client.topics import Publisher, Subscriber
 
 __all__ = [
     "CallError",
     "CallTimeoutError",
     "ClientError",
     "Connection",
+    "InUseError",
     "InterfaceError",
     "LostError",
     "NotConnectedError",
@@ -28,4 +32,5 @@ __all__ = [
     "State",
     "Subscriber",
     "UnavailableError",
+    "UntrustedError",
 ]

@@ -193,19 +193,21 @@ class EngineTransport:
         self._idle.clear()
         self._queue.put_control(QueuedMessage.of(frames))
 
-    async def deliver(self, frames: Sequence[Frame]) -> None:
-        """Send a message and wait until it was handed to the network.
+    def deliver(self, frames: Sequence[Frame]) -> asyncio.Future[None]:
+        """Send a message when its turn comes.
 
-        Raises:
-            LostError: There is no connection, or it ended before.
+        Returns:
+            Done when the message was handed to the network; its exception is a :class:`LostError` if there is
+            no connection, or it ended before.
         """
-        if not self.connected:
-            raise LostError("not connected")
         queued = QueuedMessage.of(frames)
         queued.sent = asyncio.get_running_loop().create_future()
-        self._idle.clear()
-        self._queue.put_control(queued)
-        await queued.sent
+        if self.connected:
+            self._idle.clear()
+            self._queue.put_control(queued)
+        else:
+            queued.sent.set_exception(LostError("not connected"))
+        return queued.sent
 
     async def flush(self) -> None:
         """Wait until nothing waits to be sent, at most :attr:`Timing.flush`."""

@@ -25,13 +25,14 @@ from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce.tls.exceptions import CertificateError
 from rce.tls.identity import client_contexts
-from rce_client.connection import CONNECTING, Connection, State
+from rce_client.connection import Connection, State
 from rce_client.exceptions import ClientError
 from rce_client.reminder import Reminder
 from rce_client.ros_bridge.bridge import build, joined_graph, wait_ready
 from rce_client.ros_bridge.explain import dot, long_form, picture
 from rce_client.ros_bridge.plan import make_plan
 from rce_client.ros_bridge.robot_file import RobotFile
+from rce_client.session import CONNECTING
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from rce.ros.node import Publisher as RosPublisher
     from rce.ros.types import TypeRegistry
     from rce_client.connection import Connection
-    from rce_client.ends import Publisher
     from rce_client.ros_bridge.plan import Plan, Span
+    from rce_client.topics import Publisher
 
 MASTER_PATIENCE = 2.0
 """Seconds between two looks for the robot's ROS master."""
@@ -135,7 +135,7 @@ class Uplink:
 class Downlink:
     """A topic of the cloud on its way to the robot's graph, where what is latched there is latched too.
 
-    Implements :class:`rce_client.ends.LatchListener`.
+    Implements :class:`rce_client.interfaces.LatchListener`.
 
     Args:
         publisher: Its topic in the robot's graph.

@@ -10,8 +10,8 @@ from rce.config.client import ClientConfig
 from rce.protocol.messages import Request
 from rce.tls.identity import Context
 from rce_client.connection import Connection, State
-from rce_client.ends import ServiceClient
 from rce_client.exceptions import CallError, ClientError
+from rce_client.services import ServiceClient
 from rce_fleet.station.fleet_link import (
     BLOCK_CELL,
     CALL_TIMEOUT_S,

@@ -14,7 +14,7 @@ import pytest
 from support.engine import Engine, Program, running_engine, until
 
 from rce_client.connection import Connection
-from rce_client.ends import Publisher
+from rce_client.topics import Publisher
 from rce_client.exceptions import RefusedError
 
 pytestmark = [pytest.mark.e2e]

@@ -35,13 +35,13 @@ from rce.control.model import (
     EndpointSpec,
     EndpointState,
     EndpointStatus,
+    InterfaceSpec,
     LinkAddress,
     LinkSpec,
 )
 from rce.control.server import ControlServer
 from rce.link import Endpoint, Interface, LinkHub
-from rce.model.names import EndpointId, InterfaceType
-from rce.model.specs import InterfaceSpec
+from rce.protocol.names import EndpointId, InterfaceType
 from rce_robot.app import App
 from rce_robot.settings import RobotSettings, SessionSettings
 
@@ -163,7 +163,7 @@ class FakeMaster:
         return status is not None and status.state is EndpointState.RUNNING
 
 
-class End(Interface):
+class PeerInterface(Interface):
     """The container's end: notes what comes, answers requests."""
 
     def __init__(self, port: Port) -> None:
@@ -200,7 +200,7 @@ class Cloud:
     """The master, one robot task set, one container."""
 
     def __init__(
-        self, master: FakeMaster, endpoint: Endpoint, ends: dict[str, End], address: LinkAddress
+        self, master: FakeMaster, endpoint: Endpoint, ends: dict[str, PeerInterface], address: LinkAddress
     ) -> None:
         self.master = master
         self.ends = ends
@@ -210,7 +210,9 @@ class Cloud:
         self._numbers = iter(range(1, 1000))
         self._container = EndpointSpec(id="testUser/cloud", kind=EndpointKind.CONTAINER, revision=1)
 
-    async def wire(self, tag: str, type_: str, cls: str, *, robot: str = "testRobot") -> End:
+    async def wire(
+        self, tag: str, type_: str, message_type: str, *, robot: str = "testRobot"
+    ) -> PeerInterface:
         """Make an interface of the robot and its complement in the container, joined."""
         kind = InterfaceType.parse(type_)
         id_ = f"testUser/{robot}"
@@ -218,9 +220,9 @@ class Cloud:
         number = next(self._numbers)
         peer_tag = f"{robot}_{tag}"
         peer = InterfaceSpec(
-            tag=peer_tag, type=f"{kind.role.complement.value}Interface", cls=cls, addr=f"/{tag}"
+            tag=peer_tag, type=f"{kind.role.complement.value}Interface", message_type=message_type, addr=f"/{tag}"
         )
-        own = InterfaceSpec(tag=tag, type=type_, message_type=cls)
+        own = InterfaceSpec(tag=tag, type=type_, message_type=message_type)
         self._container = _grown(
             self._container,
             peer,
@@ -237,9 +239,11 @@ class Cloud:
         self.master.put(id_, interfaces=spec.interfaces, links=spec.links, connections=spec.connections)
         return self.ends[peer_tag]
 
-    async def joined(self, tag: str, type_: str, cls: str, *, robot: str = "testRobot") -> End:
+    async def joined(
+        self, tag: str, type_: str, message_type: str, *, robot: str = "testRobot"
+    ) -> PeerInterface:
         """Wire, and wait until the connection is established."""
-        end = await self.wire(tag, type_, cls, robot=robot)
+        end = await self.wire(tag, type_, message_type, robot=robot)
         await end.active.until(lambda: end.is_active)
         return end
 
@@ -262,10 +266,10 @@ async def running_cloud(session: SessionSettings | None = None, **settings: Any)
     """Run it all on loopback."""
     master = FakeMaster()
     folder = Path(tempfile.mkdtemp(dir="/tmp"))
-    ends: dict[str, End] = {}
+    ends: dict[str, PeerInterface] = {}
 
     def make(port: Port) -> Interface:
-        end = ends[port.spec.tag] = End(port)
+        end = ends[port.spec.tag] = PeerInterface(port)
         return end
 
     faults: list[str] = []

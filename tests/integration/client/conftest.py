@@ -84,6 +84,11 @@ class Engine:
             socket.abort()
         await self.master.changed.until(lambda: len(self.master.left) > before)
 
+    def stop_reading(self) -> None:
+        """Take nothing more from the robot's connection, until that is broken."""
+        for socket in _server_sockets():
+            socket.transport.pause_reading()
+
     def connection(self, **options: Any) -> Connection:
         return Connection(self.door.url, "testUser", PASSWORD, "testRobot", timing=TIMING, **options)
 

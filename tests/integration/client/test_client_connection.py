@@ -348,3 +348,53 @@ async def test_a_refusal_on_the_way_back_closes_the_connection(engine: Engine) -
         with pytest.raises(RefusedError):
             await conn.create_container("c1")
         assert conn.state is State.CLOSED
+
+
+# Cancelling
+
+
+async def stall(engine: Engine, conn: Connection) -> None:
+    """Fill what the network takes: what is sent from now on waits in the queue of the connection."""
+    say = await conn.publisher("stalled", STRING, raw=True)
+    await say.wait_active(10)
+    engine.stop_reading()
+    say.publish(bytes(32 << 20))
+    while conn._session.transport._queue:  # until it is in the socket, as far as it goes
+        await asyncio.sleep(0)
+
+
+async def test_a_cancelled_request_is_sent_after_the_reconnect(engine: Engine) -> None:
+    async with engine.connection() as conn:
+        await conn.create_container("c1")
+        await stall(engine, conn)
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.1):
+                await conn.destroy_container("c1")
+        await engine.kick()
+        requests = engine.master.requests
+        await engine.master.changed.until(lambda: any(type_ == "DC" for _, type_, _ in requests))
+        assert conn.connected
+
+
+async def test_an_interface_whose_making_was_cancelled_can_be_made(engine: Engine) -> None:
+    async with engine.connection() as conn:
+        making = asyncio.create_task(conn.publisher("say", STRING))
+        await asyncio.sleep(0)
+        making.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await making
+        await conn.wait_active("say", 10)
+        publisher = await conn.publisher("say", STRING)
+        assert publisher.publish({"data": "up"})
+        assert await engine.end("say").received.get() == ros_string("up")
+
+
+async def test_leaving_can_be_cancelled_while_messages_wait(engine: Engine) -> None:
+    conn = await engine.connection().__aenter__()
+    await stall(engine, conn)
+    with pytest.raises(TimeoutError):
+        async with asyncio.timeout(0.1):
+            await conn.__aexit__(None, None, None)
+    assert conn.state is State.CLOSED
+    with pytest.raises(NotConnectedError):
+        await conn.create_container("c1")

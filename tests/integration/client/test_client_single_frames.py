@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rce_client.ends import ServiceClient
+from rce_client.services import ServiceClient
 from rce_robot import gate
 from rce_robot.websocket import RobotSocket
 
@@ -87,7 +87,7 @@ async def test_form_is_agreed_on_again_with_each_connection(
         assert await engine.end("say").received.get() == b"one"
         monkeypatch.setattr(gate, "read_features", lambda _query: frozenset())
         await engine.kick()
-        await conn._until(lambda: not conn.takes_single_frames)
+        await conn._session.until(lambda: not conn.takes_single_frames)
         await publisher.wait_active(30)
         publisher.publish(b"two")
         assert await engine.end("say").received.get() == b"two"

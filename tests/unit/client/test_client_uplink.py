@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
-from rce_client.ends import Publisher
 from rce_client.ros_bridge.bridge import Downlink, Uplink
+from rce_client.topics import Publisher
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
