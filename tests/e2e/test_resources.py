@@ -14,8 +14,8 @@ import pytest
 from support.engine import Engine, Program, running_engine, until
 
 from rce_client.connection import Connection
-from rce_client.topics import Publisher
 from rce_client.exceptions import RefusedError
+from rce_client.topics import Publisher
 
 pytestmark = [pytest.mark.e2e]
 
