@@ -9,9 +9,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
+from rce.model.names import Form, InterfaceType, Role
 from rce.protocol.codec import encode_data
 from rce.protocol.messages import NO_ID
-from rce.model.names import Form, InterfaceType, Role
 
 if TYPE_CHECKING:
     import asyncio

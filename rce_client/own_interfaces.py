@@ -231,7 +231,7 @@ class OwnInterfaces:
             endpoint_tag=self.robot_id,
             interface_tag=interface.tag,
             interface_type=interface.interface_type,
-            class_name=interface.message_type,
+            message_type=interface.message_type,
         )
         try:
             await session.request(ConfigureComponents(add_interfaces=(added,)))

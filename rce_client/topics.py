@@ -8,9 +8,9 @@ import logging
 from collections import deque
 from typing import TYPE_CHECKING, Generic, TypeVar
 
+from rce.model.names import Role
 from rce.protocol.codec import encode
 from rce.protocol.messages import LatchedSources
-from rce.model.names import Role
 from rce_client.exceptions import InterfaceError
 from rce_client.interfaces import ClientInterface, InterfaceOwner, LatchListener
 

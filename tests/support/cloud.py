@@ -35,13 +35,13 @@ from rce.control.model import (
     EndpointSpec,
     EndpointState,
     EndpointStatus,
-    InterfaceSpec,
     LinkAddress,
     LinkSpec,
 )
 from rce.control.server import ControlServer
 from rce.link import Endpoint, Interface, LinkHub
-from rce.protocol.names import EndpointId, InterfaceType
+from rce.model.names import EndpointId, InterfaceType
+from rce.model.specs import InterfaceSpec
 from rce_robot.app import App
 from rce_robot.settings import RobotSettings, SessionSettings
 
@@ -220,7 +220,10 @@ class Cloud:
         number = next(self._numbers)
         peer_tag = f"{robot}_{tag}"
         peer = InterfaceSpec(
-            tag=peer_tag, type=f"{kind.role.complement.value}Interface", message_type=message_type, addr=f"/{tag}"
+            tag=peer_tag,
+            type=f"{kind.role.complement.value}Interface",
+            message_type=message_type,
+            addr=f"/{tag}",
         )
         own = InterfaceSpec(tag=tag, type=type_, message_type=message_type)
         self._container = _grown(
