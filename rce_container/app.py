@@ -265,7 +265,7 @@ class Quitting:
         self.told.set()
 
     def _on_renewal(self) -> None:
-        if self.told.is_set() or self.renewal:  # an end that has begun goes on
+        if self.told.is_set() or self.renewal:  # an end that has begun continues
             return
         log.info("starting anew; containers stay")
         self.renewal = True

@@ -243,7 +243,7 @@ class StateFolder:
 
     @property
     def token(self) -> str:
-        """Names this state directory on its machine, for ever."""
+        """Names this state directory on its machine, indefinitely."""
         return self._word("run", secrets.token_hex(4))
 
     @property

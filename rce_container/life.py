@@ -95,7 +95,7 @@ NEXT: dict[Phase, dict[LifeEvent, Phase]] = {
 }
 
 ALIVE = frozenset({Phase.RUNNING, Phase.DEGRADED})
-"""The phases in which a container's environment reports, and is to go on."""
+"""The phases in which a container's environment reports, and is to continue."""
 
 
 def after(phase: Phase, life_event: LifeEvent) -> Phase:

@@ -23,7 +23,7 @@ class Chunk(NamedTuple):
 
     text: str
     offset: int
-    """Where the next read goes on."""
+    """Where the next read continues."""
 
 
 class _Raw(NamedTuple):
@@ -61,7 +61,7 @@ def read_node_log(folder: Path, tag: str, offset: int, limit: int, letters: byte
         offset: As for :func:`read_log`; within a line, the next one is meant.
         limit: Bytes of the log to read at most, though never less than it takes to get on.
         letters: Of which streams (:func:`rce_container.environment.logs.streams.letters_of`). What is
-            left out is passed over: the text may be empty though the log goes on.
+            left out is passed over: the text may be empty though the log continues.
 
     Raises:
         OSError: As for :func:`read_log`.

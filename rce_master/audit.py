@@ -102,7 +102,7 @@ class AuditLog:
     ) -> None:
         """Write what somebody did.
 
-        A record that cannot be written is kept in memory, and the engine's log says so: the engine goes on.
+        A record that cannot be written is kept in memory, and the engine's log says so: the engine continues.
         """
         record = Record(
             id=self._next_id,

@@ -114,7 +114,7 @@ class ControlHandler:
         try:
             await work
         except Exception:
-            # A fault of ours in one answer; its asker runs into a timeout, everybody else goes on.
+            # A fault of ours in one answer; its asker runs into a timeout, everybody else continues.
             logger.exception("could not answer")
 
     # Logins
@@ -199,7 +199,7 @@ class ControlHandler:
             self._reconciler.probe(id_)
 
     def _note_leaving(self, process: str, message: ToMaster) -> None:
-        """A robot may go before its login is done; its session must not stay connected for ever then."""
+        """A robot may go before its login is done; its session must not stay connected indefinitely then."""
         if not isinstance(message, Left):
             return
         for pending_login in self._logins:

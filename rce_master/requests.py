@@ -70,7 +70,7 @@ def _commands(message: messages.Request, user: str) -> Iterator[commands.Request
 
 @singledispatch
 def _command(item: Struct, user: str) -> commands.Request:
-    raise TypeError(f"{type(item).__name__} of {user} is no request")
+    raise TypeError(f"{type(item).__name__} of {user} is not a request")
 
 
 @_command.register

@@ -42,14 +42,14 @@ class Form(Protocol):
             warn: Told of what was ignored.
 
         Raises:
-            UnreadableError: It is no such message.
+            UnreadableError: It is not such a message.
         """
 
     def show(self, payload: Buffer) -> Any:
         """Return what stands for a serialized message in ``msg``.
 
         Raises:
-            UnreadableError: The payload is no such message.
+            UnreadableError: The payload is not such a message.
         """
 
     def pack(self, tag: str, message_type: str, msg_id: str, msg: Any) -> Rendered:

@@ -66,7 +66,7 @@ class Gate:
         assert isinstance(connection, RobotSocket)
         connection.speak()
         if ",".join(request.headers.get_all("Upgrade")).lower() != "websocket":
-            return None  # the library knows what to say to what is no WebSocket handshake
+            return None  # the library knows what to say to what is not a WebSocket handshake
         try:
             self._check_origin(request.headers.get_all("Origin"))
             authorization = request.headers.get_all("Authorization")

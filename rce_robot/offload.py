@@ -67,7 +67,7 @@ class Offload:
         """Make the data message that carries a payload to the robot.
 
         Raises:
-            UnreadableError: It is no message of the type, or cannot be shown.
+            UnreadableError: It is not a message of the type, or cannot be shown.
         """
         spec = self._spec
         job = Show(i_tag=spec.tag, message_type=spec.message_type, interface_type=spec.type, msg_id=msg_id)

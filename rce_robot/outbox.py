@@ -192,7 +192,7 @@ class Outbox:
     def put_latched(self, tag: str, source: str, message: Queued, *, shared: bool) -> None:
         """Queue the latched message of a source of the topic ``tag``, in place of an earlier one.
 
-        It is no part of what the limits hold and what makes room for others: a burst of many topics' latched
+        It is not part of what the limits hold and what makes room for others: a burst of many topics' latched
         messages waits until the robot has read it.
 
         Args:

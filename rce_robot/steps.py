@@ -34,7 +34,7 @@ READS_PER_STEP = 4
 
 
 class Steps:
-    """Lets a server's parser stop after a few frames; it goes on with the next data, or with none.
+    """Lets a server's parser stop after a few frames; it continues with the next data, or with none.
 
     Args:
         reader: Where the parser reads.
@@ -50,7 +50,7 @@ class Steps:
         self._payload: bytes | None = None
         self._filled = 0
         self.stopped = False
-        """Whether the parser could go on."""
+        """Whether the parser could continue."""
         self.is_between_frames = False
         """Whether the parser waits for a frame of which it has nothing yet."""
         reader.read_exact = self._read_exact  # type: ignore[method-assign]  # the library makes the reader

@@ -1,7 +1,7 @@
 """The robot task set: robots' namespaces on one side, the master on the other.
 
 It keeps nothing on disk: after a restart the master's ``Sync`` and the robots' return bring everything
-back. While the master is away everything goes on, except that no new robot can log in.
+back. While the master is away everything continues, except that no new robot can log in.
 """
 
 from __future__ import annotations
@@ -188,7 +188,7 @@ class RobotTaskSet:
                 who = credentials
                 reply = await self._channel.login(who.user, who.robot, who.password, address, who.token)
         except (ControlError, TimeoutError) as error:
-            reason = "The master cannot be reached, so nobody can log in now. Try again."
+            reason = "The master cannot be reached, so logging in is not possible now. Try again."
             raise HandshakeError(_UNAVAILABLE, reason) from error
         if reply.endpoint is None:
             status = reply.status if reply.status != _OK else _UNAVAILABLE

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class _Converted(NamedTuple):
-    """What becomes of a message of the robot, or which of its sources go on."""
+    """What becomes of a message of the robot, or which of its sources remain."""
 
     read: Read = Read()
     msg_id: str = NO_ID

@@ -47,7 +47,7 @@ def issue(
         f"made {folder.certificate(name)} and {folder.key(name)}: for {', '.join(details.hosts)},"
         f" until {details.expires:%Y-%m-%d}"
     )
-    typer.echo(f"another machine needs these two and {folder.authority}; programs that run load them anew")
+    typer.echo(f"another machine needs these two and {folder.authority}; running programs reload them")
 
 
 @app.command()

@@ -122,7 +122,7 @@ def _read(
         if key not in keys:
             close = difflib.get_close_matches(str(key), keys, 1, 0.5)
             hint = f"; did you mean {close[0]!r}?" if close else ""
-            faults.append(Fault(place, f"is no known key{hint}"))
+            faults.append(Fault(place, f"is not a known key{hint}"))
         elif value is not None:
             try:
                 values[keys[key].name] = _checked(ctx, keys[key], value)

@@ -127,7 +127,7 @@ def _namespaces(texts: list[str]) -> dict[str, str]:
     found = {master or "*": namespace for master, _, namespace in pairs}
     for namespace in found.values():
         if not is_graph_name(namespace) or is_private(namespace):
-            raise MultimasterError(f"{namespace!r} is no namespace")
+            raise MultimasterError(f"{namespace!r} is not a namespace")
     return found
 
 

@@ -68,7 +68,7 @@ def credential_faults(data: Mapping[str, Any]) -> list[Fault]:
     if len(given) == 1:
         return []
     if given:
-        return [Fault("token", "must not be there beside a password; leave one of the two out")]
+        return [Fault("token", "cannot be given beside a password; leave one of the two out")]
     what = "must be the user's password, or leave it out and give a token (rce robot add ROBOT)"
     return [Fault("password", f"is missing: {what}" if "password" not in data else what)]
 

@@ -40,7 +40,7 @@ def parse(text: str, source: str) -> Any:
         source: Its file's name, for errors.
 
     Raises:
-        ConfigError: It is no JSON or YAML, or has keys that come twice.
+        ConfigError: It is not JSON or YAML, or has keys that come twice.
     """
     if source.endswith(".json") or (
         text.lstrip().startswith(("{", "[")) and not source.endswith((".yaml", ".yml"))

@@ -216,7 +216,9 @@ def read_section(
                 faults.append(Fault(here + error.place, str(error)))
         elif key not in others:
             close = difflib.get_close_matches(str(key), [*fields, *inner, *others], 1, 0.5)
-            faults.append(Fault(here, "is no known key" + (f"; did you mean {close[0]!r}?" if close else "")))
+            faults.append(
+                Fault(here, "is not a known key" + (f"; did you mean {close[0]!r}?" if close else ""))
+            )
     return chosen
 
 

@@ -130,7 +130,7 @@ class Node(Strict):
     name: Annotated[str, _matches(messages.OptionalName)] = ""
     namespace: Annotated[str, _matches(messages.OptionalNamespace)] = ""
     restart: Annotated[Any, _one_of("restart")] = "never"
-    """When it is started again after it ended by itself."""
+    """When it is started again after it ended."""
     max_restarts: int = Field(default=5, alias="maxRestarts", ge=0, lt=2**31)
     """In a row; 0 for no limit."""
     after: tuple[Name, ...] = Field(default=(), strict=False)

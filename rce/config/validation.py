@@ -43,7 +43,7 @@ def _problem(detail: Any, model: type[BaseModel], steps: tuple[int | str, ...]) 
             return "is missing"
         case "extra_forbidden":
             close = difflib.get_close_matches(str(steps[-1]), _keys_beside(model, steps), 1, 0.5)
-            return f"is no known key; did you mean {close[0]!r}?" if close else "is no known key"
+            return f"is not a known key; did you mean {close[0]!r}?" if close else "is not a known key"
         case "value_error":
             return str(detail["ctx"]["error"])
         case _:

@@ -54,7 +54,7 @@ def parse_yaml(text: str, source: str) -> Any:
         source: Its file's name, for errors.
 
     Raises:
-        ConfigError: It is no YAML, or has keys that come twice.
+        ConfigError: It is not YAML, or has keys that come twice.
     """
     try:
         loader = _Loader(text)

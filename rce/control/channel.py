@@ -1,4 +1,4 @@
-"""The task set's side of the control channel: dials the master for ever.
+"""The task set's side of the control channel: dials the master indefinitely.
 
 One task, :meth:`TaskSetChannel.run`, owns everything. A connection starts with ``Hello``, which says all that
 is there, so nothing needs to be kept while there is none. Requests are kept until they are answered: they are
@@ -73,7 +73,7 @@ class TaskSetChannel:
         hello: Makes the first message of every connection: all that is there now.
         handler: Called with each message of the master but the answers to requests; one after the other, in
             order, and never cancelled by a lost connection. An exception from it is logged, and after a
-            while the master is dialed anew so that it says everything again.
+            while the master is dialed again so that it says everything again.
         timeouts: Times of this end.
         tls: Gives the TLS context for each connection to a ``wss://`` URL.
     """
@@ -320,7 +320,7 @@ class TaskSetChannel:
 
     def _abort(self, reason: str) -> None:
         """Cut the connection off; the next one starts with Hello."""
-        _log.warning("dialing the master anew: %s", reason)
+        _log.warning("dialing the master again: %s", reason)
         if self._socket is not None:
             self._socket.transport.abort()
 

@@ -2,7 +2,7 @@
 
 ``GET /contents/SHA256`` with the secret of the task sets and ``Range: bytes=OFFSET-`` answers 206 with the
 next piece and, in ``Content-Range``, the size of the whole. A piece is small enough for a server that has
-nothing but the time of a handshake, and a fetch that broke goes on where it broke.
+nothing but the time of a handshake, and a fetch that broke continues where it broke.
 """
 
 from __future__ import annotations

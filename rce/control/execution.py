@@ -105,7 +105,7 @@ def read_size(data: bytes) -> tuple[int, int]:
     """Read rows and columns.
 
     Raises:
-        ValueError: It is no size.
+        ValueError: It is not a size.
     """
     if len(data) != _SIZE.size:
         raise ValueError(f"a terminal's size has {_SIZE.size} bytes, not {len(data)}")
@@ -131,7 +131,7 @@ def read_command(text: str | bytes) -> Command:
     """Read what a user wants to be run.
 
     Raises:
-        ValueError: It is no such thing, or too much; the text says what.
+        ValueError: It is not such a thing, or too much; the text says what.
     """
     if len(text) > MAX_COMMAND:
         raise ValueError(f"the command has {len(text)} bytes; at most {MAX_COMMAND} are allowed")

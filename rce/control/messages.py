@@ -51,7 +51,7 @@ class MachineInfo(Struct, frozen=True, kw_only=True, omit_defaults=True, tag_fie
     """The runtime in use; container task sets only."""
     labels: tuple[str, ...] = ()
     slots: int = 0
-    """How many slots its containers may take in all; 0 if nobody counts."""
+    """How many slots its containers may take in all; 0 if it is not counted."""
     limits: str = ""
     """How limits are enforced: ``cgroup2``, ``cgroup1``, ``rlimit``; container task sets only."""
     networks: tuple[str, ...] = ("none",)
@@ -169,7 +169,7 @@ class LogChunk(_Message, frozen=True, kw_only=True, omit_defaults=True):
 
     request: int
     offset: int
-    """Where the next read goes on."""
+    """Where the next read continues."""
     text: str = ""
     error: str = ""
     life: str = ""

@@ -248,7 +248,7 @@ class ControlServer:
 
     async def _serve_peer(self, peer: Peer, socket: ServerConnection) -> None:
         while (older := self._peers.get(peer.process)) is not None:
-            _log.info("%r dialed anew", peer)
+            _log.info("%r dialed again", peer)
             older.abort()
             await older.finished.wait()
         self._peers[peer.process] = peer

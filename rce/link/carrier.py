@@ -60,7 +60,7 @@ class Carrier(ABC):
 
     @abstractmethod
     def pace(self, pacer: Pacer | None) -> None:
-        """Limit what passes; none for no limit. A link within a process is no traffic and has no limit."""
+        """Limit what passes; none for no limit. A link within a process is not traffic and has no limit."""
 
     @property
     @abstractmethod
@@ -141,7 +141,7 @@ class LocalCarrier(Carrier):
         self._schedule()
 
     def pace(self, pacer: Pacer | None) -> None:
-        """Do nothing: this is no traffic."""
+        """Do nothing: this is not traffic."""
 
     @property
     def traffic(self) -> tuple[int, int]:

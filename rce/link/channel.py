@@ -244,7 +244,7 @@ def as_payload(buffer: Buffer, limit: int) -> bytes | memoryview:
 
     Raises:
         MessageTooLarge: It is larger than ``limit`` bytes.
-        TypeError: It is no buffer.
+        TypeError: It is not a buffer.
     """
     payload = buffer if isinstance(buffer, bytes) else memoryview(buffer).cast("B")
     if len(payload) > limit:

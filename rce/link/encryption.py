@@ -32,7 +32,7 @@ def dialing_context(token: str) -> ssl.SSLContext:
 def accepting_context(token: str) -> ssl.SSLContext:
     """Return the context of a link's accepting end. Blocks for milliseconds, the first time longer."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.num_tickets = 0  # a link is dialed anew with a whole handshake
+    context.num_tickets = 0  # a link is dialed again with a whole handshake
     return _prepare(context, token, dialing=False)
 
 

@@ -352,5 +352,5 @@ def _bend_back(link: Link) -> Link:
 
 
 def _is_same_link(old: LinkSpec, new: LinkSpec | None) -> bool:
-    """Whether a link can go on under a new spec: another address or token does not end it."""
+    """Whether a link can continue under a new spec: another address or token does not end it."""
     return new is not None and (old.peer, old.dial) == (new.peer, new.dial)

@@ -3,7 +3,7 @@
 Sending is simply paced. What comes in cannot be sorted any more once it lies in the kernel's buffers, so the
 limited end says in advance how far its peer may send: a GRANT frame holds an offset in the stream of bytes,
 counted from the connection's beginning. The peer's bulk waits there, in its own queues, which drop their own;
-its small messages go on. A peer that sends much more than was granted is not read from until that is paid.
+its small messages continue. A peer that sends much more than was granted is not read from until that is paid.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class FlowControl:
         self._stream.go_on()
 
     def room(self, *, urgent: bool) -> int:
-        """Return how many bytes of payload the next frame may have; for 0, the stream goes on later."""
+        """Return how many bytes of payload the next frame may have; for 0, the stream continues later."""
         limit = FRAGMENT_SIZE
         if self._allowed != _NO_LIMIT:
             left = self._allowed - self._stream.sent

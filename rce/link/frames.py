@@ -11,7 +11,7 @@ Every frame starts with 24 bytes in network order::
         16     4  length   bytes of payload in this frame
         20     4  total    bytes of payload in the whole message
 
-A message with ``total`` above ``length`` goes on in FRAGMENT frames of the same channel. A channel has at
+A message with ``total`` above ``length`` continues in FRAGMENT frames of the same channel. A channel has at
 most one unfinished message at a time; frames of other channels, and frames that carry a whole message, may
 come in between. ABORT says that the rest of the channel's unfinished message will not come.
 
@@ -206,7 +206,7 @@ class FrameReader:
             The messages that these bytes completed, in order.
 
         Raises:
-            ProtocolError: The bytes are no frames. The reader cannot be used any more.
+            ProtocolError: The bytes are not frames. The reader cannot be used any more.
         """
         if self._current is not None and self._missing > 1 and not self._current.dropped:
             self._current.filled += count
@@ -305,7 +305,7 @@ class FrameReader:
         number, flags, zero, call_id, channel, length, total = HEADER.unpack_from(self._scratch, self._start)
         frame_type = _TYPES.get(number)
         if frame_type is None or zero:
-            raise ProtocolError("these bytes are no frame")
+            raise ProtocolError("these bytes are not a frame")
         if length > total or total > self.max_message:
             raise ProtocolError(f"message of {total} bytes (limit {self.max_message}), {length} in one frame")
         body = self._start + HEADER_SIZE

@@ -48,7 +48,7 @@ def parse_hello(frame: Frame) -> Hello:
     """Read the first frame of a link's dialing end.
 
     Raises:
-        ProtocolError: It is no HELLO, or one of a version that is not spoken here.
+        ProtocolError: It is not a HELLO, or one of a version that is not spoken here.
     """
     if frame.type is not FrameType.HELLO:
         raise ProtocolError(f"first frame is {frame.type.name}, not HELLO")

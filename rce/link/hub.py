@@ -92,7 +92,7 @@ class LinkHub:
         A socket file that a dead process left behind is replaced.
 
         Raises:
-            OSError: The path is too long (107 bytes at most), is no socket, or another process listens there.
+            OSError: The path is over 107 bytes long or not a socket, or another process listens there.
         """
         sock, inode = bind_private(path)
         await self.listen_socket(sock)

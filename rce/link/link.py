@@ -61,7 +61,7 @@ class Link:
     def drop_unfinished(self, size: int) -> None:
         """Drop the oldest messages that have not come as a whole yet, until ``size`` bytes are free.
 
-        The link goes on. Who waits for one of them is told; the log and the counters tell of the others.
+        The link continues. Who waits for one of them is told; the log and the counters tell of the others.
         """
         dropped = [] if self.carrier is None else self.carrier.drop_unfinished(size)
         for frame in dropped:

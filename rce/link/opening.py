@@ -77,7 +77,7 @@ async def read_hello(connection: socket.socket, limits: LinkLimits) -> ReceivedH
 
 
 def secured_link(received: bytes, limits: LinkLimits) -> str:
-    """Return the link for which TLS follows; empty if this is no announcement of TLS.
+    """Return the link for which TLS follows; empty if this is not an announcement of TLS.
 
     Args:
         received: What was read of a connection.

@@ -39,7 +39,7 @@ _LOW_WATER = 16 * KIB
 _NOT_SENT = 128 * KIB
 """What the kernel may hold unsent of a TCP link, for the same reason."""
 _TURN = 1 * MIB
-"""Bytes after which a link that could go on writing lets the event loop do something else."""
+"""Bytes after which a link that could continue writing lets the event loop do something else."""
 
 
 class SocketCarrier(asyncio.BufferedProtocol, Carrier):
@@ -150,7 +150,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         return 0 if self._ending else self._reader.held_bytes
 
     def drop_unfinished(self, size: int) -> list[Frame]:
-        """Forget the oldest messages that have not come as a whole yet; the connection goes on."""
+        """Forget the oldest messages that have not come as a whole yet; the connection continues."""
         return [] if self._ending else self._reader.drop_unfinished(size)
 
     def control(self, frame: Frame) -> None:

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 class TaskScope:
     """Owns the tasks of an object that is closed explicitly.
 
-    A task that fails is reported to the event loop's exception handler; the others go on. :meth:`close` ends
-    them all.
+    A task that fails is reported to the event loop's exception handler; the others continue. :meth:`close`
+    ends them all.
     """
 
     def __init__(self) -> None:

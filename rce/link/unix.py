@@ -42,14 +42,14 @@ def _remove_stale_socket(path: Path) -> None:
     """Remove the socket file of a process that is gone.
 
     Raises:
-        OSError: The path is no socket, or somebody listens there.
+        OSError: The path is not a socket, or somebody listens there.
     """
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:
         return
     if not stat.S_ISSOCK(mode):
-        raise FileExistsError(errno.EEXIST, "exists and is no socket", str(path))
+        raise FileExistsError(errno.EEXIST, "exists and is not a socket", str(path))
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:

@@ -115,7 +115,7 @@ def _next(stream: _Inflated) -> Entry | None:
     try:
         info = tarfile.TarInfo.frombuf(header, "utf-8", "strict")
     except (tarfile.HeaderError, ValueError) as error:
-        raise BadArchive(f"it is no archive of a package: {error}") from error
+        raise BadArchive(f"it is not an archive of a package: {error}") from error
     kind = _TYPES.get(info.type)
     if kind is None:
         raise BadArchive(f"{info.name!r}: only files, folders and symbolic links may be in a package")

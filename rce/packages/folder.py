@@ -83,7 +83,7 @@ def look_into(folder: Path, version: str = "", limits: ArchiveLimits = DEFAULT_L
 
 def _texts(folder: Path, limits: ArchiveLimits) -> dict[str, bytes]:
     if not folder.is_dir():
-        raise BadArchive(f"{folder} is no folder")
+        raise BadArchive(f"{folder} is not a folder")
     texts = {}
     for name in (*MANIFESTS, REQUIREMENTS):
         file = folder / name
@@ -102,8 +102,8 @@ def _name(folder: Path, texts: dict[str, bytes]) -> str:
     manifest = next((name for name in MANIFESTS if name in texts), None)
     if manifest is None:
         raise BadArchive(
-            f"{folder} is no package: it has no {' or '.join(MANIFESTS)}; write a package.yaml with the lines"
-            " 'name: ...' and 'version: ...'"
+            f"{folder} is not a package: it has no {' or '.join(MANIFESTS)}; write a package.yaml with the"
+            " lines 'name: ...' and 'version: ...'"
         )
     try:
         return parse_manifest(folder / manifest, texts[manifest], folder.resolve().name).name
@@ -120,7 +120,7 @@ def _version(requested: str, contents: Contents) -> str:
         )
     if not is_version(version):
         raise BadArchive(
-            f"{version!r} is no version: use up to four numbers, such as 1.2.0, and a label if it is not a"
+            f"{version!r} is not a version: use up to four numbers, such as 1.2.0, and a label if it is not a"
             " release yet, such as 1.3-rc1"
         )
     return version

@@ -88,7 +88,7 @@ def verify(key: str, signature: str, signed: bytes) -> None:
         signed: The statement.
 
     Raises:
-        BadKey: It is no public key.
+        BadKey: It is not a public key.
         BadSignature: The key's owner did not sign this.
     """
     from cryptography.exceptions import InvalidSignature
@@ -105,7 +105,7 @@ def key_id(key: str) -> str:
     """Tell the short name of a public key.
 
     Raises:
-        BadKey: It is no public key.
+        BadKey: It is not a public key.
     """
     return hashlib.sha256(_key_bytes(key)).hexdigest()[:_ID_LENGTH]
 

@@ -130,7 +130,7 @@ class Tree:
         for part in link.target.split("/"):
             here = self.entries.get("/".join(at))
             if here is not None and here.kind is not Kind.FOLDER:
-                return f"it is a link through {here.path!r}, which is no folder"
+                return f"it is a link through {here.path!r}, which is not a folder"
             if part == "..":
                 at = at[:-1]
             elif part not in ("", "."):

@@ -3,7 +3,7 @@
 ::
 
     ProtocolError
-    +-- MessageError      a text frame is no message, or a message holds something wrong
+    +-- MessageError      a text frame is not a message, or a message holds something wrong
     +-- AssemblyError     a binary frame, or a reference to one, is wrong
     +-- HandshakeError    an HTTP request or a WebSocket handshake is refused
 """
@@ -45,7 +45,7 @@ class HandshakeError(ProtocolError):
     """
 
     def __init__(self, status: int, reason: str) -> None:
-        # It may quote bytes of the request that are no text, which could not be sent back.
+        # It may quote bytes of the request that are not text, which could not be sent back.
         reason = reason.encode("utf-8", "backslashreplace").decode()
         super().__init__(status, reason)
         self.status = status

@@ -113,7 +113,7 @@ def read_credentials(query: str, authorization: Sequence[str] = ()) -> Credentia
 
     Raises:
         HandshakeError: 400 for a missing, repeated or malformed parameter, or a credential in both places;
-            401 for a password that is no SHA-256, or a header that is not understood.
+            401 for a password that is not a SHA-256, or a header that is not understood.
     """
     if authorization:
         return _read_header(query, authorization)

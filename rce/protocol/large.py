@@ -33,7 +33,7 @@ def read_large(
         The message, or the ids of the binary values that it refers to if none were given.
 
     Raises:
-        ProtocolError: It is no data message, or goes somewhere else.
+        ProtocolError: It is not a data message, or goes somewhere else.
     """
     check_elements(text, max_elements=limits.max_elements, max_values=limits.max_values)
     value = parse_json(text)

@@ -19,7 +19,7 @@ class Limits:
     max_values: int = 2_000_000
     """All values in one text, those in lists too."""
     max_request: int = 2**20
-    """The same for what is no data message: requests are carried out by the one master of all robots."""
+    """The same for what is not a data message: requests are carried out by the one master of all robots."""
     max_binary: int = 64 * 2**20
     """Longest binary frame in bytes, with its id."""
     max_depth: int = 64

@@ -68,7 +68,7 @@ Quantity: TypeAlias = int | float | Text
 NetworkName: TypeAlias = Literal["", "none", "group", "host"]
 """What a container sees of the network; empty for the default."""
 RestartName: TypeAlias = Literal["never", "on-failure", "always"]
-"""When a node that ended by itself is started again."""
+"""When a node that ended is started again."""
 Scalar: TypeAlias = bool | int | float | str
 Value: TypeAlias = bool | int | float | str | list[Scalar]
 """A parameter's value."""

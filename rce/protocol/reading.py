@@ -115,7 +115,7 @@ def decode(text: str | bytes, *, max_depth: int = DEFAULT_LIMITS.max_depth) -> C
         of the others in ``faults``.
 
     Raises:
-        MessageError: It is no message.
+        MessageError: It is not a message.
     """
     shallow = is_shallow(text, max_depth)
     if shallow:
@@ -187,7 +187,7 @@ def check_depth(value: Any, max_depth: int) -> None:
 
 
 def check_request_size(value: Any, size: int, limit: int) -> None:
-    """Check the size of what is no data message.
+    """Check the size of what is not a data message.
 
     Raises:
         MessageError: Its text is longer than ``limit``.
@@ -203,7 +203,7 @@ def parse_json(text: str | bytes) -> Any:
     """Read JSON; ``NaN`` and ``Infinity``, which Python's own writer emits, are understood too.
 
     Raises:
-        MessageError: It is no JSON.
+        MessageError: It is not JSON.
     """
     try:
         return _decode_any(text)
@@ -235,7 +235,7 @@ def message_from_json(value: Any, accept: Collection[str] = TYPES) -> ClientMess
         accept: The types that the peer may send.
 
     Raises:
-        MessageError: It is no message, or one of another type.
+        MessageError: It is not a message, or one of another type.
     """
     if not isinstance(value, dict):
         raise MessageError("", f"a message must be an object, not {_kind(value)}")
@@ -260,12 +260,12 @@ def read_request(kind: str, data: Any) -> Request:
     """Make a request of its type and its ``data``.
 
     Raises:
-        MessageError: ``kind`` is no request, or ``data`` as a whole is wrong. Wrong items of a ``CN`` or
+        MessageError: ``kind`` is not a request, or ``data`` as a whole is wrong. Wrong items of a ``CN`` or
             ``CX`` do not raise: they are in ``faults``.
     """
     cls = REQUEST_TYPES.get(kind)
     if cls is None:
-        raise MessageError("type", f"{_short(kind)} is no request; use one of {', '.join(REQUEST_TYPES)}")
+        raise MessageError("type", f"{_short(kind)} is not a request; use one of {', '.join(REQUEST_TYPES)}")
     if not isinstance(data, dict):
         raise MessageError("data", f"must be an object, not {_kind(data)}")
     if cls is ConfigureComponents:

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 class Fault(Struct, frozen=True):
-    """Something from the peer was refused or dropped; the stream goes on."""
+    """Something from the peer was refused or dropped; the stream continues."""
 
     text: str
     """Fit to be sent to the peer as ``ER``; it starts with the call, if there is one."""

@@ -133,7 +133,7 @@ class ParameterMissing(RosError, KeyError):  # noqa: N818
 
 
 class TcprosError(RosError):
-    """A TCPROS connection cannot go on."""
+    """A TCPROS connection cannot continue."""
 
 
 class MalformedFrame(TcprosError):  # noqa: N818
@@ -170,7 +170,7 @@ class ServiceError(RosError):
 class ServiceNotFound(ServiceError):  # noqa: N818
     """Nobody provides the service."""
 
-    text = "nobody provides it"
+    text = "it has no provider"
 
 
 class ServiceLost(ServiceError):  # noqa: N818

@@ -70,7 +70,7 @@ def started(seconds: float) -> str:
 
 
 def read_record(payload: bytes | memoryview) -> LogRecord:
-    """Read a record; what is no UTF-8 in it is replaced.
+    """Read a record; what is not UTF-8 in it is replaced.
 
     Raises:
         ValueError: It is not one.

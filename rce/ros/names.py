@@ -93,7 +93,7 @@ class Arguments:
     parameters: Mapping[str, str] = field(default_factory=dict)
     """``_name:=value``: private parameters, the name without its underscore, the value as written."""
     rest: tuple[str, ...] = ()
-    """What is no remapping: the program's own arguments."""
+    """What is not a remapping: the program's own arguments."""
 
 
 def parse_arguments(argv: Iterable[str]) -> Arguments:

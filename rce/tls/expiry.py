@@ -63,7 +63,7 @@ def name_warning(identity: TlsIdentity, host: str) -> str | None:
         return None
     return (
         f"clients are sent to {host}, but the certificate {certificate} is for"
-        f" {', '.join(details.hosts) or 'no host'}: issue it anew with --host {host}, or set --public-host"
+        f" {', '.join(details.hosts) or 'no host'}: issue it again with --host {host}, or set --public-host"
     )
 
 

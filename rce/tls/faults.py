@@ -91,7 +91,7 @@ def _explain_server(said: str) -> str:
             " this machine, or that of the machine that issued the certificate"
         )
     if "revoked" in said:
-        return "the server's certificate was revoked; issue it anew there: rce certificate issue NAME"
+        return "the server's certificate was revoked; issue it again there: rce certificate issue NAME"
     if "not valid for" in said or "mismatch" in said.lower():
         return (
             f"the server's certificate is for another name ({said.rstrip('.')});"

@@ -61,7 +61,7 @@ class TlsGate:
         return _Arrival(self, protocol)
 
     async def close(self) -> None:
-        """End the handshakes that go on."""
+        """End the handshakes that are not over."""
         self._closed = True
         tasks = list(self._tasks)
         for task in tasks:

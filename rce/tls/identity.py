@@ -30,7 +30,7 @@ class TlsFiles:
     authority: Path | None = None
     """Whose certificates the other end may have; the system's authorities if None."""
     revoked: Path | None = None
-    """The authority's list of certificates that it has revoked; there may be no such file."""
+    """The authority's list of certificates that it has revoked; the file may be missing."""
 
 
 class TlsIdentity:

@@ -1,4 +1,4 @@
-"""What the log says of requests that are no HTTP: one line, as it is no fault of the engine's."""
+"""What the log says of requests that are not HTTP: one line, as it is not a fault of the engine's."""
 
 from __future__ import annotations
 

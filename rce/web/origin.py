@@ -16,7 +16,7 @@ def is_foreign(origin: str | None, host: str, allowed: Collection[str] = ()) -> 
     """Return whether a request comes from a page of another site.
 
     Args:
-        origin: The request's ``Origin``; programs that are no browser send none.
+        origin: The request's ``Origin``; programs that are not browsers send none.
         host: The request's ``Host``.
         allowed: Origins that may use the server all the same.
     """

@@ -143,7 +143,7 @@ class HttpServer:
             guest.rest()
 
     async def _grant(self, request: web.Request, response: web.StreamResponse) -> None:
-        """Take note that a handler began to stream: who may have that is no stranger."""
+        """Take note that a handler began to stream: who may have that is not a stranger."""
         guest = None if request.transport is None else self._guests.get(request.transport)
         if guest in self._handled and response.status < _FIRST_ERROR:
             guest.leave()

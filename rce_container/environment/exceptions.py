@@ -1,6 +1,6 @@
 """What goes wrong inside a container.
 
-EnvironmentFault         told to the user as it is; the rest of the container goes on
+EnvironmentFault         told to the user as it is; the rest of the container continues
 ├── NodeError            a node cannot be started
 └── ParameterError       a parameter cannot be set
 ChannelError             the other end of the control socket breaks the protocol, or does not read

@@ -217,7 +217,7 @@ class InterfaceMaker:
         if kind.form is not Form.INTERFACE:
             raise ValueError(f"a container has no {spec.type}; use {kind.role.value}Interface")
         if not spec.addr or not names.is_graph_name(spec.addr):
-            raise ValueError(f"addr {spec.addr!r} is no ROS name; give the topic or service it stands for")
+            raise ValueError(f"addr {spec.addr!r} is not a ROS name; give the topic or service it stands for")
         if kind.role.is_service:
             self._types.service(spec.message_type)
         else:

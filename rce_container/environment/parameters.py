@@ -36,7 +36,7 @@ def evaluate(
     """Work out a parameter's global name and its value, with the substitutions made in strings.
 
     Raises:
-        ParameterError: The name is no ROS name, or a substitution cannot be made.
+        ParameterError: The name is not a ROS name, or a substitution cannot be made.
     """
 
     def filled(value: bool | float | str) -> bool | float | str:
@@ -44,7 +44,7 @@ def evaluate(
 
     name = names.canonical(f"/{spec.name}")
     if not names.is_graph_name(name) or name == "/":
-        raise ParameterError(f"parameter {spec.name!r}: this is no ROS name")
+        raise ParameterError(f"parameter {spec.name!r}: this is not a ROS name")
     try:
         if isinstance(spec.value, list):
             return name, [filled(item) for item in spec.value]

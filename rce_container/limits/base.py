@@ -61,7 +61,7 @@ def in_megabytes(size: int) -> str:
 
 
 class ControlGroupUsage(NamedTuple):
-    """What all processes of a control group consume, or consumed since it was made. None: nobody counts."""
+    """What all processes of a control group consume, or consumed since it was made. None: not counted."""
 
     cpu_s: float | None = None
     throttled_s: float = 0.0
@@ -69,7 +69,7 @@ class ControlGroupUsage(NamedTuple):
     memory: int | None = None
     """Bytes that cannot be had back without harm: files that are only cached do not count."""
     memory_peak: int = 0
-    """Bytes, cached files included; 0 if nobody counts."""
+    """Bytes, cached files included; 0 if it is not counted."""
     io_read: int = 0
     """Bytes from disks."""
     io_written: int = 0

@@ -169,7 +169,7 @@ class CgroupLimiter(Limiter):
     """Makes cells below this program's own cgroups.
 
     Args:
-        token: Names the task set on this machine, for ever.
+        token: Names the task set on this machine, indefinitely.
         ledger: A file of the task set; holds where its control groups were, since the next manager may be
             started in another cgroup.
         proc: See :func:`rce_container.limits.hierarchy.find`.

@@ -63,8 +63,8 @@ class ControlGroupV1(CgroupControlGroup):
 
     def _write_limits(self, limits: Limits) -> None:
         self._write_memory(limits.memory or -1)
-        # What waits in TCP connections is no part of the memory in this version, and comes from one store for
-        # the whole machine. Beyond this limit a connection gets no more than it cannot do without.
+        # What waits in TCP connections is not part of the memory in this version, and comes from one store
+        # for the whole machine. Beyond this limit a connection gets no more than it cannot do without.
         self._write("memory.kmem.tcp.limit_in_bytes", limits.memory or -1)
         self._write("pids.max", limits.processes or "max")
         self._write("cpu.cfs_period_us", PERIOD_US)

@@ -21,7 +21,7 @@ def choose_limiter(token: str, ledger: Path, proc: Path = PROC) -> Limiter:
     """Find the best way that works: cgroups of the version that can do more, else limits of each process.
 
     Args:
-        token: Names the task set on this machine, for ever.
+        token: Names the task set on this machine, indefinitely.
         ledger: A file of the task set, for where its cgroups are.
         proc: This process in ``/proc``.
     """

@@ -24,7 +24,7 @@ def parse_address(text: str) -> IPv4Interface:
     try:
         address = IPv4Interface(whole)
     except (AddressValueError, NetmaskValueError, ValueError) as error:
-        raise NetworkError(f"the groupIp {text!r} is no IPv4 address, such as 10.0.0.2/16") from error
+        raise NetworkError(f"the groupIp {text!r} is not an IPv4 address, such as 10.0.0.2/16") from error
     network = address.network
     if not _SHORTEST_PREFIX <= network.prefixlen <= _LONGEST_PREFIX:
         raise NetworkError(

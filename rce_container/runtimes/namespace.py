@@ -123,7 +123,7 @@ class NamespaceRuntime(Runtime):
         closed = [str(path) for path in packages if self._root and _is_closed(path)]
         if not closed:
             return ""
-        return f"containers cannot read {', '.join(closed)}: make it readable by everybody (chmod -R o+rX)"
+        return f"containers cannot read {', '.join(closed)}: make it readable by all users (chmod -R o+rX)"
 
     def _claimed(self) -> str:
         """Say whose the containers' users are; empty if nobody's."""

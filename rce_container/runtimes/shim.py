@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 SHELL = "/bin/sh"
 
 # When all has ended, the shim leaves the container's cgroups BASE/TASK_SET/MARK, each for the one in which
-# the engine is (see rce_container.limits.cgroup2), and removes them: there may be no manager to do it.
+# the engine is (see rce_container.limits.cgroup2), and removes them: the manager may be gone by then.
 _SHIM = """
 trap : HUP INT TERM
 folder=$1 run=$2 linger=$3 python=$4 sweeper=$5 mark=$6 switch=$7 joined=1 cells=

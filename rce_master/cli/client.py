@@ -145,7 +145,7 @@ class ApiClient:
             raise CliError(f"cannot use the master at {self._base}: {_words(error)}") from error
 
     async def events(self, since: int | None = None) -> AsyncIterator[Event]:
-        """Follow events for ever; a stream that breaks is resumed where it broke.
+        """Follow events indefinitely; a stream that breaks is resumed where it broke.
 
         Raises:
             ApiError: The master refused.

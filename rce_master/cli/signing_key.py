@@ -36,7 +36,7 @@ def load() -> SigningKey | None:
     except OSError as error:
         raise CliError(f"cannot read the key {file}: {error.strerror}") from error
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
-        raise CliError(f"the key {file} can be read by others; if nobody has, run: chmod 600 {file}")
+        raise CliError(f"the key {file} can be read by others; if it was not copied, run: chmod 600 {file}")
     try:
         return SigningKey.from_pem(text)
     except BadKey as error:

@@ -72,7 +72,7 @@ async def add_user(call: Call) -> models.UserOut:
     return _views(call).user(user)
 
 
-@routes.route("DELETE", "/users/{name}", "Remove a user with all that is theirs", status=204, admin=True)
+@routes.route("DELETE", "/users/{name}", "Remove a user and everything it owns", status=204, admin=True)
 async def remove_user(call: Call) -> None:
     """Remove a user."""
     await call.services.state_service.submit(commands.RemoveUser(name=call.path("name")))

@@ -428,7 +428,7 @@ class MachineOut(Model):
     memory_used: int
     """Resident bytes of the task set."""
     slots: int
-    """0 if nobody counts."""
+    """0 if it is not counted."""
     limits: str
     networks: list[str]
     runtimes: list[str]
@@ -494,10 +494,10 @@ class LogOut(Model):
 
     text: str
     offset: int
-    """Where the next read goes on."""
+    """Where the next read continues."""
     life: str = ""
     """The container's life of which this is the log; reads of the same log name it."""
     ended: float | None = None
-    """When that life ended, in seconds since 1970; null if it goes on."""
+    """When that life ended, in seconds since 1970; null if it continues."""
     reason: str = ""
     """Why it ended."""

@@ -259,4 +259,4 @@ class RouteTable:
         return add
 
 
-OF_USER = Query(name="user", description="Whose; administrators only. Default: own, in lists everybody's.")
+OF_USER = Query(name="user", description="Whose; administrators only. Default: own, in lists all users'.")

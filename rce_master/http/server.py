@@ -86,7 +86,7 @@ def _origin_guard(allowed: frozenset[str], names: ServerNames) -> Any:
     async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
         """Refuse pages of other sites: a browser would send them with the user's network position."""
         origin, host = request.headers.get(hdrs.ORIGIN), request.headers.get(hdrs.HOST, "")
-        # Robots ask for their endpoint by any name that leads here: the answer is no secret.
+        # Robots ask for their endpoint by any name that leads here: the answer is not secret.
         refusal = None if origin is None and request.path == "/" else names.refusal(host)
         if refusal is not None and origin not in allowed:
             return _error(421, refusal)

@@ -223,7 +223,7 @@ class Transaction:
         return found.value if found else 0
 
     def raise_counter(self, counter: str, value: int) -> None:
-        """Make a counter go on above a value."""
+        """Make a counter continue above a value."""
         found = self.tables.counters.get(counter)
         if value > (found.value if found else 0):
             self._assign(self.tables.counters, Counter(name=counter, value=value))

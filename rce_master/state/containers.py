@@ -96,7 +96,7 @@ def add_node(tx: Transaction, command: AddNode) -> None:
 
 
 def _check_order(container: Container, node: NodeSpec) -> None:
-    """Refuse nodes that would wait for one another for ever; what a node comes after may be yet to come."""
+    """Refuse nodes that would wait for one another; what a node comes after may be yet to come."""
     after = {other.tag: other.after for other in (*container.nodes.values(), node)}
     circle = find_circle(node.tag, after)
     if circle:
@@ -146,7 +146,7 @@ def delete_parameter(tx: Transaction, command: DeleteParameter) -> None:
 def _check_value(name: str, value: ParameterValue) -> None:
     for item in value if isinstance(value, list) else [value]:
         if isinstance(item, int) and not -_INT32 <= item < _INT32:
-            raise Invalid(f"parameter {name!r}: {item} does not fit into 32 bits, which is all that ROS has")
+            raise Invalid(f"parameter {name!r}: {item} does not fit into 32 bits, the size of ROS's integers")
         if isinstance(item, float) and not math.isfinite(item):
             raise Invalid(f"parameter {name!r}: {item} is not a finite number")
 
@@ -179,11 +179,11 @@ def lose(tx: Transaction, container: Container) -> None:
 
 
 def ended(tx: Transaction, container: Container) -> None:
-    """Note that a container's task set ended it though it is desired; it is placed anew."""
+    """Note that a container's task set ended it though it is desired; it is placed again."""
     if draining.promote(tx, container):
         return
     _unbind(tx, container, ContainerEvent.WITHDRAW)
-    tx.happen("container_gone", container.id, "its task set ended it; it is placed anew")
+    tx.happen("container_gone", container.id, "its task set ended it; it is placed again")
 
 
 def _unbind(tx: Transaction, container: Container, event: ContainerEvent) -> None:

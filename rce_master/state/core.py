@@ -114,7 +114,7 @@ class State:
                 must be converted first (:func:`rce_master.state.migration.conversion`).
             now: Seconds of a clock that never goes back.
             settings: Limits and times.
-            revision: Revisions go on above this, also if the store is an old copy. It must grow from one
+            revision: Revisions continue above this, also if the store is an old copy. It must grow from one
                 start of the master to the next more than there were changes between them: the time of day
                 in milliseconds does.
 

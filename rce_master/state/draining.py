@@ -1,7 +1,7 @@
 """Machines that are to be emptied: they take no new containers, and those they have are handed over.
 
 A container is *handed over* by a move: a copy of it, with its nodes and parameters but without interfaces and
-connections, is made at another machine while the container goes on; once the copy's nodes are up, the copy
+connections, is made at another machine while the container continues; once the copy's nodes are up, the copy
 becomes the container, gets the interfaces and connections, and the former one is dropped. A node that is not
 up in the container need not be up in the copy: one that is none of ROS never registers. One container at a
 time moves away from a machine; those in the network of one group move together. What finds room nowhere

@@ -146,7 +146,7 @@ def _check_container(tables: Tables, live: ContainerLive) -> None:
 def _check_moves(tables: Tables) -> None:
     for move in tables.moves:
         container = tables.container(move.id)
-        assert container is not None, f"{move.id}: moves and is no container"
+        assert container is not None, f"{move.id}: moves and is not a container"
         assert container.task_set, f"{move.id}: moves and is placed nowhere"
         assert move.to != container.task_set, f"{move.id}: moves to where it is"
         assert tables.is_connected(move.to), f"{move.id}: moves to {move.to}, which is away"

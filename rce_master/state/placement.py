@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 DETOUR = 0.2
 """So much more of a machine may be in use, as a share of it, for the sake of a container's company."""
 CROWD = 16
-"""Where nobody counts slots, so many containers for each core count as a full load (but are no limit)."""
+"""Where slots are not counted, so many containers for each core count as a full load (but are no limit)."""
 PODMAN = "podman"
 _TINY = 1e-6
 

@@ -72,7 +72,7 @@ class Token(Struct, frozen=True, kw_only=True):
 
     @property
     def id(self) -> str:
-        """What people call it by; it is no secret."""
+        """What people call it by; it is not secret."""
         return self.digest[:TOKEN_ID_LENGTH]
 
     @property

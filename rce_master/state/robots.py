@@ -40,7 +40,7 @@ def login(tx: Transaction, command: RobotLogin) -> None:
         or task_set.kind is not TaskSetKind.ROBOT
         or not tx.tables.is_connected(command.process)
     ):
-        raise Conflict(f"{command.process!r} is no connected robot task set")
+        raise Conflict(f"{command.process!r} is not a connected robot task set")
     there = tx.tables.endpoints.get(command.id)
     if there is None:
         _new(tx, name)

@@ -98,7 +98,7 @@ def _adopt(tx: Transaction, process: str, status: EndpointStatus) -> None:
 
 
 def _find_again(tx: Transaction, process: str, container: Container, status: EndpointStatus) -> None:
-    """Let a container that is placed nowhere go on where it is, unless it grew too much meanwhile.
+    """Let a container that is placed nowhere continue where it is, unless it grew too much meanwhile.
 
     One of the same name that was there before it is none of its lives: ``Sync`` has it dropped, and the
     container may be placed there when it is gone.
@@ -135,7 +135,7 @@ def _miss(tx: Transaction, endpoint: Container | Robot) -> None:
 
 
 def left(tx: Transaction, command: TaskSetLeft) -> None:
-    """Note that a task set's channel ended: its robots become absent, its containers go on unseen."""
+    """Note that a task set's channel ended: its robots become absent, its containers continue unseen."""
     process = command.process
     if not tx.tables.is_connected(process):
         return
@@ -186,7 +186,7 @@ def gone(tx: Transaction, command: EndpointGone) -> None:
 
 
 def _ended(tx: Transaction, command: EndpointGone) -> None:
-    """Note that a task set ended by itself what it was told to make."""
+    """Note that a task set ended what it was told to make."""
     endpoint = tx.tables.endpoints.get(command.id)
     move = tx.tables.moves.get(command.id)
     if isinstance(endpoint, Container) and endpoint.task_set == command.process:
@@ -232,7 +232,7 @@ def _expire(tx: Transaction, presence: Presence) -> None:
 def restart(tx: Transaction, revision: int) -> None:
     """Begin with what the store held: nobody is connected, and every grace time starts now.
 
-    Revisions go on above ``revision``. What task sets report has no say in it: a revision that nobody gave
+    Revisions continue above ``revision``. What task sets report has no say in it: a revision that nobody gave
     would be in force as long as the store is.
     """
     tx.raise_counter("revision", revision)

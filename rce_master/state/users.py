@@ -20,7 +20,7 @@ def add_user(tx: Transaction, command: AddUser) -> None:
     """Make a user."""
     user = command.user
     if not is_name(user.name):
-        raise Invalid(f"{user.name!r} is no user name: use letters, digits and '_', a letter first")
+        raise Invalid(f"{user.name!r} is not a user name: use letters, digits and '_', a letter first")
     if user.name in tx.tables.users:
         raise Conflict(f"there is a user {user.name!r} already")
     tx.put(user)
@@ -58,7 +58,7 @@ def set_role(tx: Transaction, command: SetRole) -> None:
 
 
 def remove_user(tx: Transaction, command: RemoveUser) -> None:
-    """Remove a user with all that is theirs."""
+    """Remove a user and everything it owns."""
     user = _find(tx, command.name)
     _keep_an_admin(tx, user)
     for endpoint in tx.tables.endpoints.by("user", user.name):

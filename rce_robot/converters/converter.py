@@ -69,7 +69,7 @@ class Converter:
             ``poses[].bar``, each once.
 
         Raises:
-            ConversionError: It is no message of the type; names the field.
+            ConversionError: It is not a message of the type; names the field.
         """
         notes: list[bool] = []
         try:
@@ -91,7 +91,7 @@ class Converter:
             ``memoryview`` (of ``payload``, which must not change while they are used) or ``bytes``.
 
         Raises:
-            ConversionError: The bytes are no message of the type.
+            ConversionError: The bytes are not a message of the type.
         """
         if len(payload) > LARGE:
             payload = memoryview(payload)

@@ -32,7 +32,7 @@ class CustomConverter(Protocol):
         """Return the fields of what came. JSON objects do not come here: they are fields already.
 
         Raises:
-            ValueError: It is no form of the message; the text says why.
+            ValueError: It is not a form of the message; the text says why.
         """
 
 

@@ -2,7 +2,7 @@
 
 ::
 
-    ConversionError    a JSON value does not fit the message type, or bytes are no message of it
+    ConversionError    a JSON value does not fit the message type, or bytes are not a message of it
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ def time_from_json(value: Any) -> tuple[int, int]:
     """Read a time into seconds and nanoseconds.
 
     Raises:
-        ValueError: It is no time, or not one between 1970 and 2106.
+        ValueError: It is not a time, or not one between 1970 and 2106.
     """
     if value.__class__ is dict:
         return _parts(value, "time", 0, 0xFFFFFFFF)
@@ -64,7 +64,7 @@ def duration_from_json(value: Any) -> tuple[int, int]:
     """Read a duration into seconds and nanoseconds; the nanoseconds are never negative.
 
     Raises:
-        ValueError: It is no duration, or out of range.
+        ValueError: It is not a duration, or out of range.
     """
     if value.__class__ is dict:
         return _parts(value, "duration", -0x80000000, 0x7FFFFFFF)

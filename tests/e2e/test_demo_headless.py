@@ -133,7 +133,7 @@ async def test_sigterm_ends_a_demo_that_is_still_starting() -> None:
         assert b"1 robots" in await process.stdout.readline()
         process.send_signal(signal.SIGTERM)
         assert b"stopped" in await asyncio.wait_for(process.stdout.read(), 30)
-        assert await process.wait() == 1, "a run that was ended early is no good run"
+        assert await process.wait() == 1, "a run that was ended early is not a good run"
 
 
 @pytest.mark.parametrize("runtime", RUNTIMES)

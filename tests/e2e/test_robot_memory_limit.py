@@ -155,7 +155,7 @@ async def large_texts(engine: Engine) -> None:
         for number in range(6):
             data = f'{{"iTag":"out","type":"{STRING}","msgID":"nil","msg":{texts[number % 2]}}}'
             await talks.send(f'{{"type":"DM","data":{data}}}')
-            # An answer comes for each: the message itself, or that it is no message or one too many.
+            # An answer comes for each: the message itself, or that it is not a message or one too many.
             async with asyncio.timeout(60):
                 while json.loads(await talks.recv())["type"] not in {"DM", "ER"}:
                     pass

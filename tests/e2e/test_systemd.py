@@ -123,7 +123,9 @@ async def check_reload(machine: Booted) -> None:
     machine.run("sed -i s/runtime:/runtimes:/ /etc/rce/engine.yaml")
     said = await machine.run_soon("systemctl reload rce-container", code=None)
     assert "failed" in said
-    assert "container.runtimes: is no known key; did you mean 'runtime'?" in machine.journal("rce-container")
+    assert "container.runtimes: is not a known key; did you mean 'runtime'?" in machine.journal(
+        "rce-container"
+    )
     machine.run("sed -i 's/runtimes: namespace/runtime: namespace, labels: [reloaded]/' /etc/rce/engine.yaml")
     await machine.run_soon("systemctl reload rce-container")
     await until(

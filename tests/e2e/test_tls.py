@@ -510,7 +510,7 @@ async def test_task_set_with_certificate_and_wrong_secret_is_refused(world: Worl
 
 @in_world
 async def test_renewed_certificate_is_used_without_restart(world: World) -> None:
-    """Connections that are there go on with the old one; traffic flows the whole time."""
+    """Connections that are there continue with the old one; traffic flows the whole time."""
 
     async def serial(port: int) -> str:
         code, text = await world.run(
@@ -558,7 +558,7 @@ def replaced(folder: CertificateFolder, aside: Path) -> None:
 async def test_rce_ros_outlives_faults_of_the_certificate(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It was connected once: it says what is wrong, keeps trying, and goes on when that is repaired."""
+    """It was connected once: it says what is wrong, keeps trying, and continues when that is repaired."""
     folder = world.certificates
     hosts = folder.details("engine").hosts
     file = tmp_path / "robot.config"

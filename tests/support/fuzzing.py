@@ -228,7 +228,7 @@ async def exchange(port: int, request: bytes, *, whole: bool = False) -> list[in
 
 
 async def _begin(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, patience: float) -> bytes:
-    """Wait for the beginning of an answer; then, unless it goes on for ever, send the end of the request."""
+    """Wait for the beginning of an answer; then, unless it never ends, send the end of the request."""
     answer = b""
     with contextlib.suppress(TimeoutError):
         answer = await asyncio.wait_for(reader.read(1 << 16), patience)

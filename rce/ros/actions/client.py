@@ -38,7 +38,7 @@ class ActionClient:
     ``async with ActionClient(node, "fibonacci", "actionlib_tutorials/FibonacciAction") as client:``
     ``goal = await client.send(order=5)``, ``print(await goal.result())``
 
-    Leaving the block forgets the goals, which go on at the server; here, they are lost.
+    Leaving the block forgets the goals, which continue at the server; here, they are lost.
 
     Attributes:
         name: The action's global name.

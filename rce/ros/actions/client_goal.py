@@ -96,7 +96,7 @@ class ClientGoal:
             How it ended.
 
         Raises:
-            TimeoutError: It is not over within ``timeout`` seconds; it goes on.
+            TimeoutError: It is not over within ``timeout`` seconds; it continues.
         """
         async with asyncio.timeout(timeout):
             await self._done.wait()
@@ -107,7 +107,7 @@ class ClientGoal:
 
         Raises:
             GoalFailed: It ended in another way than by success.
-            TimeoutError: It is not over within ``timeout`` seconds; it goes on.
+            TimeoutError: It is not over within ``timeout`` seconds; it continues.
         """
         state = await self.wait(timeout)
         if state is not GoalState.SUCCEEDED or self._result is None:

@@ -27,7 +27,7 @@ class GoalServer(Protocol):
         """Tell the goal's clients how it goes."""
 
     async def sleep(self, seconds: float) -> bool:
-        """Sleep in ROS time; tell whether the node goes on."""
+        """Sleep in ROS time; tell whether the node continues."""
 
 
 class ServerGoal:
@@ -94,7 +94,7 @@ class ServerGoal:
 
         Raises:
             IllegalTransition: It was not accepted, or is over.
-            SerializationError: The result does not fit its type; the goal goes on.
+            SerializationError: The result does not fit its type; the goal continues.
         """
         self._server.transition(self._entry, GoalEvent.SUCCEED, text, result)
 
@@ -103,7 +103,7 @@ class ServerGoal:
 
         Raises:
             IllegalTransition: It was not accepted, or is over.
-            SerializationError: The result does not fit its type; the goal goes on.
+            SerializationError: The result does not fit its type; the goal continues.
         """
         self._server.transition(self._entry, GoalEvent.ABORT, text, result)
 
@@ -112,7 +112,7 @@ class ServerGoal:
 
         Raises:
             IllegalTransition: It is over.
-            SerializationError: The result does not fit its type; the goal goes on.
+            SerializationError: The result does not fit its type; the goal continues.
         """
         self._server.transition(self._entry, GoalEvent.CANCEL, text, result)
 

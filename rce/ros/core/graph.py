@@ -153,7 +153,7 @@ class Graph:
         """Check the invariants; for tests."""
         self._registrations.validate()
         for topic in self._types:
-            assert self._is_used(topic), f"the type of {topic} is kept although nobody uses it"
+            assert self._is_used(topic), f"the type of {topic} is kept although it is unused"
 
     # ------------------------------------------------------------------ inside
 

@@ -4,7 +4,7 @@
 
     RosError
     +-- MultimasterError
-        +-- MalformedHeartbeat   a datagram that is no heartbeat of a known version
+        +-- MalformedHeartbeat   a datagram that is not a heartbeat of a known version
         +-- MalformedState       a master's description that cannot be read
         +-- NoSuchInterface      an interface or address to discover on that is not there
         +-- NoDiscovery          no discovery runs at a master
@@ -22,7 +22,7 @@ class MultimasterError(RosError):
 
 
 class MalformedHeartbeat(MultimasterError):  # noqa: N818
-    """A datagram is no heartbeat of a known version."""
+    """A datagram is not a heartbeat of a known version."""
 
 
 class MalformedState(MultimasterError):  # noqa: N818

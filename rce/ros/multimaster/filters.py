@@ -151,7 +151,7 @@ class SyncLists:
             if name in _NOT_HERE and not value:
                 continue
             if name not in cls.__slots__:
-                raise MultimasterError(f"{name} is no setting of a synchronization")
+                raise MultimasterError(f"{name} is not a setting of a synchronization")
             if name == "sync_remote_nodes":
                 lists.sync_remote_nodes = bool(value)
             elif isinstance(value, str | list | dict) or value is None:

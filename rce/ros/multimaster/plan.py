@@ -122,8 +122,8 @@ def split_clashes(
 ) -> tuple[set[Registration], list[Clash]]:
     """Part what can be registered from what would displace something.
 
-    A node or service that stands here with the very URI is no clash, and is not registered either: it is the
-    same one, registered here by itself or by another synchronization.
+    A node or service that stands here with the very URI is not a clash, and is not registered either: it is
+    the same one, registered here by itself or by another synchronization.
 
     Args:
         candidates: What shall be registered and is not yet.

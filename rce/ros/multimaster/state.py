@@ -153,7 +153,7 @@ class MasterInfo:
                 _providers(providers),
             )
         except (TypeError, ValueError, OverflowError) as error:
-            raise MalformedState(f"this is no masterInfo: {error}") from error
+            raise MalformedState(f"this is not a masterInfo: {error}") from error
 
 
 def stamp_text(stamp: Stamp) -> str:

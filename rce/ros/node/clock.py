@@ -46,7 +46,7 @@ class Clock:
     def tick(self, payload: bytes, _latched: bool) -> None:
         """Take a serialized ``rosgraph_msgs/Clock``."""
         if len(payload) != _STAMP.size:
-            _log.warning("%s: a message of %d bytes is no clock", TOPIC, len(payload))
+            _log.warning("%s: a message of %d bytes is not a clock", TOPIC, len(payload))
             return
         secs, nsecs = _STAMP.unpack(payload)
         now = secs * NANOSECONDS + nsecs
@@ -64,7 +64,7 @@ class Clock:
         """Sleep until a time in nanoseconds, until simulated time jumps back, or until the node stops.
 
         Returns:
-            Whether the node goes on.
+            Whether the node continues.
         """
         if self._stop.is_set():
             return False

@@ -138,7 +138,7 @@ class GraphMember:
         """Sleep in ROS time, or wake up early because the node is told to stop or simulated time jumps back.
 
         Returns:
-            Whether the node goes on: ``while await node.sleep(0.1): ...``.
+            Whether the node continues: ``while await node.sleep(0.1): ...``.
         """
         return await self._clock.sleep_until(self._clock.nanoseconds() + round(seconds * NANOSECONDS))
 

@@ -76,7 +76,7 @@ class Node(GraphMember):
             anonymous: Make the name unique.
             signals: Stop the node at SIGINT and SIGTERM; ``None`` means: if it is the program's main node,
                 which is the one that takes the program's command line.
-            master_timeout: Seconds to wait for a master that is not up yet; ``None`` for ever.
+            master_timeout: Seconds to wait for a master that is not up yet; ``None`` indefinitely.
             intra_process: Take messages of other nodes of this process as the objects that they published,
                 which then must not be changed; else by a connection, as from any node.
             rosout: Publish the log on ``/rosout``.

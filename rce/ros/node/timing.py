@@ -44,7 +44,7 @@ class Rate:
         """Sleep until the next beat.
 
         Returns:
-            Whether the node goes on.
+            Whether the node continues.
         """
         self._last = min(self._last, self._clock.nanoseconds())  # time may have jumped back
         goes_on = await self._clock.sleep_until(self._last + self._step)

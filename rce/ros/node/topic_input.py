@@ -247,7 +247,7 @@ class InputLink:
             self._target.changed.set()
 
     def connection_lost(self, connection: Connection, error: Exception | None) -> None:
-        """Let who waits for the end go on."""
+        """Let who waits for the end continue."""
         del connection  # the only one
         self._end(error)
 

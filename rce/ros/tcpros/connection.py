@@ -33,7 +33,7 @@ class Owner(Protocol):
         """Take a frame.
 
         Raises:
-            TcprosError: The connection cannot go on and shall be closed.
+            TcprosError: The connection cannot continue and shall be closed.
         """
 
     def connection_lost(self, connection: Connection, error: Exception | None) -> None:

@@ -31,7 +31,7 @@ def decode_header(body: bytes) -> dict[str, str]:
     """Read a connection header, without the length in front of it.
 
     Raises:
-        MalformedFrame: The bytes are no header.
+        MalformedFrame: The bytes are not a header.
     """
     fields: dict[str, str] = {}
     position = 0

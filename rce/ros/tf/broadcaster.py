@@ -100,7 +100,7 @@ class TransformBroadcaster:
 
 
 class StaticTransformBroadcaster(TransformBroadcaster):
-    """Publishes on ``/tf_static`` what holds for ever; whoever comes later gets all of it.
+    """Publishes on ``/tf_static`` what holds indefinitely; later subscribers get all of it.
 
     A frame that is sent again replaces what was sent of it before.
     """

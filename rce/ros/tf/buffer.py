@@ -60,7 +60,7 @@ class Buffer:
 
         Args:
             stamped: The edge.
-            static: It holds for ever; its stamp does not count.
+            static: It holds indefinitely; its stamp does not count.
 
         Returns:
             False if it is older than the cache reaches, or its time is known already.
@@ -82,7 +82,7 @@ class Buffer:
         return edge.insert(Sample(stamped.stamp.to_nsec(), parent, transform))
 
     def clear(self) -> None:
-        """Forget all but what holds for ever; for a time that begins anew."""
+        """Forget all but what holds indefinitely; for a time that begins anew."""
         self._edges = {child: edge for child, edge in self._edges.items() if isinstance(edge, StaticEdge)}
         self._frames = {}
         for child, edge in self._edges.items():
@@ -99,13 +99,13 @@ class Buffer:
             time: When; zero or None: the latest time that all edges of the path have in common.
 
         Returns:
-            The transform with the time that it holds at; zero if it holds for ever.
+            The transform with the time that it holds at; zero if it holds indefinitely.
 
         Raises:
             UnknownFrameError: There is no such frame.
             ConnectivityError: The two are in different trees.
             ExtrapolationError: The time is not within the cache.
-            FrameLoopError: The frames are no tree.
+            FrameLoopError: The frames are not a tree.
         """
         target, source = self._known(target), self._known(source)
         moment = self._moment(target, source, time)
@@ -151,12 +151,12 @@ class Buffer:
         return True
 
     def latest_common_time(self, target: str, source: str) -> Time:
-        """Return the latest time at which all edges between two frames are known; zero: they hold for ever.
+        """Return the latest time at which all edges between two frames are known; zero: they always hold.
 
         Raises:
             UnknownFrameError: There is no such frame.
             ConnectivityError: The two are in different trees.
-            FrameLoopError: The frames are no tree.
+            FrameLoopError: The frames are not a tree.
         """
         moment = self._moment(self._known(target), self._known(source), None)
         return Time(*divmod(moment, NANOSECONDS))

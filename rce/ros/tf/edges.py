@@ -1,4 +1,4 @@
-"""What is known of one frame's place below its parent: over time, or for ever. Pure.
+"""What is known of one frame's place below its parent: over time, or indefinitely. Pure.
 
 Times are nanoseconds.
 """
@@ -29,7 +29,7 @@ class Edge(Protocol):
 
     @property
     def latest(self) -> Sample:
-        """The newest sample; its time is 0 if it holds for ever."""
+        """The newest sample; its time is 0 if it holds indefinitely."""
 
     def at(self, child: str, time: int) -> Sample:
         """Return the place at a time; ``child`` is for errors.

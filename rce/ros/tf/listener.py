@@ -131,12 +131,12 @@ class TransformListener:
             target: The frame to take coordinates to.
             source: The frame to take them from.
             time: When; zero or None: as soon as there is any answer.
-            timeout: Real seconds to wait; None: for ever.
+            timeout: Real seconds to wait; None: indefinitely.
 
         Raises:
             TransformTimeout: It did not become known in time; the cause says why.
             ExtrapolationError: ``time`` is before what the buffer holds: waiting does not help.
-            FrameLoopError: The frames are no tree.
+            FrameLoopError: The frames are not a tree.
             NodeClosed: The node stops.
         """
         try:

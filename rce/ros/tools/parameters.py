@@ -47,7 +47,7 @@ async def set_value(context: ToolContext, name: str, text: str) -> None:
     except ValueError as error:
         raise ToolError(str(error)) from error
     if value is None:
-        raise ToolError(f"{text!r} is no value; use 'param delete {name}' to delete the parameter")
+        raise ToolError(f"{text!r} is not a value; use 'param delete {name}' to delete the parameter")
     await context.node.set_param(name, value)
 
 

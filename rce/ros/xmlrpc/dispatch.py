@@ -3,7 +3,7 @@
 Every ROS method answers ``[status, message, value]`` with status 1 for success, 0 for a failure and -1 for a
 mistake of the caller. Real clients do not expect faults, so a wrong number or kind of arguments is answered
 ``[-1, message, 0]`` (or another value that says nothing: of the type that the method's answers have); a fault
-says only that there is no such method or that the document is no call.
+says only that there is no such method or that the document is not a call.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """How a node's log keeps apart what comes from where: each piece of a line begins with a letter. Pure.
 
 A log is a row of *fragments*: a letter, some text, a newline. A small letter means that the line ends with
-the fragment, the capital that it goes on in a later one of the same letter. The letter tells the stream, and
-of ROS's log records how serious it is. So a log is read in the order in which it came, all of it or some of
+the fragment, the capital that it continues in a later one of the same letter. The letter tells the stream,
+and of ROS's log records how serious it is. So a log is read in the order in which it came, all or some of
 its streams, and nothing that a node prints can look like something else.
 """
 
@@ -56,7 +56,7 @@ def letters_of(streams: Collection[LogStream], level: LogLevel = LogLevel.DEBUG)
 
 
 def fragments(letter: bytes, data: bytes) -> bytes:
-    """Put text into fragments; the last one goes on later if the text does not end with a newline.
+    """Put text into fragments; the last one continues later if the text does not end with a newline.
 
     Args:
         letter: The stream's.

@@ -234,9 +234,9 @@ class NodesCore:
     def _end_well(self, node: Node) -> None:
         node.is_done = True
         if node.restarts_after(failed=False):
-            self._again(node, "ended by itself", failed=False)
+            self._again(node, "ended", failed=False)
         else:
-            self._become(node, LifeEvent.DONE, detail="ended by itself")
+            self._become(node, LifeEvent.DONE, detail="ended")
 
     def _again(self, node: Node, reason: str, *, failed: bool) -> None:
         """Start a node that ended again, after a pause, unless that was done too often."""
@@ -247,7 +247,7 @@ class NodesCore:
             self._fail(
                 node,
                 f"{reason}; it was started again {node.in_a_row} times in a row, which is its limit: "
-                "to start it anew, remove it and add it again, or change it",
+                "to start it again, remove it and add it again, or change it",
             )
             return
         node.in_a_row += 1

@@ -25,7 +25,7 @@ class LifeEvent(Enum):
     HALT = "halt"
     """It is told to end: it is not desired any more, is another one now, or is stuck."""
     DONE = "done"
-    """It ended by itself with exit code 0, and stays so."""
+    """It ended with exit code 0, and stays so."""
     FAIL = "fail"
     """It could not be started or ended in another way, and stays so."""
     PAUSE = "pause"

@@ -31,11 +31,11 @@ class Node:
     in_a_row: int = 0
     """How often it was started again since it ran well last."""
     pausing: bool = False
-    """It ended by itself, and waits for :attr:`due`."""
+    """It ended, and waits for :attr:`due`."""
     failing: bool = False
     """Its last end was a failure, or it is being ended because it is stuck."""
     is_done: bool = False
-    """Its last life ended by itself with exit code 0."""
+    """Its last life ended with exit code 0."""
     due: float = 0.0
     """When it may be started again."""
     started_at: float = 0.0

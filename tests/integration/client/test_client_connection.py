@@ -135,7 +135,7 @@ async def test_service_provider(engine: Engine) -> None:
 
 
 async def test_an_answer_that_cannot_be_sent_fails_its_caller(engine: Engine) -> None:
-    """The connection goes on, too: the next call is answered."""
+    """The connection continues, too: the next call is answered."""
 
     def handler(request: dict[str, Any]) -> dict[str, Any]:
         return {"data": object() if request["data"] == "bad" else "good"}

@@ -49,7 +49,7 @@ BROKEN = {
     "imports.py": ("import no_such_module\n", 0o755, "No module named 'no_such_module'"),
     "closed": ("#!/bin/sh\n", 0o644, "may not be executed (chmod +x makes it so)"),
     "stranger": ("#!/no/such/interpreter\n", 0o755, "/no/such/interpreter"),
-    "text": ("this is no program\n", 0o755, "its first line must name"),
+    "text": ("this is not a program\n", 0o755, "its first line must name"),
 }
 
 

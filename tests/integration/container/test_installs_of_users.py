@@ -1,4 +1,4 @@
-"""Requirements of several users: one that takes for ever keeps nobody else's from being installed."""
+"""Requirements of several users: one that never ends does not keep others' from being installed."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ NODES = {
     "crash.py": (
         "import sys\nprint('to stdout', flush=True)\nprint('it is broken', file=sys.stderr)\nsys.exit(3)\n"
     ),
-    # Its first life beats for a second, then hangs and does not end on SIGINT; later ones beat for ever.
+    # Its first life beats for a second, then hangs and does not end on SIGINT; later ones beat indefinitely.
     "beat.py": (
         "import asyncio, pathlib, signal, sys, time\n"
         "from rce.ros.node import Node, run\n"

@@ -30,7 +30,7 @@ SCRIPTS = {
     "code": "import sys\nprint('out')\nsys.exit(3)\n",
     "text": "import sys\nsys.exit('it is broken')\n",
     "error": "def f():\n    raise ValueError('wrong')\nf()\n",
-    "syntax": "print('never')\nthis is no Python\n",
+    "syntax": "print('never')\nthis is not Python\n",
     "interrupt": "import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(60)\n",
     "atexit": "import atexit\natexit.register(print, 'late')\nprint('early')\n",
     "atexit_interrupt": "import atexit\natexit.register(print, 'late')\nraise KeyboardInterrupt\n",

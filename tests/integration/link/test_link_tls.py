@@ -91,7 +91,7 @@ async def test_peer_without_the_token_is_refused(
         while not any("no TLS with the peer" in record.getMessage() for record in caplog.records):
             await asyncio.sleep(0.01)
     assert not any(record.exc_info for record in caplog.records)
-    assert a.endpoint.connections == (1,), "the link itself goes on"
+    assert a.endpoint.connections == (1,), "the link itself continues"
 
 
 @SECURE

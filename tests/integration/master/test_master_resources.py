@@ -317,7 +317,7 @@ async def test_usage_is_measured_and_ends_with_its_container(site: Site) -> None
                 or line.replace("268435456.0", "2.68435456e+08") in text
                 or line.replace("1048576.0", "1.048576e+06") in text
             ), line
-        assert "unknown" not in text, "a name that nobody desires is no label"
+        assert "unknown" not in text, "an undesired name is not a label"
         await site.api("DELETE", "/containers/c", status=204)
         text = await metrics()
         assert "testUser/c" not in text

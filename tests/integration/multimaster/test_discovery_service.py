@@ -162,7 +162,7 @@ async def test_the_relay_program(tmp_path: Path) -> None:
     [
         ("relay", ("/a", "/a"), "to itself"),
         ("relay", ("/a", "/b", "--throttle", "0"), "above 0 Hz"),
-        ("sync", ("--as", "no way"), "is no namespace"),
+        ("sync", ("--as", "no way"), "is not a namespace"),
         ("sync", ("--relay", ":5"), "HOST:PORT"),
         ("discovery", ("--heartbeat-hz", "30"), "at most 25.5"),
         ("discovery", ("--list", "--master-uri", "http://127.0.0.1:1/"), "does not answer"),

@@ -320,7 +320,7 @@ async def test_strangers_are_bounded_in_number() -> None:
             while one._links._lobby.turned_away < 60 - STRANGERS_PER_ADDRESS:
                 await asyncio.sleep(0.02)
         assert len(one._links._lobby) <= STRANGERS_PER_ADDRESS
-        assert one._links.connected == {"robot"}, "who is known goes on"
+        assert one._links.connected == {"robot"}, "who is known continues"
         for _, writer in connections:
             writer.close()
 

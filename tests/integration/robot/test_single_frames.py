@@ -142,8 +142,8 @@ async def test_what_is_wrong_is_told_and_harms_nothing_else(cloud: Cloud, single
     ):
         await single.socket.send(frame)
         assert words in await single.get("ER")
-    await single.socket.send(frame_of("say", STRING, b"goes on"))
-    assert await end.received.get() == b"goes on"
+    await single.socket.send(frame_of("say", STRING, b"continues"))
+    assert await end.received.get() == b"continues"
 
 
 async def test_robot_that_did_not_ask_is_refused_one_frame(cloud: Cloud, robot: Robot) -> None:

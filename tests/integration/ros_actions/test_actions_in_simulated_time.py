@@ -85,7 +85,7 @@ async def test_a_server_is_not_missed_while_time_stands_still(core: Core, make_n
             await goal.wait(timeout=1.0)
         assert goal.state is GoalState.ACTIVE
         seconds = 100.0
-        while not goal.is_done:  # it goes on, and the server says nothing
+        while not goal.is_done:  # it continues, and the server says nothing
             seconds += 0.0625
             await world.set(seconds)
             await asyncio.sleep(0.05)

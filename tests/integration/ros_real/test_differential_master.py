@@ -190,7 +190,7 @@ def test_random_calls_have_equal_answers_and_effects(sides: tuple[Side, Side], s
     script = [
         (method, tuple(below(prefix, value) for value in arguments))
         for method, arguments in script
-        if "/P" not in arguments[1:2] or method != "setParam"  # a whole namespace is no dictionary then
+        if "/P" not in arguments[1:2] or method != "setParam"  # a whole namespace is not a dictionary then
     ]
     expected, found = (side.play(script) for side in sides)
     for call, theirs, mine in zip(script, expected, found, strict=True):

@@ -93,7 +93,7 @@ async def echoes(node: Node) -> None:
 
 
 async def is_gone(graph: Graph, name: str) -> bool:
-    """Whether a node has no topic or service; a real master may remember its name for ever."""
+    """Whether a node has no topic or service; a real master may remember its name indefinitely."""
     state = await graph.ask("getSystemState")
     return not any(name in nodes for part in state for _, nodes in part)
 

@@ -1,4 +1,4 @@
-"""A core is killed with -9 and started again; nodes of ours go on, and are known to the next core."""
+"""A core is killed with -9 and started again; nodes of ours continue, and are known to the next core."""
 
 from __future__ import annotations
 

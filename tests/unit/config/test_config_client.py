@@ -194,7 +194,7 @@ def test_unknown_key_gets_a_suggestion() -> None:
     data["interfaces"][1]["itype"] = data["interfaces"][1].pop("iType")
     assert faults(data) == [
         "interfaces[1].iType: is missing",
-        "interfaces[1].itype: is no known key; did you mean 'iType'?",
+        "interfaces[1].itype: is not a known key; did you mean 'iType'?",
     ]
 
 

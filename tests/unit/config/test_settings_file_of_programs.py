@@ -75,8 +75,8 @@ def test_option_wins_over_variable_and_variable_over_file(file: str, monkeypatch
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("core: {prot: 1}", "core.prot: is no known key; did you mean 'port'?"),
-        ("discovry: {}", "discovry: is no known key; did you mean 'discovery'?"),
+        ("core: {prot: 1}", "core.prot: is not a known key; did you mean 'port'?"),
+        ("discovry: {}", "discovry: is not a known key; did you mean 'discovery'?"),
         (
             "core: {port: many}",
             "core.port: Input should be a valid integer, unable to parse string as an integer, found 'many'",
@@ -84,7 +84,7 @@ def test_option_wins_over_variable_and_variable_over_file(file: str, monkeypatch
         ("core: {log: 3}", "core.log: must be true or false, found 3"),
         ("core: {port: [1, 2]}", "core.port: must be one value, found [1, 2]"),
         ("core: 5", "core: must be a mapping, found 5"),
-        ("master: {http_prot: 1}", "master.http_prot: is no known key; did you mean 'http_port'?"),
+        ("master: {http_prot: 1}", "master.http_prot: is not a known key; did you mean 'http_port'?"),
         ("core: {prot: 1, log: 3}", "core.log: must be true or false"),
     ],
 )
@@ -105,7 +105,7 @@ def test_actions_are_no_settings(file: str, tmp_path: Path, capsys: pytest.Captu
     path.write_text("discovery: {list: true}")
     with pytest.raises(typer.Exit):
         read("discovery", "--config", str(path))
-    assert "discovery.list: is no known key" in capsys.readouterr().err
+    assert "discovery.list: is not a known key" in capsys.readouterr().err
     assert "list_" not in {each.name for each in keys_of(command("discovery"), ("list",)).values()}
 
 

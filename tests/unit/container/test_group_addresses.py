@@ -33,7 +33,7 @@ def test_a_prefix_of_24_is_understood(text: str, network: str) -> None:
     ["", "x", "10.0.0", "10.0.0.256", "fe80::1", "10.0.0.1/33", "10.0.0.1/", "10.0.0.1/24/24", "10.0.0.1 "],
 )
 def test_what_is_no_address_is_told(text: str) -> None:
-    with pytest.raises(NetworkError, match="is no IPv4 address"):
+    with pytest.raises(NetworkError, match="is not an IPv4 address"):
         parse_address(text)
 
 

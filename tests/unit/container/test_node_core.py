@@ -34,7 +34,7 @@ class World:
         """Lives that have a process, by tag."""
         self.halting: dict[str, float] = {}
         self.done: set[str] = set()
-        """Nodes whose last life ended by itself with exit code 0."""
+        """Nodes whose last life ended with exit code 0."""
         self.desired: dict[str, NodeSpec] = {}
         self.told: list[str] = []
         self.notes: list[str] = []
@@ -97,7 +97,7 @@ class World:
             self.now = max(self.now, deadline)
             self.do(e.Tick())
         else:
-            raise AssertionError("ticks for ever")
+            raise AssertionError("ticks indefinitely")
         self.now = end
 
     def status(self, tag: str = "a") -> NodeStatus:
@@ -115,9 +115,7 @@ def test_a_node_is_started_registers_and_ends() -> None:
     world.register()
     assert world.status() == NodeStatus(tag="a", state=NodeState.RUNNING, pid=101)
     world.end(code=0)
-    assert world.status() == NodeStatus(
-        tag="a", state=NodeState.EXITED, exit_code=0, detail="ended by itself"
-    )
+    assert world.status() == NodeStatus(tag="a", state=NodeState.EXITED, exit_code=0, detail="ended")
     assert (world.told, world.notes) == ([], ["ended: exit code 0"])
     assert not world.core.is_degraded
 
@@ -152,7 +150,7 @@ def test_the_restart_policy(policy: RestartPolicy, code: int, again: bool) -> No
     status = world.status()
     assert (status.state, status.exit_code) == (NodeState.WAITING, code)
     assert status.detail.endswith("starts again after 0.5 s")
-    assert world.core.is_degraded is (code != 0), "a pause after a proper end is no failure"
+    assert world.core.is_degraded is (code != 0), "a pause after a proper end is not a failure"
     world.wait(0.4)
     assert not world.alive
     world.wait(0.1)
@@ -174,7 +172,7 @@ def test_pauses_grow_and_the_limit_ends_them() -> None:
     assert (status.state, status.restarts, status.exit_code) == (NodeState.FAILED, 9, 3)
     assert status.detail == (
         "exit code 3; it was started again 9 times in a row, which is its limit: "
-        "to start it anew, remove it and add it again, or change it"
+        "to start it again, remove it and add it again, or change it"
     )
     assert world.told == [
         "node a failed: exit code 3; it is started again",

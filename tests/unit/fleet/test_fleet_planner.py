@@ -222,7 +222,7 @@ def test_a_new_goal_replaces_the_old_one(make: Any) -> None:
     assert fleet.ask(GoalSet("Robot1", 56)).ok
     fleet.run(fleet.all_arrived)
     assert robot(fleet).cell == 56
-    assert robot(fleet).replans == 0, "a new goal is no blocked path"
+    assert robot(fleet).replans == 0, "a new goal is not a blocked path"
 
 
 def test_a_robot_without_its_goal_stays(make: Any) -> None:

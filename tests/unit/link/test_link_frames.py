@@ -1,4 +1,4 @@
-"""The frame codec: what is written is read, however it is cut; what is no frame is refused."""
+"""The frame codec: what is written is read, however it is cut; what is not a frame is refused."""
 
 from __future__ import annotations
 

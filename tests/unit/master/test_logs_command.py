@@ -12,7 +12,7 @@ from rce_master.cli.exceptions import ApiError
 
 
 class Server:
-    """Has the logs of a container's lives, one after the other; a life goes on while it is the last."""
+    """Has the logs of a container's lives, one after the other; a life continues while it is the last."""
 
     def __init__(self, **lives: str) -> None:
         self.lives = lives

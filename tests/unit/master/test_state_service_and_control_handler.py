@@ -429,7 +429,7 @@ async def test_a_task_set_that_left_hears_nothing_until_it_is_back(cloud: Cloud)
     (spec,) = (await again.hello(status)).endpoints
     assert spec.nodes == ()
     await cloud.control_handler.on_gone(containers)
-    assert cloud.state_service.tables.is_connected("c1"), "the former channel's end is no loss"
+    assert cloud.state_service.tables.is_connected("c1"), "the former channel's end is not a loss"
 
 
 async def test_a_container_made_again_is_put_when_its_former_self_is_gone(cloud: Cloud) -> None:

@@ -94,7 +94,7 @@ HOSTILE: dict[str, tuple[bytes, str]] = {
         + b"".join([folder("nav/q"), folder("nav/q/r"), link("nav/q/r/up", "../..")])
         + link("nav/z", "q/r/up/../x")
         + END,
-        "which is no folder",
+        "which is not a folder",
     ),
     "hard link": (START + header("nav/x", type=tarfile.LNKTYPE, linkname="nav/y") + END, "only files"),
     "device": (START + header("nav/x", type=tarfile.CHRTYPE, devmajor=1, devminor=3) + END, "only files"),

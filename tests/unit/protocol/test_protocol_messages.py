@@ -233,7 +233,7 @@ def test_executable_outside_the_package_is_refused(exe: str) -> None:
 
 
 def test_unknown_request_type_is_refused() -> None:
-    with pytest.raises(MessageError, match="'DM' is no request; use one of CC, DC, CN, CX"):
+    with pytest.raises(MessageError, match="'DM' is not a request; use one of CC, DC, CN, CX"):
         read_request("DM", {})
 
 

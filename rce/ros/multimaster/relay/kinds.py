@@ -76,7 +76,7 @@ async def learn_topic(rpc: RpcClient, caller: str, topic: str, publishers: Itera
     Raises:
         NothingToRelay: None of them answers.
     """
-    reason = "nobody publishes it"
+    reason = "it has no publisher"
     for uri in publishers:
         try:
             async with asyncio.timeout(PROBE_TIMEOUT):

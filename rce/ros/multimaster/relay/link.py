@@ -78,7 +78,7 @@ class RelayLinks:
         self._lobby = Lobby("relay links", per_address=STRANGERS_PER_ADDRESS, in_all=STRANGERS)
         self._complaints = Complaints()
         self._dialing: set[str] = set()
-        """Nonces of the attempts to dial that go on."""
+        """Nonces of the attempts to dial that are not over."""
 
     async def dial(self, host: str, port: int) -> None:
         """Keep a link to another side, until cancelled."""

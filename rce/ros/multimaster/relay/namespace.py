@@ -71,7 +71,7 @@ class NamespaceRemote(Remote):
         self._relay: asyncio.Task[None] | None = None
 
     async def synchronize(self) -> None:
-        """Begin to relay, unless that goes on already."""
+        """Begin to relay, unless it is being relayed already."""
         if self._relay is None or self._relay.done():
             self._relay = self._tasks.start(self._run_relay(), name=f"relay of {self.master.name}")
 

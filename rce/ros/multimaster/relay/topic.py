@@ -43,7 +43,7 @@ class TopicRelay:
         Args:
             source: The topic to take.
             target: The topic to publish.
-            throttle: Decides which messages go on; None: all.
+            throttle: Decides which messages are passed on; None: all.
             latch: Keep the last message for later subscribers. Without it, what is latched stays so.
             lazy: Take messages only while somebody wants them.
         """

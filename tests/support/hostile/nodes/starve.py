@@ -180,7 +180,7 @@ def descriptors() -> Iterator[int]:
 
 
 def passing() -> Iterator[int]:
-    """Descriptors that are on their way for ever, in sockets."""
+    """Descriptors that are on their way indefinitely, in sockets."""
     pieces = [os.open("/dev/null", os.O_RDONLY)] * 250
     for number in count(1):
         pair = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
