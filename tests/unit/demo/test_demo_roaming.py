@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from random import Random
 
-from support.fleet_states import fleet, robot
-
 from rce_fleet.demo.roaming import REST, Roamer
+from support.fleet_states import fleet, robot
 
 
 def test_a_robot_without_a_goal_gets_one_that_is_free() -> None:
