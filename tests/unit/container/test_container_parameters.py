@@ -58,4 +58,4 @@ def test_a_bad_one_leaves_the_others_alone(packages: PackageIndex) -> None:
     )
     assert values == {"/good": 1}
     assert "nothing" in str(faults[0])
-    assert "no ROS name" in str(faults[1])
+    assert "not a ROS name" in str(faults[1])

@@ -186,7 +186,7 @@ def test_a_robot_connects_once(world: World) -> None:
     world.robot_set("r2")
     with pytest.raises(Conflict, match="connected already"):
         world.login(process="r2")
-    with pytest.raises(Conflict, match="no connected robot task set"):
+    with pytest.raises(Conflict, match="is not a connected robot task set"):
         world.login("other", process="c1")
 
 

@@ -119,7 +119,7 @@ HOSTILE: dict[str, tuple[bytes, str]] = {
     "something behind": (START + END + b"evil", "behind the last entry"),
     "more zeros": (START + END + bytes(512), "behind the last entry"),
     "smuggled": (START + header("nav/x", 5) + b"12345" + b"evil" + bytes(503) + END, "between two entries"),
-    "no tar": (b"evil" * 1000, "no archive"),
+    "no tar": (b"evil" * 1000, "not an archive"),
     "unprintable": (START + file("nav/a\x1b[2J") + END, "cannot be printed"),
     "no manifest": (folder("nav") + file("nav/x") + END, "there is no package.yaml"),
     "another name": (folder("nav") + file("nav/package.yaml", b"name: evil\n") + END, "its folder is 'nav'"),
