@@ -20,7 +20,7 @@ from rce_client.exceptions import (
 from rce_client.reminder import Reminder
 
 if TYPE_CHECKING:
-    from tests.integration.client.conftest import Door, Engine
+    from integration.client.conftest import Door, Engine
 
 STRING = "std_msgs/String"
 ECHO = "Test/StringEcho"

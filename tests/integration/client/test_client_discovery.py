@@ -15,7 +15,7 @@ from rce_client.exceptions import RefusedError, UnavailableError
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tests.integration.client.conftest import Door
+    from integration.client.conftest import Door
 
 
 async def test_asks_for_user_and_version(door: Door) -> None:

@@ -13,7 +13,7 @@ import pytest
 from rce_client import Connection, Publisher, ServiceClient, ServiceProvider, Subscriber
 
 if TYPE_CHECKING:
-    from tests.integration.client.conftest import Engine
+    from integration.client.conftest import Engine
 
 CLASSES = (Connection, Publisher, Subscriber, ServiceClient, ServiceProvider)
 INSIDE = {  # what an interface takes from its connection, not from the program

@@ -12,7 +12,7 @@ from rce_robot import gate
 from rce_robot.websocket import RobotSocket
 
 if TYPE_CHECKING:
-    from tests.integration.client.conftest import Engine
+    from integration.client.conftest import Engine
 
 STRING = "std_msgs/String"
 ECHO = "Test/StringEcho"

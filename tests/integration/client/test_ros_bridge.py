@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from tests.integration.client.conftest import Engine
+    from integration.client.conftest import Engine
 
 STRING = "std_msgs/String"
 EMPTY = "std_srvs/SetBool"

@@ -11,9 +11,8 @@ import pytest
 from rce.link import PeerFault
 
 if TYPE_CHECKING:
+    from integration.robot.conftest import Robot
     from support.cloud import Cloud
-
-    from tests.integration.robot.conftest import Robot
 
 STRING = "std_msgs/String"
 ECHO = "Test/StringEcho"

@@ -17,10 +17,9 @@ from websockets.asyncio.client import connect
 from rce.protocol.single import MAX_PAYLOAD
 
 if TYPE_CHECKING:
+    from integration.robot.conftest import Robot
     from support.cloud import Cloud
     from websockets.asyncio.client import ClientConnection
-
-    from tests.integration.robot.conftest import Robot
 
 STRING = "std_msgs/String"
 ECHO = "Test/StringEcho"
