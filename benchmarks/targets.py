@@ -102,6 +102,16 @@ TARGETS = [
         "%",
         at_least=True,
     ),
+    *(
+        Target(
+            f"a pose of a driving robot at the planner, {robots} robots",
+            "fleet.planner",
+            _column("driving, us per pose", robots=robots),
+            50,
+            "us",
+        )
+        for robots in (50, 2000)
+    ),
     Target("container start to first message, p50", "start", _column("p50_ms"), 250, "ms"),
     Target("100 containers at once", "many", _column("all at once", containers=100), 20, "s"),
     Target("idle container, PSS", "many", _column("idle container PSS MB"), 15, "MB"),

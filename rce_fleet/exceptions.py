@@ -8,6 +8,7 @@
     +-- OccupiedError       a box cannot stand where a robot is
     +-- TransitionError     an event that the life cycle of a robot does not allow
     +-- InvariantError      the planner's records contradict each other: a bug
+    +-- PlanWorkerError     the process that makes plans ended twice over one plan
     +-- StationError        a request to the operator station was not carried out
     |   +-- StationUnavailableError    station or planner cannot be reached; try again later
     |   +-- RequestRefusedError        the station refused the request
@@ -76,3 +77,25 @@ class StationUnavailableError(StationError):
 
 class RequestRefusedError(StationError):
     """The station refused a request; its text says why."""
+
+
+class PlanWorkerError(FleetError):
+    """The process that makes plans ended twice over one plan.
+
+    Attributes:
+        number: Of the plan.
+        robots: How many robots it was for.
+        status: How the process ended the second time.
+    """
+
+    def __init__(self, number: int, robots: int, status: str) -> None:
+        self.number = number
+        self.robots = robots
+        self.status = status
+        super().__init__(number, robots, status)
+
+    def __str__(self) -> str:
+        return (
+            f"plan {self.number} for {self.robots} robots was not made: the process that makes plans ended"
+            f" twice over it ({self.status}); read its output, and check that the container has enough memory"
+        )

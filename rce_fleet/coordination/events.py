@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rce_fleet.coordination.move_client import ClientReport
+    from rce_fleet.coordination.replanning import PlanRequest, PlanResult
 
 # -- events -------------------------------------------------------------------------------------
 
@@ -67,11 +68,20 @@ class RobotRemoved:
 
 
 @dataclass(frozen=True, slots=True)
+class PlanMade:
+    """The plan that :class:`MakePlan` asked for is there."""
+
+    result: PlanResult
+
+
+@dataclass(frozen=True, slots=True)
 class Tick:
     """Time goes by; wanted a few times a second."""
 
 
-Event = PoseSeen | ReportSeen | ObstacleSeen | GoalSet | CellBlocked | CellFreed | RobotRemoved | Tick
+Event = (
+    PoseSeen | ReportSeen | ObstacleSeen | GoalSet | CellBlocked | CellFreed | RobotRemoved | PlanMade | Tick
+)
 
 # -- instructions -------------------------------------------------------------------------------
 
@@ -114,8 +124,13 @@ class BlockedChanged:
 
 
 @dataclass(frozen=True, slots=True)
-class StateChanged:
-    """The snapshot is another one, poses not counted."""
+class MakePlan:
+    """Compute this plan and hand it in as :class:`PlanMade`. Until then no robot is granted anything new.
+
+    There is one request at a time. It may take seconds; everything else goes on meanwhile.
+    """
+
+    request: PlanRequest
 
 
-Instruction = SendCells | SendCancel | Reply | BlockedChanged | StateChanged
+Instruction = SendCells | SendCancel | Reply | BlockedChanged | MakePlan

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from rce_fleet.coordination.changes import ChangeLog, FleetChanges
+from rce_fleet.coordination.indexes import FleetIndex
 from rce_fleet.coordination.ledger import CellLedger
-from rce_fleet.coordination.robot import Phase, RobotRecord
+from rce_fleet.coordination.robot import Cause, Phase, RobotRecord
 from rce_fleet.coordination.snapshot import FleetSnapshot, RobotSnapshot, RobotState
 from rce_fleet.exceptions import InvariantError
 
@@ -18,12 +20,17 @@ if TYPE_CHECKING:
 class FleetState:
     """The fleet's state.
 
+    Records are changed where they are; who changes one calls :meth:`touch`, and before indexes are read
+    :meth:`refresh`. The ledger notes by itself whose part of it changed.
+
     Attributes:
         grid: The map; its blocked cells are walls.
         robots: Every robot ever heard and not removed.
-        ledger: Who claims which cell.
-        blocked: Cells that were blocked; nobody claims one.
-        pending: Cells that will be blocked when those who claim them have left; nobody may enter one.
+        ledger: Which robot claims which cell.
+        blocked: Cells that were blocked; no robot claims one.
+        pending: Cells that will be blocked when those who claim them have left; no robot may enter one.
+        index: Robots by what the planner asks for.
+        log: What the outside has not been told yet.
     """
 
     grid: GridMap
@@ -31,15 +38,83 @@ class FleetState:
     ledger: CellLedger = field(default_factory=CellLedger)
     blocked: set[int] = field(default_factory=set)
     pending: set[int] = field(default_factory=set)
+    index: FleetIndex = field(default_factory=FleetIndex)
+    log: ChangeLog = field(default_factory=ChangeLog)
+    _touched: set[str] = field(default_factory=set)
 
     @property
     def shut(self) -> frozenset[int]:
-        """Cells that nobody may enter."""
+        """Cells that no robot may enter."""
         return self.grid.blocked.union(self.blocked, self.pending)
 
-    def in_phase(self, phase: Phase) -> list[RobotRecord]:
-        """Robots in a phase of their lives."""
-        return [record for record in self.robots.values() if record.phase is phase]
+    def is_shut(self, cell: int) -> bool:
+        """Whether no robot may enter a cell."""
+        return cell in self.grid.blocked or cell in self.blocked or cell in self.pending
+
+    def is_blocked(self, cell: int) -> bool:
+        """Whether a cell is a wall or blocked already."""
+        return cell in self.grid.blocked or cell in self.blocked
+
+    # -- changes ------------------------------------------------------------------------------------
+
+    def touch(self, record: RobotRecord) -> None:
+        """Note that a record was changed."""
+        self._touched.add(record.id)
+
+    def change(self, record: RobotRecord, cause: Cause, reason: str) -> None:
+        """Take a robot to the next phase of its life.
+
+        Raises:
+            TransitionError: The cause does not belong to the phase.
+        """
+        record.change(cause)
+        record.reason = reason
+        self._touched.add(record.id)
+
+    def remove(self, robot: str) -> None:
+        """Forget a robot; its cells are free."""
+        del self.robots[robot]
+        self.ledger.remove(robot)
+        self._touched.add(robot)
+
+    def want_blocked(self, cell: int) -> None:
+        """Let no robot enter a cell from now on."""
+        self.pending.add(cell)
+        self.log.note_cell(cell)
+
+    def block(self, cell: int) -> None:
+        """Block a cell that no robot claims."""
+        self.pending.discard(cell)
+        self.blocked.add(cell)
+        self.log.note_cell(cell)
+
+    def free(self, cell: int) -> None:
+        """Let robots enter a cell again."""
+        self.pending.discard(cell)
+        self.blocked.discard(cell)
+        self.log.note_cell(cell)
+
+    def refresh(self) -> None:
+        """Enter into the indexes what changed since the last call."""
+        touched = self.ledger.take_changed() | self._touched
+        self._touched = set()
+        for robot in sorted(touched, key=self._held_at):
+            self.log.note_robot(robot)
+            record = self.robots.get(robot)
+            if record is None:
+                self.index.leave(robot)
+            else:
+                self.index.enter(record, self.ledger)
+
+    def _held_at(self, robot: str) -> float:
+        record = self.robots.get(robot)
+        return record.held_at if record else 0.0
+
+    # -- the outside --------------------------------------------------------------------------------
+
+    def take_changes(self) -> FleetChanges | None:
+        """Return what the outside has not been told yet; None if it knows everything."""
+        return self.log.take(self.describe, self._cell_state)
 
     def snapshot(self) -> FleetSnapshot:
         """The state as the outside sees it."""
@@ -49,6 +124,11 @@ class FleetState:
             pending=tuple(sorted(self.pending)),
         )
 
+    def describe(self, robot: str) -> RobotSnapshot | None:
+        """One robot as the outside sees it; None if there is none of this name."""
+        record = self.robots.get(robot)
+        return None if record is None else self._describe(record)
+
     def validate(self) -> None:
         """Check the invariants.
 
@@ -56,6 +136,7 @@ class FleetState:
             InvariantError: One does not hold.
         """
         self.ledger.validate()
+        self.index.validate(self.robots.values(), self.ledger)
         if self.blocked & (self.pending | self.grid.blocked) or self.pending & self.grid.blocked:
             raise InvariantError("a cell is a wall, blocked or pending, and only one of these")
         for record in self.robots.values():
@@ -70,6 +151,10 @@ class FleetState:
                 raise InvariantError(f"{record.id} is active without a cell")
             if self.shut.intersection(route[1:]):
                 raise InvariantError(f"the route of {record.id} leads through blocked cells: {route}")
+
+    def _cell_state(self, cell: int) -> bool | None:
+        """Whether a cell is blocked (true), pending (false) or neither (None)."""
+        return True if cell in self.blocked else False if cell in self.pending else None
 
     def _describe(self, record: RobotRecord) -> RobotSnapshot:
         route = self.ledger.route(record.id)

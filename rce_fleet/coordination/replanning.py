@@ -1,52 +1,188 @@
-"""One plan for all active robots, from the cells that they are committed to."""
+"""One plan for all active robots, from the cells that they are committed to.
+
+A plan is made in three steps, so that the long one can be done elsewhere: :func:`request_plan` takes what
+it depends on from the fleet's state, :func:`compute_plan` works on nothing else, and :func:`adopt_plan`
+enters the result into the ledger, as far as the robots are still where the plan has them begin.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rce_fleet.coordination.robot import Phase
 from rce_fleet.coordination.targets import assign_targets
-from rce_fleet.planning.lacam import JointPlan, plan
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.lacam import plan
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from rce_fleet.coordination.fleet_state import FleetState
     from rce_fleet.coordination.settings import FleetSettings
 
+NO_CELL = -1
+"""In a request: a robot has none."""
 
-def plan_together(books: FleetState, settings: FleetSettings, attempt: int) -> JointPlan:
-    """Plan for all active robots and enter the routes into the ledger.
+
+@dataclass(frozen=True, slots=True)
+class PlanRequest:
+    """All that a plan depends on.
+
+    Attributes:
+        number: Names the request.
+        rows, columns: Size of the map.
+        blocked: Cells that no robot may enter, those of robots that take no part among them.
+        robots: Robots that take part.
+        starts: For each the last cell that it was granted.
+        goals: For each where it was sent, or -1.
+        rests: For each where it returns to without a goal, or -1.
+        seed: Breaks ties.
+        effort: Work spent at most, see :func:`rce_fleet.planning.lacam.plan`.
+    """
+
+    number: int
+    rows: int
+    columns: int
+    blocked: tuple[int, ...]
+    robots: tuple[str, ...]
+    starts: tuple[int, ...]
+    goals: tuple[int, ...]
+    rests: tuple[int, ...]
+    seed: int
+    effort: int
+
+
+@dataclass(frozen=True, slots=True)
+class PlanResult:
+    """A plan: which robot enters which cell, in order.
+
+    Attributes:
+        number: The request's.
+        visitors: For each visit of a cell the robot, as its place in the request's ``robots``.
+        cells: For each visit the cell.
+        unreachable: Robots, as places in ``robots``, whose goal cannot be reached.
+        complete: Whether the plan ends with all robots at their targets.
+    """
+
+    number: int
+    visitors: tuple[int, ...]
+    cells: tuple[int, ...]
+    unreachable: tuple[int, ...]
+    complete: bool
+
+
+def request_plan(state: FleetState, settings: FleetSettings, number: int) -> PlanRequest:
+    """Take from the fleet's state what a plan depends on.
 
     Cells claimed by robots that are not active are obstacles. Cells granted already are driven through in any
     case, so the plan begins where they end.
 
     Args:
-        books: The fleet; its ledger and the robots' ``rest`` and ``unreachable`` are changed.
+        state: The fleet; ``rest`` of robots that have nowhere to go is set.
         settings: Seed and effort.
-        attempt: Number of the plan; breaks ties in another way each time.
+        number: Of the plan; breaks ties in another way each time.
     """
-    active = books.in_phase(Phase.ACTIVE)
-    standing = [record for record in books.robots.values() if record.phase is not Phase.ACTIVE]
-    grid = books.grid.with_blocked(
-        books.shut.union(*(books.ledger.claims(record.id) for record in standing)),
-    )
-    starts = {record.id: books.ledger.granted(record.id)[-1] for record in active}
-    for record in active:
+    robots, starts, goals, rests = [], [], [], []
+    blocked = set(state.shut)
+    for record in state.robots.values():
+        start = state.ledger.end_of_grant(record.id)
+        if record.phase is not Phase.ACTIVE or start is None:
+            blocked |= state.ledger.claims(record.id)
+            continue
         if record.rest is None and record.goal is None:
-            record.rest = starts[record.id]
+            record.rest = start
+        robots.append(record.id)
+        starts.append(start)
+        goals.append(NO_CELL if record.goal is None else record.goal)
+        rests.append(NO_CELL if record.rest is None else record.rest)
+    return PlanRequest(
+        number=number,
+        rows=state.grid.rows,
+        columns=state.grid.columns,
+        blocked=tuple(blocked),
+        robots=tuple(robots),
+        starts=tuple(starts),
+        goals=tuple(goals),
+        rests=tuple(rests),
+        seed=settings.seed + number,
+        effort=settings.effort,
+    )
+
+
+def compute_plan(request: PlanRequest) -> PlanResult:
+    """Make the plan. The same request always gives the same one."""
+    grid = GridMap(request.rows, request.columns, blocked=frozenset(request.blocked))
+    starts = dict(zip(request.robots, request.starts, strict=True))
     targets = assign_targets(
         grid,
         starts,
-        goals={record.id: record.goal for record in active if record.goal is not None},
-        rests={record.id: record.rest for record in active if record.rest is not None},
+        goals={robot: cell for robot, cell in zip(request.robots, request.goals, strict=True) if cell >= 0},
+        rests={robot: cell for robot, cell in zip(request.robots, request.rests, strict=True) if cell >= 0},
     )
     joint = plan(
         grid,
-        list(starts.values()),
-        [targets.cells[robot] for robot in starts],
-        seed=settings.seed + attempt,
-        effort=settings.effort,
+        request.starts,
+        [targets.cells[robot] for robot in request.robots],
+        seed=request.seed,
+        effort=request.effort,
     )
-    books.ledger.adopt({robot: joint.route(index) for index, robot in enumerate(starts)})
-    for record in active:
-        record.unreachable = record.id in targets.unreachable
-    return joint
+    visits = sorted(
+        (step, request.robots[index], index, cell)
+        for index in range(len(request.robots))
+        for step, cell in joint.route(index)[1:]
+    )
+    return PlanResult(
+        number=request.number,
+        visitors=tuple(index for _, _, index, _ in visits),
+        cells=tuple(cell for *_, cell in visits),
+        unreachable=tuple(
+            index for index, robot in enumerate(request.robots) if robot in targets.unreachable
+        ),
+        complete=joint.complete,
+    )
+
+
+def adopt_plan(state: FleetState, request: PlanRequest, result: PlanResult) -> None:
+    """Enter a plan's routes into the ledger.
+
+    The state may have changed since the request. A robot that is not active any more, was granted other cells
+    or was sent elsewhere gets no route, and a route ends before a cell that no robot may enter any more. That
+    is safe, as only grants let robots drive, and each of them is checked by the ledger; but robots may not
+    get to their goals by it, so another plan has to follow.
+
+    Args:
+        state: The fleet; its ledger and the robots' ``unreachable`` are changed.
+        request: What the plan was asked for with.
+        result: The plan.
+    """
+    unreachable = frozenset(result.unreachable)
+    present: list[str | None] = []
+    for index, robot in enumerate(request.robots):
+        record = state.robots.get(robot)
+        goal = NO_CELL if record is None or record.goal is None else record.goal
+        if (
+            record is None
+            or record.phase is not Phase.ACTIVE
+            or state.ledger.end_of_grant(robot) != request.starts[index]
+            or goal != request.goals[index]
+        ):
+            present.append(None)
+            continue
+        present.append(robot)
+        if record.unreachable != (index in unreachable):
+            record.unreachable = index in unreachable
+            state.touch(record)
+    starts = {robot: start for robot, start in zip(present, request.starts, strict=True) if robot is not None}
+    state.ledger.adopt(starts, _visits(state, present, result))
+
+
+def _visits(state: FleetState, present: list[str | None], result: PlanResult) -> Iterator[tuple[str, int]]:
+    """Tell who enters which cell, in order, as far as it is still possible."""
+    shut = state.shut
+    for index, cell in zip(result.visitors, result.cells, strict=True):
+        robot = present[index]
+        if robot is not None and cell in shut:
+            present[index] = robot = None  # Its route ends here.
+        if robot is not None:
+            yield robot, cell

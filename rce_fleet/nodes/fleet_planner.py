@@ -11,7 +11,7 @@ import asyncio
 import re
 import time
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, assert_never
 
 from rce.ros.errors import MasterError
 from rce.ros.node import Node, run
@@ -26,14 +26,15 @@ from rce_fleet.coordination.events import (
     Event,
     GoalSet,
     Instruction,
+    MakePlan,
     ObstacleSeen,
+    PlanMade,
     PoseSeen,
     Reply,
     ReportSeen,
     RobotRemoved,
     SendCancel,
     SendCells,
-    StateChanged,
     Tick,
 )
 from rce_fleet.coordination.move_client import ClientReport, ClientState
@@ -43,10 +44,12 @@ from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.navigation.angles import yaw_of
 from rce_fleet.navigation.occupancy import occupancy
 from rce_fleet.nodes.parameters import make_grid
+from rce_fleet.nodes.plan_worker import PlanWorker
 
 if TYPE_CHECKING:
     from rce.ros.node import Publisher
     from rce.ros.types import Message
+    from rce_fleet.coordination.replanning import PlanRequest
 
 TICK = 0.1
 """Seconds between two looks at the clock; the state is published at most as often."""
@@ -72,7 +75,7 @@ class PlannerNode:
         self._planner = planner
         self._cells: dict[str, Publisher] = {}
         self._cancels: dict[str, Publisher] = {}
-        self._state_changed = True
+        self._requests: asyncio.Queue[PlanRequest] = asyncio.Queue()
         self._started = Time.now()
         self._state: Publisher
         self._blocked: Publisher
@@ -94,9 +97,12 @@ class PlannerNode:
         await node.advertise_service("/fleet/set_goal", "fleet/SetGoal", self._set_goal)
         await node.advertise_service("/fleet/block_cell", "fleet/BlockCell", self._block_cell)
         await node.advertise_service("/fleet/remove_robot", "fleet/RemoveRobot", self._remove_robot)
-        async with asyncio.TaskGroup() as tasks:
+        self._publish_state()
+        async with PlanWorker(node.log) as worker, asyncio.TaskGroup() as tasks:
+            planning = tasks.create_task(self._make_plans(worker))
             tasks.create_task(self._look_around())
-            tasks.create_task(self._keep_time())
+            await self._keep_time()
+            planning.cancel()
 
     # -- what comes in ------------------------------------------------------------------------------
 
@@ -168,9 +174,12 @@ class PlannerNode:
     async def _keep_time(self) -> None:
         while await self._node.sleep(TICK):
             self._handle(Tick())
-            if self._state_changed:
-                self._state_changed = False
+            if self._planner.take_changes() is not None:
                 self._publish_state()
+
+    async def _make_plans(self, worker: PlanWorker) -> None:
+        while True:
+            self._handle(PlanMade(await worker.compute(await self._requests.get())))
 
     def _set_goal(self, request: Message) -> dict[str, Any]:
         return self._ask(GoalSet(request.robot, None if request.cell < 0 else request.cell))
@@ -204,13 +213,17 @@ class PlannerNode:
                     self._cancels[robot].publish(data=True)
                 case BlockedChanged(cells):
                     self._publish_blocked(cells)
-                case StateChanged():
-                    self._state_changed = True
+                case MakePlan(request):
+                    self._requests.put_nowait(request)
+                case Reply():
+                    pass  # for the caller
+                case _:
+                    assert_never(instruction)
         return instructions
 
     def _publish_blocked(self, cells: tuple[int, ...]) -> None:
         self._blocked.publish(data=list(cells))
-        picture = occupancy(self._planner.books.grid, cells)
+        picture = occupancy(self._planner.state.grid, cells)
         x, y = picture.origin
         stamp = Time.now()
         self._map.publish(
@@ -226,7 +239,7 @@ class PlannerNode:
         )
 
     def _publish_state(self) -> None:
-        grid, snapshot = self._planner.books.grid, self._planner.snapshot()
+        grid, snapshot = self._planner.state.grid, self._planner.snapshot()
         walls = sorted(grid.blocked)
         self._state.publish(
             started=self._started,

@@ -27,17 +27,34 @@ def distances(grid: GridMap, goal: int, weights: Sequence[float] | None = None) 
     if goal in grid.blocked:
         return cost
     cost[goal] = 0.0
+    if weights is None:
+        _spread(grid, goal, cost)
+        return cost
     heap = [(0.0, goal)]
     while heap:
         reached, cell = heapq.heappop(heap)
         if reached > cost[cell]:
             continue
         for other in grid.neighbours[cell]:
-            through = reached + (1.0 if weights is None else weights[other])
+            through = reached + weights[other]
             if through < cost[other]:
                 cost[other] = through
                 heapq.heappush(heap, (through, other))
     return cost
+
+
+def _spread(grid: GridMap, goal: int, cost: list[float]) -> None:
+    """Count steps from the goal outwards: with equal weights a queue does what a heap does."""
+    ring, steps = [goal], 0.0
+    while ring:
+        steps += 1.0
+        outer = []
+        for cell in ring:
+            for other in grid.neighbours[cell]:
+                if cost[other] > steps:
+                    cost[other] = steps
+                    outer.append(other)
+        ring = outer
 
 
 def shortest_path(

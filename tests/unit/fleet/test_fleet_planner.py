@@ -77,7 +77,7 @@ def test_a_robot_whose_cell_is_anothers_goal_makes_room_for_good(make: Any) -> N
 def test_blocking_a_cell_of_a_path_cancels_it_and_brings_another(make: Any) -> None:
     fleet = make(GridMap(), [24], [31])
     cell = robot(fleet).plan[5]
-    out = fleet.planner.handle(CellBlocked(cell), fleet.now)
+    out = fleet.tell(CellBlocked(cell))
     assert SendCancel("Robot1") in out
     assert BlockedChanged((cell,)) in out
     fleet.blocked = {cell}
@@ -90,7 +90,7 @@ def test_blocking_a_cell_of_a_path_cancels_it_and_brings_another(make: Any) -> N
 
 def test_a_cell_that_robots_do_not_use_is_blocked_without_disturbing_them(make: Any) -> None:
     fleet = make(GridMap(), [0], [7])
-    out = fleet.planner.handle(CellBlocked(60), fleet.now)
+    out = fleet.tell(CellBlocked(60))
     assert not [done for done in out if isinstance(done, SendCancel)]
     fleet.run(fleet.all_arrived)
     assert robot(fleet).replans == 0
@@ -155,7 +155,7 @@ def test_what_a_sensor_finds_is_blocked(make: Any) -> None:
 
 def test_what_a_sensor_finds_in_another_robots_cell_was_a_robot(make: Any) -> None:
     fleet = make(GridMap(), [0, 1])
-    fleet.planner.handle(ObstacleSeen("Robot1", (1, 0, 999)), fleet.now)
+    fleet.tell(ObstacleSeen("Robot1", (1, 0, 999)))
     assert fleet.planner.snapshot().blocked == ()
     assert fleet.planner.snapshot().pending == ()
 
@@ -201,7 +201,7 @@ def test_a_restarted_planner_takes_over_where_robots_are(make: Any) -> None:
     fleet = make(GridMap(), [0], [63])
     for _ in range(30):
         fleet.step()
-    fleet.planner = FleetPlanner(GridMap())
+    fleet.restart_planner(FleetPlanner(GridMap()))
     fleet.run(lambda: fleet.states() == [RobotState.IDLE])
     fleet.ask(GoalSet("Robot1", 7))
     fleet.run(fleet.all_arrived)
@@ -239,7 +239,7 @@ def test_a_robot_that_left_its_path_is_stopped_and_placed_anew(make: Any) -> Non
     fleet.run(lambda: fleet.clients["Robot1"].report.reached == 0)
     fleet.check = lambda: None  # The robot is where it must not be: that is the point.
     fleet.robots["Robot1"].x, fleet.robots["Robot1"].y = 5.5, 5.5
-    fleet.planner.handle(PoseSeen("Robot1", 5.5, 5.5, 0.0), fleet.now)
+    fleet.tell(PoseSeen("Robot1", 5.5, 5.5, 0.0))
     assert robot(fleet).state is RobotState.STOPPING
     assert robot(fleet).reason == "it left its path"
     fleet.run(lambda: robot(fleet).state is RobotState.IDLE)

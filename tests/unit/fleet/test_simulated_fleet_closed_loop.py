@@ -13,7 +13,9 @@ from rce_fleet.coordination.events import (
     CellBlocked,
     Event,
     GoalSet,
+    MakePlan,
     ObstacleSeen,
+    PlanMade,
     PoseSeen,
     ReportSeen,
     SendCancel,
@@ -22,6 +24,7 @@ from rce_fleet.coordination.events import (
 )
 from rce_fleet.coordination.move_client import MoveClient, SendGoal, SendStop
 from rce_fleet.coordination.planner import FleetPlanner
+from rce_fleet.coordination.replanning import compute_plan
 from rce_fleet.coordination.snapshot import RobotState
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.movingai import read_map, read_scenario
@@ -62,12 +65,14 @@ class SimulatedFleet:
                 case BlockedChanged(cells):
                     for cell in cells:
                         self.world.add_box(cell)
+                case MakePlan(request):
+                    self.plan(PlanMade(compute_plan(request)))
 
     def tell(self, robot: str, instructions: list[Any]) -> None:
         for instruction in instructions:
             match instruction:
                 case SendGoal(goal_id, stamp, cell):
-                    x, y = self.planner.books.grid.centre(cell)
+                    x, y = self.planner.state.grid.centre(cell)
                     self.bases[robot].accept(goal_id, stamp, x, y)
                 case SendStop(stamp):
                     self.bases[robot].cancel("", stamp)

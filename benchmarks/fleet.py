@@ -1,0 +1,216 @@
+"""Measure the fleet planner: ``python -m benchmarks.fleet [--quick]``. It needs no engine.
+
+``planner``: what a pose costs, by the number of robots; it should not depend on that. ``planning``: the
+longest step of the event loop while a plan is made by the process beside it, and how long the plan takes.
+
+Times are those of the processor that the measured thread used, so that other load does not count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import gc
+import logging
+from dataclasses import dataclass, field
+from math import ceil, sqrt
+from random import Random
+from time import perf_counter, thread_time
+from typing import Any
+
+import uvloop
+
+from benchmarks.figures import percentile, save, show
+from benchmarks.summary import main as summarize
+from rce_fleet.coordination.events import (
+    Event,
+    GoalSet,
+    MakePlan,
+    PlanMade,
+    PoseSeen,
+    ReportSeen,
+    SendCells,
+    Tick,
+)
+from rce_fleet.coordination.move_client import ClientReport, ClientState
+from rce_fleet.coordination.planner import FleetPlanner
+from rce_fleet.coordination.replanning import PlanRequest, compute_plan
+from rce_fleet.nodes.plan_worker import PlanWorker
+from rce_fleet.planning.grid import GridMap
+
+SIZES = (50, 200, 800, 2000)
+CELLS_PER_ROBOT = 5
+BATCH = 2000
+"""Poses of standing robots that are averaged."""
+POSE_LIMIT_US = 50
+"""A pose should cost no more than this, however many robots there are."""
+
+
+@dataclass
+class Fleet:
+    """A planner and robots that do at once what they are told, without any delay.
+
+    Attributes:
+        planner: What is measured.
+        now: Time of the fleet, seconds.
+        requests: Plans that are asked for and not made.
+    """
+
+    planner: FleetPlanner
+    now: float = 0.0
+    requests: list[PlanRequest] = field(default_factory=list)
+    revisions: dict[str, tuple[int, tuple[int, ...]]] = field(default_factory=dict)
+    places: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+    def tell(self, event: Event) -> None:
+        """Give an event to the planner."""
+        for instruction in self.planner.handle(event, self.now):
+            match instruction:
+                case MakePlan(request):
+                    self.requests.append(request)
+                case SendCells(robot, revision, cells):
+                    self.revisions[robot] = revision, cells
+
+    def pose(self, robot: str) -> PoseSeen:
+        """The pose that a robot sends next."""
+        return PoseSeen(robot, *self.places[robot], 0.0)
+
+    def report(self, robot: str) -> ReportSeen:
+        """What a robot's move client says next."""
+        revision, cells = self.revisions[robot]
+        return ReportSeen(robot, ClientReport(revision, ClientState.IDLE, cells))
+
+    def drive(self, robot: str) -> bool:
+        """Put a robot into the next cell that it was granted; tell whether there is one."""
+        granted = self.planner.state.ledger.granted(robot)
+        if len(granted) > 1:
+            self.places[robot] = self.planner.state.grid.centre(granted[1])
+        return len(granted) > 1
+
+    def say_all(self) -> None:
+        """Let everybody be heard, so that no robot is lost."""
+        for robot in self.places:
+            self.tell(self.pose(robot))
+            self.tell(self.report(robot))
+        self.tell(Tick())
+
+
+def joined(count: int) -> Fleet:
+    """A fleet whose robots have their places, each sent somewhere, with a plan asked for and not made."""
+    edge = ceil(sqrt(count * CELLS_PER_ROBOT))
+    grid = GridMap(edge, edge)
+    rng = Random(count)
+    fleet = Fleet(FleetPlanner(grid))
+    for number, cell in enumerate(rng.sample(range(edge * edge), count)):
+        fleet.places[f"Robot{number}"] = grid.centre(cell)
+    for robot in fleet.places:
+        fleet.tell(fleet.pose(robot))
+    while any(not fleet.planner.state.ledger.length(robot) for robot in fleet.places):
+        fleet.now += 0.5
+        fleet.say_all()
+    for robot, goal in zip(fleet.places, rng.sample(range(edge * edge), count), strict=True):
+        fleet.tell(GoalSet(robot, goal))
+    return fleet
+
+
+def finish_plans(fleet: Fleet) -> None:
+    """Make all plans that are asked for, one after another."""
+    while fleet.requests:
+        fleet.tell(PlanMade(compute_plan(fleet.requests.pop())))
+
+
+def pose_cost(count: int, *, batches: int) -> dict[str, Any]:
+    """What a pose costs: of robots that stand, and of robots that come into their next cell with it."""
+    fleet = joined(count)
+    finish_plans(fleet)
+    robots = list(fleet.places)
+    rng = Random(count)
+    driving = []
+    while moving := [robot for robot in rng.sample(robots, count) if fleet.drive(robot)]:
+        driving += [_timed(fleet, robot) for robot in moving]
+        finish_plans(fleet)
+        if len(driving) > batches * BATCH:
+            break
+    standing = [sum(_timed(fleet, rng.choice(robots)) for _ in range(BATCH)) / BATCH for _ in range(batches)]
+    return {
+        "robots": count,
+        "standing, us per pose": round(1e6 * min(standing), 1),
+        "driving, us per pose": round(1e6 * percentile(driving, 0.5), 1),
+        "limit, us": POSE_LIMIT_US,
+    }
+
+
+def _timed(fleet: Fleet, robot: str) -> float:
+    """Seconds that a robot's pose takes; plans that it leads to are not made yet."""
+    pose = fleet.pose(robot)
+    began = thread_time()
+    instructions = fleet.planner.handle(pose, fleet.now)
+    took = thread_time() - began
+    fleet.requests += [done.request for done in instructions if isinstance(done, MakePlan)]
+    return took
+
+
+async def plan_cost(count: int) -> dict[str, Any]:
+    """The longest step of the event loop while a plan is made, with a pose in each other step."""
+    fleet = joined(count)
+    for robot in fleet.places:
+        fleet.tell(fleet.report(robot))
+    gc.collect()
+    gc.freeze()
+    async with PlanWorker(logging.getLogger("benchmark")) as worker:
+        await worker.compute(PlanRequest(0, 1, 1, (), (), (), (), (), 0, 1))
+        # This plan knows of the first goal only; the next one knows them all.
+        fleet.tell(PlanMade(compute_plan(fleet.requests.pop())))
+        request = fleet.requests.pop()
+        steps: dict[str, float] = {}
+
+        def step(name: str, event: Event) -> None:
+            began = thread_time()
+            fleet.tell(event)
+            steps[name] = max(steps.get(name, 0.0), thread_time() - began)
+
+        async def feed() -> None:
+            robots = list(fleet.places)
+            while True:
+                for robot in robots:
+                    step("pose", fleet.pose(robot))
+                    await asyncio.sleep(0)
+                step("tick", Tick())
+
+        feeding = asyncio.create_task(feed())
+        began = perf_counter()
+        result = await worker.compute(request)
+        took = perf_counter() - began
+        step("plan", PlanMade(result))
+        feeding.cancel()
+        await asyncio.gather(feeding, return_exceptions=True)
+    gc.unfreeze()
+    return {
+        "robots": count,
+        "plan s": round(took, 2),
+        "longest step ms": round(1e3 * max(steps.values()), 2),
+        **{f"{name} ms": round(1e3 * steps.get(name, 0.0), 2) for name in ("pose", "tick", "plan")},
+    }
+
+
+async def measure(*, quick: bool) -> None:
+    """Run all suites."""
+    sizes = SIZES[:2] if quick else SIZES
+    poses = [pose_cost(count, batches=3 if quick else 10) for count in sizes]
+    show("Cost of a pose", poses)
+    plans = [await plan_cost(count) for count in sizes]
+    show("Event loop while a plan is made", plans)
+    print("results:", save("fleet", {"planner": poses, "planning": plans}))
+    if not quick:
+        summarize()
+
+
+def main() -> None:
+    """Read the command line and measure."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.fleet", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="small fleets only")
+    uvloop.run(measure(quick=parser.parse_args().quick))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,203 @@
+"""Carries out what the fleet's state asks for: stops robots, gives them places, grants cells, asks for plans.
+
+The planner takes events and notes what they change; :meth:`Dispatcher.advance` then does everything that
+has become possible by that. What may have become possible is found by the indexes of the state and by the
+ledger's notes, so the cost of an event does not depend on the number of robots.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rce_fleet.coordination.events import BlockedChanged, Instruction, MakePlan, SendCancel, SendCells
+from rce_fleet.coordination.fleet_state import FleetState
+from rce_fleet.coordination.progress import arrived_index, standing_cell
+from rce_fleet.coordination.refusals import hindrance
+from rce_fleet.coordination.replanning import PlanRequest, PlanResult, adopt_plan, request_plan
+from rce_fleet.coordination.robot import Cause, Phase, RobotRecord
+from rce_fleet.exceptions import InvariantError
+
+if TYPE_CHECKING:
+    from rce_fleet.coordination.settings import FleetSettings
+
+
+class Dispatcher:
+    """Sends the robots of a fleet on.
+
+    Attributes:
+        now: Time of the present event, seconds.
+        out: The instructions to which it led so far.
+        outdated: Whether something changed that the newest plan, or the one asked for, does not know.
+        to_settle: Robots that may stand still now.
+        left: Cells that may have to be blocked now.
+
+    Args:
+        state: The fleet.
+        settings: Sizes and times.
+    """
+
+    def __init__(self, state: FleetState, settings: FleetSettings) -> None:
+        self.state = state
+        self.settings = settings
+        self.now = 0.0
+        self.out: list[Instruction] = []
+        self.outdated = False
+        self.to_settle: set[str] = set()
+        self.left: set[int] = set()
+        self._partial = False
+        self._asked: PlanRequest | None = None
+        self._plans = 0
+
+    def advance(self) -> None:
+        """Do everything that has become possible."""
+        self._settle_standing()
+        self._block_left_cells()
+        self.state.refresh()
+        if self._asked is None:
+            if self._partial and not self.state.index.under_way:
+                self.outdated = True
+            if not self.outdated:
+                self._grant()
+                self.state.refresh()
+            elif not self._awaited():
+                self._ask_for_plan()
+
+    def hold(self, record: RobotRecord, reason: str) -> None:
+        """Tell a robot to stop, to take its cells back once it has."""
+        if record.phase is Phase.SILENT:
+            return
+        record.held_at = self.now
+        self.state.change(record, Cause.HELD, reason)
+        if self.state.ledger.length(record.id):
+            self.state.ledger.truncate(record.id)
+        self.outdated = True
+        self.send(record, ())
+
+    def _settle_standing(self) -> None:
+        """Give robots that stand still their places, and then those that waited for one of these."""
+        while True:
+            freed = self.state.ledger.take_freed()
+            self.left |= freed
+            candidates = self.to_settle | self.state.index.hindered_at(freed)
+            self.to_settle = set()
+            if not candidates:
+                return
+            for robot in sorted(candidates):
+                record = self.state.robots.get(robot)
+                if record is None or record.phase is not Phase.HOLDING:
+                    continue
+                if record.stands(self.settings):
+                    self._settle(record)
+                else:
+                    self.state.index.set_hindered(robot, ())
+
+    def _settle(self, record: RobotRecord) -> None:
+        """Give a robot that stands still the cell that it stands in."""
+        state = self.state
+        touched = self.touched(record)
+        own = {cell for cell in touched if state.ledger.owner(cell) in (None, record.id)}
+        shut = {cell for cell in own if state.is_shut(cell)}
+        cell = standing_cell(state.grid, own, record.x, record.y, shut)
+        reason = hindrance(state, record, touched, own, cell)
+        state.index.set_hindered(record.id, touched if reason else ())
+        if cell is None or reason:
+            if record.reason != reason:
+                record.reason = reason
+                state.touch(record)
+            return
+        state.change(record, Cause.SETTLED, "")
+        record.centred = False
+        # No robot claims what is blocked already: it only touches the margin around the box.
+        state.ledger.place(record.id, cell, {other for other in own if not state.is_blocked(other)})
+        self.outdated = True
+        self.send(record, (cell,))
+        self.arrive(record)
+
+    def _block_left_cells(self) -> None:
+        left, self.left = self.left & self.state.pending, set()
+        free = [cell for cell in left if self.state.ledger.owner(cell) is None]
+        for cell in free:
+            self.state.block(cell)
+        if free:
+            self.out.append(BlockedChanged(tuple(sorted(self.state.blocked))))
+
+    def _grant(self) -> None:
+        """Grant cells to the robots that may have got their turn."""
+        ledger = self.state.ledger
+        for robot in sorted(ledger.take_ripe()):
+            record = self.state.robots.get(robot)
+            if record is None or record.phase is not Phase.ACTIVE:
+                continue
+            if ledger.grant(robot, self.settings.ahead):
+                self.send(record, tuple(ledger.granted(robot)))
+
+    # -- plans ----------------------------------------------------------------------------------------
+
+    def _awaited(self) -> bool:
+        """Whether a plan has to wait for a robot that is being stopped."""
+        told_at = self.state.index.last_stop()
+        return told_at is not None and self.now - told_at < self.settings.hold_timeout
+
+    def _ask_for_plan(self) -> None:
+        self._asked = request_plan(self.state, self.settings, self._plans)
+        self._plans += 1
+        self.outdated = self._partial = False
+        self.out.append(MakePlan(self._asked))
+
+    def take_plan(self, result: PlanResult) -> None:
+        """Take the plan that was asked for; another one is ignored."""
+        request = self._asked
+        if request is None or request.number != result.number:
+            return
+        self._asked = None
+        if not self.outdated:
+            adopt_plan(self.state, request, result)
+            # A plan that gets nearer is followed by another; one that gets nowhere waits for a change.
+            self._partial = not result.complete and bool(result.cells)
+        elif not self._awaited():
+            adopt_plan(self.state, request, result)
+            self._grant()
+
+    # -- one robot ------------------------------------------------------------------------------------
+
+    def arrive(self, record: RobotRecord) -> bool:
+        """Leave behind the cells that a robot has left; tell whether it is on its path."""
+        granted = self.state.ledger.granted(record.id)
+        index = arrived_index(self.state.grid, granted, record.x, record.y, self.settings)
+        if index is None:
+            return False
+        if index > 0 or not record.centred:
+            record.centred = True
+            self.state.touch(record)
+            self.state.ledger.arrive(record.id, index)
+        return True
+
+    def send(self, record: RobotRecord, cells: tuple[int, ...]) -> None:
+        """Send a robot its cells; one that is to stand still is stopped first."""
+        record.sent_at = self.now
+        if record.phase is Phase.HOLDING:
+            self.out.append(SendCancel(record.id))
+        self.out.append(SendCells(record.id, record.next_revision(), cells))
+
+    def touched(self, record: RobotRecord) -> set[int]:
+        """The cells that a robot overlaps where it was seen last."""
+        reach = self.settings.robot_radius + self.settings.clearance
+        return self.state.grid.cells_touched(record.x, record.y, reach)
+
+    def validate(self) -> None:
+        """Check that nothing is left undone that has become possible.
+
+        Raises:
+            InvariantError: Something is.
+        """
+        state, quiet = self.state, not self.outdated and self._asked is None
+        for record in state.robots.values():
+            stands = record.phase is Phase.HOLDING and record.stands(self.settings)
+            if stands and record.id not in state.index.hindered and self.touched(record):
+                raise InvariantError(f"{record.id} stands and was not given its place")
+            is_granted_cells = quiet and record.phase is Phase.ACTIVE
+            if is_granted_cells and state.ledger.may_grant(record.id, self.settings.ahead):
+                raise InvariantError(f"{record.id} was not granted a cell that is free for it")
+        undone = [cell for cell in state.pending if state.ledger.owner(cell) is None]
+        if undone:
+            raise InvariantError(f"cells {undone} are free and were not blocked")
