@@ -27,16 +27,16 @@ from rce_container.runtimes.podman import PodmanRuntime
 from rce_container.runtimes.process import ProcessRuntime
 from rce_container.settings import ContainerSettings
 
-BUSY_PATIENCE_S = 60.0
+RUNNING_TIMEOUT_S = 60.0
 """Longer than a task set that was told to end takes for it."""
-KILLED_PATIENCE_S = 30.0
+KILLED_TIMEOUT_S = 30.0
 """For the end of one that was killed; the kernel may have much to clean up."""
 _BUSY_PAUSE_S = 0.05
 _log = logging.getLogger(__name__)
 
 
 async def end_containers(
-    settings: ContainerSettings, state_dir: Path, *, patience: float = BUSY_PATIENCE_S
+    settings: ContainerSettings, state_dir: Path, *, timeout: float = RUNNING_TIMEOUT_S
 ) -> None:
     """End the containers of a state directory as their task set would, and remove all that is left of them.
 
@@ -46,13 +46,13 @@ async def end_containers(
     Args:
         settings: How long nodes are given.
         state_dir: The task set's state directory.
-        patience: Seconds for which a task set is waited for.
+        timeout: Seconds to wait for a task set.
 
     Raises:
         ContainerError: The directory cannot be used, or a task set uses it and does not end.
     """
     remove_stale_sockets(run_dir(), "robot_*.sock")
-    async with _taken(state_dir, patience) as state, contextlib.AsyncExitStack() as stack:
+    async with _taken(state_dir, timeout) as state, contextlib.AsyncExitStack() as stack:
         limiter = await asyncio.to_thread(choose_limiter, state.token, state.cgroups)
         stack.callback(limiter.close)
         runtimes: dict[str, Runtime] = {
@@ -78,25 +78,23 @@ async def end_containers(
 
 
 @contextlib.asynccontextmanager
-async def _taken(state_dir: Path, patience: float) -> AsyncIterator[StateFolder]:
+async def _taken(state_dir: Path, timeout: float) -> AsyncIterator[StateFolder]:
     """Take a state directory as soon as no other process has it; kill the one that keeps it too long."""
     folder = StateFolder(state_dir, run_dir())
-    state = await _take_within(folder, patience)
+    state = await _take_within(folder, timeout)
     if state is None and (owner := folder.owner()) is not None:
-        _log.warning(
-            "rce-container (process %d) has not ended within %g s and is killed", owner.pid, patience
-        )
+        _log.warning("rce-container (process %d) has not ended within %g s and is killed", owner.pid, timeout)
         proc.kill(owner)
-        state = await _take_within(folder, KILLED_PATIENCE_S)
+        state = await _take_within(folder, KILLED_TIMEOUT_S)
     try:
         yield state or folder.__enter__()
     finally:
         folder.__exit__()
 
 
-async def _take_within(folder: StateFolder, patience: float) -> StateFolder | None:
+async def _take_within(folder: StateFolder, timeout: float) -> StateFolder | None:
     """Take a state directory; None if another process still has it after some seconds."""
-    deadline = asyncio.get_running_loop().time() + patience
+    deadline = asyncio.get_running_loop().time() + timeout
     while True:
         try:
             return folder.__enter__()

@@ -272,12 +272,12 @@ class Incarnation:
             match intake.read(line):
                 case m.Report(status=status, features=features):
                     self._features = frozenset(features) & {EXEC}
-                    self._report(self._sound(status), pace)
+                    self._report(self._sanitize(status), pace)
                 case m.Fault(text=text):
                     pace.pay(intake.PER_FAULT)
-                    self._context.feed(events.Faulted(self.id, self.mark, intake.sound_text(text)))
+                    self._context.feed(events.Faulted(self.id, self.mark, intake.sanitize_text(text)))
                 case m.Counters() as counters:
-                    self.counters = intake.sound_counters(counters)
+                    self.counters = intake.sanitize_counters(counters)
                 case m.Killed(request=number):
                     channel.send(m.encode(m.Cause(request=number, text=self.enforcer.claim())))
                 case m.Dial() as request:
@@ -285,12 +285,12 @@ class Incarnation:
             if pause := pace.pause:
                 await asyncio.sleep(pause)
 
-    def _sound(self, status: EndpointStatus) -> EndpointStatus:
+    def _sanitize(self, status: EndpointStatus) -> EndpointStatus:
         """Believe no revision that the environment was not given, by this manager or by one before."""
         if self._spec is not None:
-            return intake.sound_status(self.id, status, self._spec.revision)
+            return intake.sanitize_status(self.id, status, self._spec.revision)
         record = self.folder.read_record()
-        return intake.sound_status(self.id, status, record.revision if record is not None else 0)
+        return intake.sanitize_status(self.id, status, record.revision if record is not None else 0)
 
     def _report(self, status: EndpointStatus, pace: intake.Pace) -> None:
         if not self._stopping:
@@ -361,10 +361,10 @@ class Incarnation:
         words = last_line(self.folder.logs)[:_LAST_WORDS_LENGTH]
         return f"; its last words: {words}" if words else ""
 
-    async def _clean(self, patience: float) -> None:
-        """Let the shim do its work for ``patience`` seconds, then kill what is left and remove the folder."""
+    async def _clean(self, timeout: float) -> None:
+        """Let the shim do its work for ``timeout`` seconds, then kill what is left and remove the folder."""
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(patience):
+            async with asyncio.timeout(timeout):
                 await self.handle.wait()
         try:
             await self.enforcer.end()

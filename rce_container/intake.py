@@ -56,13 +56,13 @@ def read(line: bytes) -> m.ToManager | Unknown:
         raise msgspec.DecodeError(str(error)) from error
 
 
-def sound_text(text: str) -> str:
+def sanitize_text(text: str) -> str:
     """Cut a text that is too long for people, and take out what their terminals would obey."""
     text = one_line(text)
     return text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]} ..."
 
 
-def sound_status(id_: str, status: EndpointStatus, newest: int) -> EndpointStatus:
+def sanitize_status(id_: str, status: EndpointStatus, newest: int) -> EndpointStatus:
     """Take of a report what can be true of a container.
 
     Args:
@@ -78,14 +78,14 @@ def sound_status(id_: str, status: EndpointStatus, newest: int) -> EndpointStatu
         state=status.state if status.state in _STATES else EndpointState.RUNNING,
         incarnation="",
         detail="",
-        nodes=tuple(map(_sound_node, nodes.values())),
+        nodes=tuple(map(_sanitize_node, nodes.values())),
         interfaces=_named(status.interfaces),
         connections=tuple(map(_whole, status.connections[:MAX_CONNECTIONS])),
         address=LinkAddress(),
     )
 
 
-def sound_counters(said: m.Counters) -> m.Counters:
+def sanitize_counters(said: m.Counters) -> m.Counters:
     """Take of counters what can be true of a container's links and interfaces."""
     return m.Counters(
         interfaces={
@@ -96,14 +96,14 @@ def sound_counters(said: m.Counters) -> m.Counters:
     )
 
 
-def _sound_node(node: NodeStatus) -> NodeStatus:
+def _sanitize_node(node: NodeStatus) -> NodeStatus:
     code = node.exit_code
     return replace(
         node,
         pid=_whole(node.pid),
         exit_code=None if code is None else max(-_MAX_CODE, min(code, _MAX_CODE)),
         restarts=_whole(node.restarts),
-        detail=sound_text(node.detail),
+        detail=sanitize_text(node.detail),
     )
 
 

@@ -79,8 +79,8 @@ class Launcher:
         """
         runtime = self._runtime_for(resources)
         control_group = self._limiter.create(folder.mark, limits_of(resources, self._settings))
-        seat = self._enroll(id_, folder, resources)
-        boot = self._boot(id_, folder, resources, runtime, control_group, seat)
+        membership = self._enroll(id_, folder, resources)
+        boot = self._boot(id_, folder, resources, runtime, control_group, membership)
         with folder.listen(folder.control_socket) as control, folder.listen(folder.link_socket) as links:
             order = Order(
                 EndpointId.parse(id_).tag,
@@ -91,7 +91,7 @@ class Launcher:
                 links.fileno(),
                 join=control_group.join,
                 host_network=resources.network is Network.HOST,
-                switch=seat.path if seat else "",
+                switch=membership.path if membership else "",
                 image=resources.image or runtime.image,
             )
             handle = runtime.start(order)
@@ -102,8 +102,8 @@ class Launcher:
             runtime=runtime.name,
             pid=process.pid,
             start=process.start,
-            group=resources.group if seat else "",
-            address=str(seat.address) if seat else "",
+            group=resources.group if membership else "",
+            address=str(membership.address) if membership else "",
         )
         try:
             folder.write_record(record)
@@ -151,7 +151,7 @@ class Launcher:
         resources: Resources,
         runtime: Runtime,
         control_group: ControlGroup,
-        seat: Membership | None,
+        membership: Membership | None,
     ) -> m.Boot:
         settings = self._settings
         own_network = runtime.isolated and resources.network is not Network.HOST
@@ -164,7 +164,7 @@ class Launcher:
             logs="",
             ros_port=ROS_PORT if own_network else 0,
             isolated=runtime.isolated,
-            address=str(seat.address.ip) if seat else LOOPBACK,
+            address=str(membership.address.ip) if membership else LOOPBACK,
             rlimits=_rlimits(control_group, isolated=runtime.isolated),
             packages=tuple(map(str, settings.packages)),
             user_packages=runtime.user_packages(folder),

@@ -210,7 +210,7 @@ class Manager:
 
     async def _deal_with_the_past(self) -> None:
         folders = await asyncio.to_thread(self._state.existing)
-        await self._sweep_cells({folder.mark for folder in folders})
+        await self._sweep_control_groups({folder.mark for folder in folders})
         marks = {folder.mark for folder in folders}
         await asyncio.to_thread(self._state.archive.settle, marks, time.time())
         async with asyncio.TaskGroup() as tasks:
@@ -269,7 +269,7 @@ class Manager:
             await asyncio.to_thread(self._state.archive.prune, time.time())
             await asyncio.sleep(self._settings.prune_interval)
 
-    async def _sweep_cells(self, keep: set[str]) -> None:
+    async def _sweep_control_groups(self, keep: set[str]) -> None:
         """Remove the control groups of containers of which nothing else is left."""
         try:
             await asyncio.to_thread(self._limiter.sweep, keep)

@@ -20,7 +20,7 @@ import psutil
 import pytest
 
 REQUIRE_ALL = os.environ.get("RCE_REQUIRE_ALL") == "1"
-LEAK_PATIENCE_S = 3.0
+LEAK_TIMEOUT_S = 3.0
 WORKERS_PER_CORE = 2
 
 # Nothing fails for being slow: not on a busy machine, nor at the first run, which makes hypothesis's tables.
@@ -315,7 +315,7 @@ def _no_leaks(request: pytest.FixtureRequest) -> Iterator[None]:
     fds, threads = _descriptors(), set(threading.enumerate())
     children = {child.pid for child in psutil.Process().children(recursive=True)}
     yield
-    deadline = time.monotonic() + LEAK_PATIENCE_S
+    deadline = time.monotonic() + LEAK_TIMEOUT_S
     while leaks := _leaks(fds, children, threads):
         if time.monotonic() > deadline:
             pytest.fail("left behind: " + "; ".join(leaks))

@@ -136,7 +136,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
     def pace(self, pacer: Pacer | None) -> None:
         """Limit what passes."""
         if not self._ending and (pacer is not None or self._flow is not None):
-            self._use_valve().pace(pacer)
+            self._use_flow_control().pace(pacer)
             self._look_at_flow()
 
     @property
@@ -277,7 +277,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
 
     # Inside
 
-    def _use_valve(self) -> FlowControl:
+    def _use_flow_control(self) -> FlowControl:
         if self._flow is None:
             self._flow = FlowControl(self)
             self._straight = False
@@ -320,7 +320,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
 
     def _take_grant(self, frame: Frame) -> None:
         try:
-            self._use_valve().allow(frame.payload)
+            self._use_flow_control().allow(frame.payload)
         except ProtocolError as error:
             self.abort(error)
         else:

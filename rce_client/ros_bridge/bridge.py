@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rce_client.ros_bridge.plan import Plan, Span
     from rce_client.topics import Publisher
 
-MASTER_PATIENCE = 2.0
+MASTER_TIMEOUT = 2.0
 """Seconds between two looks for the robot's ROS master."""
 
 REMINDER = 5.0
@@ -43,7 +43,7 @@ async def joined_graph(
                 master_uri=master_uri,
                 types=types,
                 signals=False,
-                master_timeout=MASTER_PATIENCE,
+                master_timeout=MASTER_TIMEOUT,
             )
             try:
                 await stack.enter_async_context(node)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rce.config.bridges import Bridge
     from rce.ros.node import Node
 
-PATIENCE_S = 10.0
+TIMEOUT_S = 10.0
 """How long the robot's nodes get to tell their types."""
 _LOOK_S = 0.5
 _UNKNOWN = "*"
@@ -31,7 +31,7 @@ async def find_types(
     source: str,
     say: Callable[[str], None],
     *,
-    patience: float = PATIENCE_S,
+    timeout: float = TIMEOUT_S,
 ) -> dict[int, str]:
     """Wait until the robot's graph tells the types of all bridges.
 
@@ -40,7 +40,7 @@ async def find_types(
         node: A node of the robot's graph.
         source: Name of the file, for errors.
         say: Is told what is waited for.
-        patience: Seconds to wait.
+        timeout: Seconds to wait.
 
     Raises:
         ConfigError: A bridge has no end in the robot's graph, or the graph did not tell in time; every such
@@ -56,7 +56,7 @@ async def find_types(
     async with RpcClient() as rpc:
         master = MasterClient(node.master_uri, node.name, node.uri, rpc)
         try:
-            async with asyncio.timeout(patience):
+            async with asyncio.timeout(timeout):
                 told = False
                 while True:
                     await _look(bridges, master, found)
@@ -69,11 +69,11 @@ async def find_types(
                     await asyncio.sleep(_LOOK_S)
         except TimeoutError:
             left = [item for item in bridges.items() if item[0] not in found]
-            raise ConfigError(source, [_timeout_fault(*item, patience) for item in left]) from None
+            raise ConfigError(source, [_timeout_fault(*item, timeout) for item in left]) from None
 
 
-def _timeout_fault(index: int, bridge: Bridge, patience: float) -> Fault:
-    where = f"within {patience:g} s no node of the robot's graph told that of {bridge}"
+def _timeout_fault(index: int, bridge: Bridge, timeout: float) -> Fault:
+    where = f"within {timeout:g} s no node of the robot's graph told that of {bridge}"
     return Fault(f"bridges[{index}].type", f"is missing, and {where}; start the node first, or give the type")
 
 

@@ -170,7 +170,7 @@ class Environment:
     def _context(self, reaper: Reaper) -> NodeContext:
         return NodeContext(
             reaper=reaper,
-            outfit=lambda node: self._user_packages.outfit(node, self._environ()),
+            launch_environment=lambda node: self._user_packages.launch_environment(node, self._environ()),
             mark=self._boot.mark,
             home=self._boot.home,
             logs=Path(self._boot.logs),

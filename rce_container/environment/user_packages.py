@@ -92,7 +92,7 @@ class UserPackages:
         connections = tuple(one for one in spec.connections if one.interface in tags)
         return msgspec.structs.replace(spec, interfaces=kept, connections=connections)
 
-    def outfit(self, node: NodeSpec, environ: Mapping[str, str]) -> LaunchEnvironment:
+    def launch_environment(self, node: NodeSpec, environ: Mapping[str, str]) -> LaunchEnvironment:
         """Work out what a node is started with.
 
         Args:

@@ -16,10 +16,10 @@ class PackageTrouble(Exception):  # noqa: N818 - base of what is told to a packa
     """A package cannot come into a container now; the text says why and what to do.
 
     Attributes:
-        patience: How many times the usual pause is made before it is tried again.
+        delay_factor: How much longer than usual to wait before the next attempt.
     """
 
-    patience: ClassVar[float] = 1.0
+    delay_factor: ClassVar[float] = 1.0
 
 
 class Unfetched(PackageTrouble):
@@ -37,4 +37,4 @@ class NoSpace(PackageTrouble):
 class RequirementsTrouble(PackageTrouble):
     """What it needs of Python cannot be installed."""
 
-    patience = 10.0  # each attempt costs the machine, and whoever serves the distributions, a lot
+    delay_factor = 10.0  # each attempt costs the machine, and whoever serves the distributions, a lot

@@ -113,7 +113,7 @@ class Supply:
                     log.warning("%s: %s", self._holder, text)
                     self._tell(text)
                 told = text
-                await asyncio.sleep(pauses.next() * trouble.patience)
+                await asyncio.sleep(pauses.next() * trouble.delay_factor)
             else:
                 self._on_arrival()
                 return

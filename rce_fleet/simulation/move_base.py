@@ -25,7 +25,7 @@ SIGHT = 1.2
 """How far ahead a robot looks for blocked cells, metres."""
 MARGIN = 0.15
 """Width of a cell's rim in which hits may belong to a neighbour, metres."""
-PATIENCE = 3.0
+STUCK_TIMEOUT = 3.0
 """Seconds that a robot waits before an obstacle that it cannot place before it gives up."""
 
 
@@ -131,7 +131,7 @@ class SimulatedMoveBase:
             self._end(goal, self._ending or GoalState.SUCCEEDED)
         elif self._navigator.standing:
             self._stuck_for += dt
-            if self._stuck_for > PATIENCE:
+            if self._stuck_for > STUCK_TIMEOUT:
                 self._brake(GoalState.ABORTED)
         else:
             self._stuck_for = 0.0

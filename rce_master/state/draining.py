@@ -66,8 +66,8 @@ def _processes(tables: Tables, name: str) -> list[str]:
 def advance(tx: Transaction) -> None:
     """Begin the next move from each machine that is draining, and give up moves that take too long."""
     for move in list(tx.tables.moves):
-        if tx.now - move.since >= tx.settings.move_patience:
-            give_up(tx, move, f"did not come up there within {tx.settings.move_patience:.0f} s")
+        if tx.now - move.since >= tx.settings.move_timeout:
+            give_up(tx, move, f"did not come up there within {tx.settings.move_timeout:.0f} s")
     for task_set in list(tx.connected_task_sets(TaskSetKind.CONTAINER)):
         if capacity.is_draining(tx.tables, task_set):
             _advance(tx, task_set)

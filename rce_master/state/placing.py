@@ -101,7 +101,7 @@ def tell_waiting(tx: Transaction) -> None:
         live = tx.tables.live[endpoint.id]
         if not isinstance(endpoint, Container) or not isinstance(live, ContainerLive) or live.told:
             continue
-        if tx.now - live.since >= tx.settings.placement_patience:
+        if tx.now - live.since >= tx.settings.placement_timeout:
             rooms = capacity.rooms(tx.tables) if rooms is None else rooms
             _tell(tx, endpoint, _why_nowhere(tx, endpoint, rooms))
 

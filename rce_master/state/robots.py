@@ -131,5 +131,5 @@ def expire(tx: Transaction) -> None:
             next_session(live.session, RobotEvent.EXPIRE)
             endpoints.remove(tx, robot.id, "the robot stayed away")
             tx.happen("robot_gone", robot.id, "its interfaces and connections were removed")
-        elif live.status is None and waited >= tx.settings.login_patience:
+        elif live.status is None and waited >= tx.settings.login_timeout:
             leave(tx, robot, "it was let in and never came")

@@ -13,11 +13,11 @@ class StateSettings:
     """How long a robot's interfaces and connections are kept after its connection dropped."""
     container_grace: float = 30.0
     """How long a container task set may be away until its containers are placed elsewhere."""
-    placement_patience: float = 10.0
+    placement_timeout: float = 10.0
     """How long a container waits for a machine until its user is told."""
-    login_patience: float = 15.0
+    login_timeout: float = 15.0
     """How long a robot that was let in may take until its task set reports it; then it counts as away."""
-    move_patience: float = 60.0
+    move_timeout: float = 60.0
     """How long a container's copy at another machine may take to come up, when its machine is drained."""
     move_rest: float = 30.0
     """How long a container stays after a move of it failed, until the next is tried."""

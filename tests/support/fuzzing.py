@@ -227,11 +227,11 @@ async def exchange(port: int, request: bytes, *, whole: bool = False) -> list[in
     return [int(status) for status in _STATUS.findall(answer)]
 
 
-async def _begin(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, patience: float) -> bytes:
+async def _begin(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, timeout: float) -> bytes:
     """Wait for the beginning of an answer; then, unless it never ends, send the end of the request."""
     answer = b""
     with contextlib.suppress(TimeoutError):
-        answer = await asyncio.wait_for(reader.read(1 << 16), patience)
+        answer = await asyncio.wait_for(reader.read(1 << 16), timeout)
     if not _is_stream(answer):
         writer.write_eof()
     return answer

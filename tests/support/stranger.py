@@ -12,7 +12,7 @@ from typing import Any
 
 import aiohttp
 
-PATIENCE_S = 90.0
+TIMEOUT_S = 90.0
 """How long to wait for what should come at once: the machine may be busy."""
 
 
@@ -76,7 +76,7 @@ class Stranger:
     async def publish(self, tag: str, cls: str, message: Any) -> None:
         await self.send("DM", {"iTag": tag, "type": cls, "msgID": "nil", "msg": message})
 
-    async def call(self, tag: str, cls: str, message: Any, *, timeout: float = PATIENCE_S) -> Any:
+    async def call(self, tag: str, cls: str, message: Any, *, timeout: float = TIMEOUT_S) -> Any:
         number = f"call{next(self._numbers)}"
         await self.send("DM", {"iTag": tag, "type": cls, "msgID": number, "msg": message})
         async with asyncio.timeout(timeout):
@@ -84,11 +84,11 @@ class Stranger:
         assert answer["msgID"] == number
         return answer["msg"]
 
-    async def receive(self, tag: str, *, timeout: float = PATIENCE_S) -> Any:
+    async def receive(self, tag: str, *, timeout: float = TIMEOUT_S) -> Any:
         async with asyncio.timeout(timeout):
             return (await self.queue(tag).get())["msg"]
 
-    async def wait_status(self, tags: dict[str, bool], *, timeout: float = PATIENCE_S) -> None:
+    async def wait_status(self, tags: dict[str, bool], *, timeout: float = TIMEOUT_S) -> None:
         try:
             async with asyncio.timeout(timeout), self._changed:
                 await self._changed.wait_for(
@@ -97,7 +97,7 @@ class Stranger:
         except TimeoutError:
             raise AssertionError(f"wanted {tags}; status {self.status}, errors {self.errors}") from None
 
-    async def wait_error(self, text: str, *, timeout: float = PATIENCE_S) -> str:
+    async def wait_error(self, text: str, *, timeout: float = TIMEOUT_S) -> str:
         try:
             async with asyncio.timeout(timeout), self._changed:
                 await self._changed.wait_for(lambda: any(text in error for error in self.errors))

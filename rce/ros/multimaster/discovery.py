@@ -65,7 +65,7 @@ class Discovery:
         self.settings = settings = settings or DiscoverySettings()
         self._core = core
         self._master_uri = core.uri if core is not None else local_master(settings.master_uri)
-        self._neighbours = PeerTable(settings.patience)
+        self._neighbours = PeerTable(settings.liveness)
         self._watches: set[EventQueue[PeerEvent]] = set()
         self._beat_now = asyncio.Event()
         self._robots = RobotHosts(settings.robot_addresses, self._beat_now.set)

@@ -142,8 +142,8 @@ class _Peer:
 class PeerTable:
     """The masters that were heard of, this machine's own among them."""
 
-    def __init__(self, patience: LivenessSettings | None = None) -> None:
-        self._patience = patience or LivenessSettings()
+    def __init__(self, liveness: LivenessSettings | None = None) -> None:
+        self._liveness = liveness or LivenessSettings()
         self._peers: dict[PeerKey, _Peer] = {}
 
     # ------------------------------------------------------------------ questions
@@ -212,7 +212,7 @@ class PeerTable:
         step = Step()
         for peer in list(self._peers.values()):
             silence = now - peer.last_beat
-            if self._patience.remove_after > 0 and silence > self._patience.remove_after:
+            if self._liveness.remove_after > 0 and silence > self._liveness.remove_after:
                 self._remove(peer, step)
                 continue
             self._due_contact(peer, now, step)
@@ -257,26 +257,26 @@ class PeerTable:
 
     def _question(self, peer: _Peer, now: float, step: Step) -> None:
         asked = bool(peer.requests)
-        period = 1 / self._patience.rosmaster_hz
+        period = 1 / self._liveness.rosmaster_hz
         if asked and now - peer.requests[-1] < period:
             return
-        if not asked and now - peer.last_beat <= self._patience.active_request_after:
+        if not asked and now - peer.last_beat <= self._liveness.active_request_after:
             return
         if len(peer.requests) >= OFFLINE_AFTER_REQUESTS:
             self._offline(peer, step)
-            if now - peer.requests[-1] < self._patience.active_request_after:
+            if now - peer.requests[-1] < self._liveness.active_request_after:
                 return
         peer.requests.append(now)
         del peer.requests[: -OFFLINE_AFTER_REQUESTS - 1]
         step.request_state.append(peer.key.host)
 
     def _allowed_silence(self, peer: _Peer) -> float:
-        return self._patience.measurement_intervals / peer.heard.rate * self._patience.timeout_factor
+        return self._liveness.measurement_intervals / peer.heard.rate * self._liveness.timeout_factor
 
     def _quality(self, peer: _Peer, now: float) -> float:
         if not peer.measures:
             return -1.0
-        duration = min(self._patience.measurement_intervals / peer.heard.rate, now - peer.first_beat)
+        duration = min(self._liveness.measurement_intervals / peer.heard.rate, now - peer.first_beat)
         expected = int(peer.heard.rate * duration)
         if expected <= 0:
             return -1.0

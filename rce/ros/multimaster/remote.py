@@ -57,10 +57,10 @@ class Remote(ABC):
 
     async def run(self) -> None:
         """Keep in step until the master is gone and everything is taken back."""
-        patience = 0.0
+        timeout = 0.0
         while True:
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(patience):
+                async with asyncio.timeout(timeout):
                     await self._wake.wait()
             self._wake.clear()
             try:
@@ -70,10 +70,10 @@ class Remote(ABC):
                     await self.release()
                     if self._is_gone:
                         return
-                patience = LOOK_AGAIN
+                timeout = LOOK_AGAIN
             except (RosError, OSError) as error:
                 _log.warning("master %s: %s", self.master.name, error)
-                patience = RETRY
+                timeout = RETRY
 
     @abstractmethod
     async def synchronize(self) -> None:

@@ -16,7 +16,7 @@ from rce.ros.multimaster.heartbeat import MAX_RATE
 from rce.ros.multimaster.peer_table import LivenessSettings
 from rce.ros.node.settings import DEFAULT_MASTER_URI
 
-_PATIENCE = LivenessSettings()
+_LIVENESS = LivenessSettings()
 
 
 def local_master(uri: str = "") -> str:
@@ -43,10 +43,10 @@ class DiscoverySettings:
     heartbeat_hz: float = 1.0
     rosmaster_hz: float = 1.0
     """How often the master is asked for changes."""
-    measurement_intervals: float = _PATIENCE.measurement_intervals
-    timeout_factor: float = _PATIENCE.timeout_factor
-    active_request_after: float = _PATIENCE.active_request_after
-    remove_after: float = _PATIENCE.remove_after
+    measurement_intervals: float = _LIVENESS.measurement_intervals
+    timeout_factor: float = _LIVENESS.timeout_factor
+    active_request_after: float = _LIVENESS.active_request_after
+    remove_after: float = _LIVENESS.remove_after
     robot_hosts: tuple[str, ...] = ()
     """Hosts (``HOST`` or ``HOST:PORT``) that get heartbeats of their own, where multicast does not reach."""
     send_mcast: bool = True
@@ -61,7 +61,7 @@ class DiscoverySettings:
             raise ValueError(f"rosmaster_hz must be above 0, not {self.rosmaster_hz:g}")
 
     @property
-    def patience(self) -> LivenessSettings:
+    def liveness(self) -> LivenessSettings:
         """When a silent master is given up."""
         return LivenessSettings(
             self.measurement_intervals,

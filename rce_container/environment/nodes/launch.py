@@ -28,18 +28,18 @@ class Launch(NamedTuple):
     """The global ROS name that it was told to take; empty if it chooses by itself."""
 
 
-def prepare(outfit: LaunchEnvironment, mark: str) -> Launch:
+def prepare(launch_environment: LaunchEnvironment, mark: str) -> Launch:
     """Work out how to start a node.
 
     Args:
-        outfit: What it is started with.
+        launch_environment: What it is started with.
         mark: The value of :data:`NODE_MARK`.
 
     Raises:
         NodeError: It cannot be started; the text says what to do.
     """
-    spec, packages = outfit.spec, outfit.packages
-    environ: Mapping[str, str] = outfit.environ
+    spec, packages = launch_environment.spec, launch_environment.packages
+    environ: Mapping[str, str] = launch_environment.environ
     try:
         package = packages.find(spec.pkg)
         executable = package.executable(spec.exe)
@@ -50,8 +50,10 @@ def prepare(outfit: LaunchEnvironment, mark: str) -> Launch:
     if package.python == "system":
         environ = system_environ(environ, package.path)
     env = {**environ, NODE_MARK: mark}
-    if outfit.python_path:
-        env["PYTHONPATH"] = os.pathsep.join(filter(None, (outfit.python_path, env.get("PYTHONPATH", ""))))
+    if launch_environment.python_path:
+        env["PYTHONPATH"] = os.pathsep.join(
+            filter(None, (launch_environment.python_path, env.get("PYTHONPATH", "")))
+        )
     if spec.name:
         arguments.append(f"__name:={spec.name}")
     if namespace:

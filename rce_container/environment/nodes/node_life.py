@@ -32,7 +32,7 @@ class NodeContext:
     """What nodes are made with."""
 
     reaper: Reaper
-    outfit: Callable[[NodeSpec], LaunchEnvironment]
+    launch_environment: Callable[[NodeSpec], LaunchEnvironment]
     """Says what a node is started with."""
     mark: str
     home: str
@@ -81,7 +81,7 @@ class NodeLife:
         """Live. Tells of the beginning when it is known, and of the end when nothing is left."""
         mark = f"{self._context.mark}.{self._spec.tag}.{self.life}"
         try:
-            launch = prepare(self._context.outfit(self._spec), mark)
+            launch = prepare(self._context.launch_environment(self._spec), mark)
             event = await self._live(launch)
         except NodeError as error:
             event = Refused(self._spec.tag, self.life, str(error), hopeless=True)
@@ -125,12 +125,12 @@ class NodeLife:
         return code, cause or describe_exit(code)
 
     async def _escalate(self, child: Child, share: float) -> tuple[int, str]:
-        for number, patience in (
+        for number, timeout in (
             (signal.SIGINT, self._context.interrupt_timeout),
             (signal.SIGTERM, self._context.terminate_timeout),
         ):
             child.signal_group(number)
-            done, _ = await asyncio.wait((child.ended,), timeout=patience * share)
+            done, _ = await asyncio.wait((child.ended,), timeout=timeout * share)
             if done:
                 return child.ended.result(), f"it was told to by {number.name}"
         child.signal_group(signal.SIGKILL)

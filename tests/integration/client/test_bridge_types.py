@@ -62,7 +62,7 @@ async def test_types_are_read_as_nodes_appear() -> None:
 async def test_what_the_graph_does_not_tell_is_named() -> None:
     async with Core(port=0) as core, node("asker", core) as asker:
         with pytest.raises(ConfigError) as caught:
-            await find_types({4: TOPIC}, asker, "file", lambda _: None, patience=0.1)
+            await find_types({4: TOPIC}, asker, "file", lambda _: None, timeout=0.1)
         assert str(caught.value) == (
             "file: bridges[4].type: is missing, and within 0.1 s no node of the robot's graph told that of "
             "topic pose; start the node first, or give the type"

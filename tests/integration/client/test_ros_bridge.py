@@ -207,7 +207,7 @@ async def test_check_only_tells_what_is_in_the_file(engine: Engine, tmp_path: Pa
 async def test_joined_graph_takes_the_master_when_it_comes() -> None:
     said: list[str] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("rce_client.ros_bridge.bridge.MASTER_PATIENCE", 0.05)
+        patch.setattr("rce_client.ros_bridge.bridge.MASTER_TIMEOUT", 0.05)
         async with Core(host="127.0.0.1", port=0) as core:
             uri = core.uri
         waiting = asyncio.Event()

@@ -127,7 +127,7 @@ async def test_a_node_that_dies_is_told_and_not_restarted(machine: Machine) -> N
         assert "hello anew" in await machine.log_holds(BOX, "node", "anew")
 
 
-async def test_bad_wishes_are_told_and_spoil_nothing_else(machine: Machine) -> None:
+async def test_invalid_request_is_reported_and_spoils_nothing_else(machine: Machine) -> None:
     async with machine.engine():
         await machine.put(
             BOX,

@@ -106,7 +106,7 @@ def _incarnations(machine: Machine) -> list[object]:
     return list(machine.manager._incarnations.values())
 
 
-async def test_a_manager_that_dies_before_a_birth_leaves_nothing(namespaces: Machine) -> None:
+async def test_manager_that_dies_before_a_fork_leaves_nothing(namespaces: Machine) -> None:
     machine = namespaces
     async with machine.managed(grace=0.2):
         os.kill(fork_server(machine), signal.SIGSTOP)

@@ -14,13 +14,13 @@ from rce_container.environment import proc
 
 MARK = "0123456789ab"
 TOKEN = "feedbeef"
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 SLEEP = "import time; time.sleep(600)"
 
 
 def vanish(traces: Traces) -> None:
     """Wait until nothing is left: what was killed needs a moment for its end, and its parent to notice."""
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while left := traces.left():
         assert time.monotonic() < deadline, left
         time.sleep(0.01)
@@ -34,7 +34,7 @@ def test_processes_are_found_by_name_and_by_descent_and_remembered(folder: Path)
         subprocess.Popen([sys.executable, "-c", SLEEP, "box_of_leaks"]) as other,
     ):
         try:
-            deadline = time.monotonic() + PATIENCE_S
+            deadline = time.monotonic() + TIMEOUT_S
             while len(found := traces.look()) < 3:
                 assert time.monotonic() < deadline, found
                 time.sleep(0.01)

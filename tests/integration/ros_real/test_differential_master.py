@@ -27,7 +27,7 @@ from rce.ros.core import Graph
 
 pytestmark = [pytest.mark.needs("rospy", "roslaunch")]
 
-PATIENCE_S = 20.0
+TIMEOUT_S = 20.0
 
 Call = tuple[str, tuple[Any, ...]]
 
@@ -63,7 +63,7 @@ def comparable(method: str, answer: Any) -> Any:
 def master(*argv: str, uri: str, home: Path) -> Iterator[Side]:
     process = Popen(argv, env=ros_environment(uri, home), stdout=DEVNULL, stderr=DEVNULL)
     try:
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while True:
             try:
                 with ServerProxy(uri) as proxy:

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
 import pytest
-from support.ros_real import PATIENCE_S, Graph, interrupt
+from support.ros_real import TIMEOUT_S, Graph, interrupt
 
 from rce.ros.errors import ServiceFault
 from rce.ros.node import Node, Publisher
@@ -33,7 +33,7 @@ class Program:
 
     async def says(self, words: str = "done") -> list[str]:
         """Wait for a line; return all lines until then."""
-        async with asyncio.timeout(PATIENCE_S):
+        async with asyncio.timeout(TIMEOUT_S):
             while words not in self.lines:
                 line = await self._output.readline()
                 assert line, f"it ended and said {self.lines}"
@@ -55,7 +55,7 @@ async def running(graph: Graph, program: str, part: str) -> AsyncIterator[Progra
 
 async def until_set(node: Node, name: str, value: Any) -> None:
     """Wait until the program has set a parameter."""
-    async with asyncio.timeout(PATIENCE_S):
+    async with asyncio.timeout(TIMEOUT_S):
         while await node.get_param(name, None) != value:
             await asyncio.sleep(0.01)
 
@@ -106,7 +106,7 @@ async def test_latching(graph: Graph, make_node: MakeNode, roscpp_library: str) 
         async with running(graph, roscpp_library, "latching") as program:
             await program.says("says so 1")
             late = await node.subscribe("cpp_latched", STRING)
-            async with asyncio.timeout(PATIENCE_S):
+            async with asyncio.timeout(TIMEOUT_S):
                 assert (await anext(aiter(late))).data == "two"
             latched.publish(data="newer")
             assert await program.says() == ["near two", "late kept 5", "says so 1", "kept newer", "done"]
@@ -135,7 +135,7 @@ async def test_a_subscriber_leaves_under_load(graph: Graph, make_node: MakeNode,
             publishing = tasks.create_task(publish(load))
             assert await program.says() == ["heard epochs", "done"]
             publishing.cancel()
-        async with asyncio.timeout(PATIENCE_S):
+        async with asyncio.timeout(TIMEOUT_S):
             while load.connections:
                 await asyncio.sleep(0.01)
 
@@ -169,9 +169,9 @@ async def test_services(graph: Graph, make_node: MakeNode, roscpp_library: str) 
             await until_set(node, "/lib/served", 0)
             client = node.service_client("cpp_set", SET_BOOL)
             for _ in range(200):
-                assert (await client.call({"data": True}, timeout=PATIENCE_S)).message == "cpp"
+                assert (await client.call({"data": True}, timeout=TIMEOUT_S)).message == "cpp"
             with pytest.raises(ServiceFault):
-                await client.call({"data": False}, timeout=PATIENCE_S)
+                await client.call({"data": False}, timeout=TIMEOUT_S)
             await until_set(node, "/lib/served", 1)
             assert await graph.service("/cpp_set") is None
             assert await program.says() == [

@@ -365,7 +365,7 @@ def test_amounts_are_read_as_the_protocol_reads_them() -> None:
         assert getattr(made.container_data, key) == value
 
 
-def test_faults_of_wishes_are_named_by_their_keys() -> None:
+def test_faults_of_requests_are_named_by_their_keys() -> None:
     data = good()
     data["containers"] = [
         {"cTag": "a", "memory": "lots", "network": "all"},

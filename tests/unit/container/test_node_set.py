@@ -18,7 +18,7 @@ from rce_container.environment.nodes.reaper import Reaper
 
 
 def context(folder: Path, faults: list[str]) -> NodeContext:
-    def outfit(_: NodeSpec) -> Any:
+    def launch_environment(_: NodeSpec) -> Any:
         raise NodeError("no package 'x'")
 
     async def why_killed() -> str:
@@ -26,7 +26,7 @@ def context(folder: Path, faults: list[str]) -> NodeContext:
 
     return NodeContext(
         reaper=Reaper(),
-        outfit=outfit,
+        launch_environment=launch_environment,
         mark="mark",
         home=str(folder),
         logs=folder,

@@ -38,11 +38,11 @@ STATUSES = st.builds(
 )
 SLOTS = 3
 LIMITS = StateSettings(
-    move_patience=3,
+    move_timeout=3,
     move_rest=2,
     robot_grace=3,
     container_grace=2,
-    placement_patience=1,
+    placement_timeout=1,
     max_containers=3,
     max_connections=6,
 )

@@ -26,8 +26,8 @@ def beat(secs: int = 1, *, rate: float = 1.0, kind: Kind = Kind.STATE, local: in
     return Heartbeat(kind, PORT, rate, Stamp(secs, 0), Stamp(local, 0))
 
 
-def known(**patience: float) -> PeerTable:
-    found = PeerTable(LivenessSettings(**patience))
+def known(**liveness: float) -> PeerTable:
+    found = PeerTable(LivenessSettings(**liveness))
     assert found.received(HOST, beat(), 0.0).ask_contact == [KEY]
     step = found.contacted(KEY, CONTACT, 0.0)
     assert changes(step) == [(PeerChange.NEW, True)]

@@ -42,7 +42,7 @@ def create(**data: Any) -> ContainerData:
         ({"size": 1.5}, r"containerData\.size: must be int"),
     ],
 )  # fmt: skip
-def test_a_wrong_wish_is_named_with_its_place_and_the_fix(data: dict[str, Any], problem: str) -> None:
+def test_invalid_request_is_named_with_place_and_fix(data: dict[str, Any], problem: str) -> None:
     with pytest.raises(MessageError, match=problem):
         create(**data)
 
@@ -88,7 +88,7 @@ def test_resizing_changes_what_it_names() -> None:
         ({"heartbeatTimeout": 0}, "heartbeatTimeout: must be float >= 0.1"),
     ],
 )
-def test_a_wrong_wish_for_a_node_spares_the_other_nodes(keys: dict[str, Any], problem: str) -> None:
+def test_invalid_node_request_spares_other_nodes(keys: dict[str, Any], problem: str) -> None:
     node = {"containerTag": "c", "nodeTag": "n", "pkg": "p", "exe": "e"}
     request = read_request("CN", {"addNodes": [{**node, **keys}, node]})
     assert isinstance(request, ConfigureComponents)
