@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -56,14 +57,13 @@ class Ban:
             _is_under(path, part) for part in excepted
         )
 
-    def matches(self, name: str, kind: Kind) -> bool:
-        if kind not in self.kinds:
-            return False
-        words = {word.lower() for word in _WORD.findall(name)}
-        return any(
-            name.strip("_") == banned[1:] if banned.startswith("=") else banned in words
-            for banned in self.names.split()
-        )
+    @property
+    def words(self) -> frozenset[str]:
+        return frozenset(name for name in self.names.split() if not name.startswith("="))
+
+    @property
+    def whole(self) -> frozenset[str]:
+        return frozenset(name[1:] for name in self.names.split() if name.startswith("="))
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,16 +165,31 @@ def _names_of_node(node: ast.AST) -> list[tuple[str, Kind]]:
     return []
 
 
+@cache
+def bans_of(folder: str) -> tuple[dict[str, Ban], dict[str, Ban]]:
+    """Return what is banned in a folder: words, and whole names."""
+    bans = [ban for ban in BANS if ban.applies_to(folder)]
+    return {word: ban for ban in bans for word in ban.words}, {
+        name: ban for ban in bans for name in ban.whole
+    }
+
+
+@cache
+def words_of(name: str) -> tuple[str, ...]:
+    return tuple(word.lower() for word in _WORD.findall(name))
+
+
 def faults_of(path: str, text: str) -> list[str]:
-    """What is wrong with the names of a file, one line each."""
-    bans = [ban for ban in BANS if ban.applies_to(path)]
-    return [
-        f"{path}:{name.line}: {name.kind.value} {name.text!r} ({ban.meaning}); use: {ban.use}"
-        for name in names_of(path, text)
-        if (path, name.text) not in KEPT
-        for ban in bans
-        if ban.matches(name.text, name.kind)
-    ]
+    """Return what is wrong with the names of a file, one line each."""
+    words, whole = bans_of(path.rpartition("/")[0])
+    faults = []
+    for name in names_of(path, text):
+        found = [whole.get(name.text.strip("_")), *map(words.get, words_of(name.text))]
+        for ban in filter(None, found):
+            if name.kind in ban.kinds and (path, name.text) not in KEPT:
+                place = f"{path}:{name.line}: {name.kind.value} {name.text!r}"
+                faults.append(f"{place} ({ban.meaning}); use: {ban.use}")
+    return faults
 
 
 @pytest.mark.parametrize("tree", TREES)

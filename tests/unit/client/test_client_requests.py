@@ -69,7 +69,7 @@ def test_a_method_has_the_fields_of_its_message(
         ({"network": "group", "group": "g", "wait": True}, {"network": "group", "group": "g", "wait": True}),
     ],
 )
-async def test_only_wishes_are_sent(given: dict[str, Any], sent: dict[str, Any]) -> None:
+async def test_only_requested_fields_are_sent(given: dict[str, Any], sent: dict[str, Any]) -> None:
     noted = Noted()
     await noted.create_container("c", **given)
     assert noted.sent == [("CC", {"containerTag": "c", "containerData": sent})]
