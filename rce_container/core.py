@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Any, Self
 
 import msgspec
 
 from rce.aio.backoff import Backoff
 from rce.control.messages import Fault, Gone, Status
 from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress
+from rce.lifecycle import StateMachine
 from rce.model.specs import Resources
 from rce_container.events import (
     Adopted,
@@ -35,7 +37,7 @@ from rce_container.events import (
     Tell,
     Wait,
 )
-from rce_container.life import ALIVE, LifeEvent, Phase, after
+from rce_container.life import ALIVE, CONTAINER_LIFE, LifeEvent, Phase
 
 BACKOFF = Backoff(first=0.5, longest=30.0)
 """Pauses before a container that ended is made again. The first time in a row it is made again at once."""
@@ -48,7 +50,7 @@ class Container:
     """What is known of one container."""
 
     id: str
-    phase: Phase
+    course: StateMachine[Phase, LifeEvent]
     desired: EndpointSpec | None = None
     """None also for an adopted one of which the master has not spoken yet."""
     drop_revision: int = 0
@@ -62,6 +64,16 @@ class Container:
     detail: str = ""
     told: str = ""
     """The last failure that the user was told of."""
+
+    @classmethod
+    def make(cls, id_: str, phase: Phase, **fields: Any) -> Self:
+        """Make one in a phase."""
+        return cls(id_, CONTAINER_LIFE.start(phase, id_), **fields)
+
+    @property
+    def phase(self) -> Phase:
+        """Where it is in its life."""
+        return self.course.state
 
     @property
     def status(self) -> EndpointStatus:
@@ -160,12 +172,12 @@ class ManagerCore:
             return
         container = self.containers.get(spec.id)
         if container is None:
-            container = self.containers[spec.id] = Container(spec.id, Phase.GONE)
+            container = self.containers[spec.id] = Container.make(spec.id, Phase.GONE)
         elif container.desired is not None and spec.revision < container.desired.revision:
             return
         container.desired = spec
         was = container.phase
-        container.phase = after(was, LifeEvent.DESIRE)
+        container.course.advance(LifeEvent.DESIRE)
         if was is Phase.GONE:
             self._start(container)
         elif container.phase in {*ALIVE, Phase.STARTING} and container.mark:
@@ -197,7 +209,7 @@ class ManagerCore:
 
     def _release(self, container: Container, reason: str) -> None:
         was = container.phase
-        container.phase = after(was, LifeEvent.RELEASE)
+        container.course.advance(LifeEvent.RELEASE)
         if container.phase is Phase.GONE:
             self._forget(container)
         elif was in {*ALIVE, Phase.STARTING}:
@@ -212,7 +224,7 @@ class ManagerCore:
         assert id_ not in self.containers, "containers are adopted before anything else happens"
         is_ill = event.status.state is EndpointState.DEGRADED
         phase = Phase.DEGRADED if is_ill else Phase.RUNNING
-        container = self.containers[id_] = Container(id_, phase, mark=event.mark, address=event.address)
+        container = self.containers[id_] = Container.make(id_, phase, mark=event.mark, address=event.address)
         container.reported = event.status
         container.running_since = self._now
 
@@ -247,7 +259,7 @@ class ManagerCore:
     def _report(self, container: Container, status: EndpointStatus) -> None:
         was = container.phase
         is_ill = status.state is EndpointState.DEGRADED
-        container.phase = after(was, LifeEvent.ILLNESS if is_ill else LifeEvent.REPORT)
+        container.course.advance(LifeEvent.ILLNESS if is_ill else LifeEvent.REPORT)
         container.reported = status
         if was is Phase.STARTING:
             container.running_since = self._now
@@ -259,7 +271,7 @@ class ManagerCore:
         was = container.phase
         if was is Phase.CLEANING:
             return
-        container.phase = after(was, LifeEvent.LOSS)
+        container.course.advance(LifeEvent.LOSS)
         if container.phase is not Phase.CLEANING:
             return
         if container.running_since is not None and self._now - container.running_since >= STABLE_S:
@@ -270,7 +282,7 @@ class ManagerCore:
     def _removed(self, container: Container) -> None:
         if container.phase not in (Phase.STOPPING, Phase.CLEANING):
             self._lost(container, "its processes ended")
-        container.phase = after(container.phase, LifeEvent.REMOVED)
+        container.course.advance(LifeEvent.REMOVED)
         container.mark = ""
         container.address = LinkAddress()
         container.reported = None
@@ -285,11 +297,9 @@ class ManagerCore:
         container = self.containers.get(id_)
         if container is None:
             return
-        if container.phase is Phase.STOPPING:
-            container.phase = Phase.GONE
+        if container.course.advance(LifeEvent.NOT_STARTED) is Phase.GONE:
             self._revive_or_forget(container)
             return
-        container.phase = Phase.WAITING
         self._failed(container, f"cannot be started: {reason}")
         self._pause(container)
 
@@ -297,7 +307,7 @@ class ManagerCore:
         container = self.containers.get(id_)
         if container is None or container.phase is not Phase.WAITING or container.ticket != ticket:
             return
-        container.phase = after(container.phase, LifeEvent.DUE)
+        container.course.advance(LifeEvent.DUE)
         self._start(container)
 
     # What is done about it
@@ -315,7 +325,7 @@ class ManagerCore:
         if container.desired is None or self._quitting:
             self._forget(container)
             return
-        container.phase = after(Phase.GONE, LifeEvent.DESIRE)
+        container.course.advance(LifeEvent.DESIRE)
         container.detail = ""
         self._start(container)
 

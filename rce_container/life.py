@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from enum import Enum
 
+from rce.lifecycle import LifeCycle
+
 
 class Phase(Enum):
     """Where a container is in its life."""
@@ -35,7 +37,9 @@ class LifeEvent(Enum):
     ILLNESS = "illness"
     """Its environment reported that not all is well."""
     LOSS = "loss"
-    """Its environment is gone, or could not be started."""
+    """Its environment is gone."""
+    NOT_STARTED = "not started"
+    """It could not be started; nothing of it is there."""
     REMOVED = "removed"
     """No process and no folder of it is left."""
     RELEASE = "release"
@@ -46,65 +50,58 @@ class LifeEvent(Enum):
     """It waited long enough."""
 
 
-NEXT: dict[Phase, dict[LifeEvent, Phase]] = {
-    Phase.STARTING: {
-        LifeEvent.REPORT: Phase.RUNNING,
-        LifeEvent.ILLNESS: Phase.DEGRADED,
-        LifeEvent.LOSS: Phase.CLEANING,
-        LifeEvent.RELEASE: Phase.STOPPING,
-        LifeEvent.DESIRE: Phase.STARTING,
+CONTAINER_LIFE: LifeCycle[Phase, LifeEvent] = LifeCycle(
+    "container",
+    {
+        Phase.STARTING: {
+            LifeEvent.REPORT: Phase.RUNNING,
+            LifeEvent.ILLNESS: Phase.DEGRADED,
+            LifeEvent.LOSS: Phase.CLEANING,
+            LifeEvent.NOT_STARTED: Phase.WAITING,
+            LifeEvent.RELEASE: Phase.STOPPING,
+            LifeEvent.DESIRE: Phase.STARTING,
+        },
+        Phase.RUNNING: {
+            LifeEvent.REPORT: Phase.RUNNING,
+            LifeEvent.ILLNESS: Phase.DEGRADED,
+            LifeEvent.LOSS: Phase.CLEANING,
+            LifeEvent.RELEASE: Phase.STOPPING,
+            LifeEvent.DESIRE: Phase.RUNNING,
+        },
+        Phase.DEGRADED: {
+            LifeEvent.REPORT: Phase.RUNNING,
+            LifeEvent.ILLNESS: Phase.DEGRADED,
+            LifeEvent.LOSS: Phase.CLEANING,
+            LifeEvent.RELEASE: Phase.STOPPING,
+            LifeEvent.DESIRE: Phase.DEGRADED,
+        },
+        Phase.STOPPING: {
+            LifeEvent.REPORT: Phase.STOPPING,
+            LifeEvent.ILLNESS: Phase.STOPPING,
+            LifeEvent.LOSS: Phase.STOPPING,
+            LifeEvent.REMOVED: Phase.GONE,
+            LifeEvent.NOT_STARTED: Phase.GONE,
+            LifeEvent.RELEASE: Phase.STOPPING,
+            LifeEvent.DESIRE: Phase.STOPPING,
+        },
+        Phase.CLEANING: {
+            LifeEvent.REPORT: Phase.CLEANING,
+            LifeEvent.ILLNESS: Phase.CLEANING,
+            LifeEvent.REMOVED: Phase.WAITING,
+            LifeEvent.RELEASE: Phase.STOPPING,
+            LifeEvent.DESIRE: Phase.CLEANING,
+        },
+        Phase.WAITING: {
+            LifeEvent.DUE: Phase.STARTING,
+            LifeEvent.RELEASE: Phase.GONE,
+            LifeEvent.DESIRE: Phase.WAITING,
+        },
+        Phase.GONE: {
+            LifeEvent.DESIRE: Phase.STARTING,
+            LifeEvent.RELEASE: Phase.GONE,
+        },
     },
-    Phase.RUNNING: {
-        LifeEvent.REPORT: Phase.RUNNING,
-        LifeEvent.ILLNESS: Phase.DEGRADED,
-        LifeEvent.LOSS: Phase.CLEANING,
-        LifeEvent.RELEASE: Phase.STOPPING,
-        LifeEvent.DESIRE: Phase.RUNNING,
-    },
-    Phase.DEGRADED: {
-        LifeEvent.REPORT: Phase.RUNNING,
-        LifeEvent.ILLNESS: Phase.DEGRADED,
-        LifeEvent.LOSS: Phase.CLEANING,
-        LifeEvent.RELEASE: Phase.STOPPING,
-        LifeEvent.DESIRE: Phase.DEGRADED,
-    },
-    Phase.STOPPING: {
-        LifeEvent.REPORT: Phase.STOPPING,
-        LifeEvent.ILLNESS: Phase.STOPPING,
-        LifeEvent.LOSS: Phase.STOPPING,
-        LifeEvent.REMOVED: Phase.GONE,
-        LifeEvent.RELEASE: Phase.STOPPING,
-        LifeEvent.DESIRE: Phase.STOPPING,
-    },
-    Phase.CLEANING: {
-        LifeEvent.REPORT: Phase.CLEANING,
-        LifeEvent.ILLNESS: Phase.CLEANING,
-        LifeEvent.REMOVED: Phase.WAITING,
-        LifeEvent.RELEASE: Phase.STOPPING,
-        LifeEvent.DESIRE: Phase.CLEANING,
-    },
-    Phase.WAITING: {
-        LifeEvent.DUE: Phase.STARTING,
-        LifeEvent.RELEASE: Phase.GONE,
-        LifeEvent.DESIRE: Phase.WAITING,
-    },
-    Phase.GONE: {
-        LifeEvent.DESIRE: Phase.STARTING,
-        LifeEvent.RELEASE: Phase.GONE,
-    },
-}
+)
 
 ALIVE = frozenset({Phase.RUNNING, Phase.DEGRADED})
 """The phases in which a container's environment reports, and is to continue."""
-
-
-def after(phase: Phase, life_event: LifeEvent) -> Phase:
-    """The phase that follows.
-
-    Raises:
-        ValueError: This cannot happen in that phase.
-    """
-    found = NEXT[phase].get(life_event)
-    if found is None:
-        raise ValueError(f"{life_event.value} cannot happen to a container that is {phase.value}")
-    return found

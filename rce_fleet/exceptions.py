@@ -17,6 +17,8 @@
 
 from __future__ import annotations
 
+from rce.lifecycle import InvalidTransitionError
+
 
 class FleetError(Exception):
     """Base of the errors of the fleet system."""
@@ -59,8 +61,8 @@ class OccupiedError(FleetError):
         return f"cell {self.cell} cannot get a box: robot {', '.join(self.robots)} is in the way"
 
 
-class TransitionError(FleetError):
-    """An event that the life cycle of a robot does not allow; nothing was changed."""
+class TransitionError(InvalidTransitionError, FleetError):
+    """An event that the life cycle of a robot or a move client does not allow; nothing was changed."""
 
 
 class InvariantError(FleetError):

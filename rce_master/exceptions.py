@@ -16,7 +16,7 @@
     |   +-- WrongCredentials    unknown user, wrong password, unknown or expired token
     |   +-- TooManyFailures     too many wrong passwords; wait
     |   +-- TooManyLogins       too many people log in just now; wait
-    +-- InvalidTransition       an event that a life cycle does not know in its present state
+    +-- TransitionError         an event that a life cycle does not allow in the present state
     +-- StoreError              the store cannot be read or written
     |   +-- StoreBusy           another process owns the state folder
     +-- TaskSetAway             the task set that is to be asked is not there
@@ -25,6 +25,8 @@
 from __future__ import annotations
 
 import math
+
+from rce.lifecycle import InvalidTransitionError
 
 
 class MasterError(Exception):
@@ -130,21 +132,8 @@ class TooManyLogins(AuthError):  # noqa: N818
         return "too many log in at the same time; try again in a moment"
 
 
-class InvalidTransition(MasterError):  # noqa: N818
-    """An event that a life cycle does not know in its present state.
-
-    Attributes:
-        state: The present state.
-        event: The event.
-    """
-
-    def __init__(self, state: str, event: str) -> None:
-        self.state = state
-        self.event = event
-        super().__init__(state, event)
-
-    def __str__(self) -> str:
-        return f"{self.event} is impossible while {self.state}"
+class TransitionError(InvalidTransitionError, MasterError):
+    """An event that the life cycle of a robot or container does not allow in the present state."""
 
 
 class StoreError(MasterError):

@@ -15,6 +15,9 @@ from enum import Enum
 from math import atan2
 from typing import TYPE_CHECKING, Any
 
+from rce.lifecycle import LifeCycle, remember
+from rce_fleet.exceptions import TransitionError
+
 if TYPE_CHECKING:
     from rce_fleet.planning.grid import GridMap
 
@@ -38,12 +41,43 @@ class ClientState(Enum):
     """The robot gave up a goal; its list was dropped."""
 
 
-_TRANSITIONS: dict[ClientState, frozenset[ClientState]] = {
-    ClientState.IDLE: frozenset({ClientState.DRIVING}),
-    ClientState.DRIVING: frozenset({ClientState.IDLE, ClientState.CANCELLING, ClientState.FAILED}),
-    ClientState.CANCELLING: frozenset({ClientState.IDLE}),
-    ClientState.FAILED: frozenset({ClientState.IDLE}),
-}
+class ClientEvent(Enum):
+    """What moves a move client from state to state."""
+
+    DRIVE = "drive"
+    """A goal is sent."""
+    ARRIVE = "arrive"
+    """The robot is at its goal, or the list that it is driven along has ended."""
+    FAIL = "fail"
+    """The robot gave a goal up."""
+    STOP = "stop"
+    """The goal under way is not wanted any more: it is cancelled."""
+    STOPPED = "stopped"
+    """No goal is under way any more."""
+    RENEW = "renew"
+    """A new list came after a failure."""
+
+
+CLIENT_LIFE: LifeCycle[ClientState, ClientEvent] = LifeCycle(
+    "move client",
+    {
+        ClientState.IDLE: {
+            ClientEvent.DRIVE: ClientState.DRIVING,
+        },
+        ClientState.DRIVING: {
+            ClientEvent.ARRIVE: ClientState.IDLE,
+            ClientEvent.STOP: ClientState.CANCELLING,
+            ClientEvent.FAIL: ClientState.FAILED,
+        },
+        ClientState.CANCELLING: {
+            ClientEvent.STOPPED: ClientState.IDLE,
+        },
+        ClientState.FAILED: {
+            ClientEvent.RENEW: ClientState.IDLE,
+        },
+    },
+    error=TransitionError,
+)
 
 
 class GoalState(Enum):
@@ -138,6 +172,7 @@ class MoveClient:
     _sent_at: float = float("-inf")
     _quiet_since: float | None = None
     _count: int = 0
+    _recent: tuple[ClientEvent, ...] = ()
 
     @property
     def report(self) -> ClientReport:
@@ -206,13 +241,13 @@ class MoveClient:
         if self._report.state is ClientState.DRIVING:
             return [*self._stop(now), self._report]
         if self._report.state is ClientState.FAILED:
-            self._become(ClientState.IDLE)
+            self._advance(ClientEvent.RENEW)
         return [self._report]
 
     def _follow(self, revision: int, cells: tuple[int, ...], now: float) -> list[Instruction]:
         before = self._report
         if before.state is ClientState.FAILED:
-            self._become(ClientState.IDLE)
+            self._advance(ClientEvent.RENEW)
         reached = before.reached if before.reached in cells else None
         self._update(revision=revision, cells=cells, reached=reached)
         if before.state is ClientState.DRIVING and before.target not in cells:
@@ -228,7 +263,7 @@ class MoveClient:
         index = self._next_index()
         if index is None:
             if report.state is ClientState.DRIVING:
-                self._become(ClientState.IDLE)
+                self._advance(ClientEvent.ARRIVE)
                 self._update(target=None)
             self._goal = None
             return []
@@ -236,7 +271,7 @@ class MoveClient:
         if report.state is ClientState.DRIVING and cell == report.target:
             return []
         if report.state is ClientState.IDLE:
-            self._become(ClientState.DRIVING)
+            self._advance(ClientEvent.DRIVE)
         self._heading = self._heading_to(index)
         self._step = cell - report.cells[index - 1] if index else None
         self._update(target=cell)
@@ -278,16 +313,16 @@ class MoveClient:
     def _finished(self, state: GoalState, now: float) -> list[Instruction]:
         self._goal = None
         if state is not GoalState.SUCCEEDED:
-            self._become(ClientState.FAILED)
+            self._advance(ClientEvent.FAIL)
             self._update(cells=(), reached=None, target=None)
             return [self._report]
         self._update(reached=self._report.target)
-        self._become(ClientState.IDLE)
+        self._advance(ClientEvent.ARRIVE)
         self._update(target=None)
         return [*self._proceed(now), self._report]
 
     def _stop(self, now: float) -> list[Instruction]:
-        self._become(ClientState.CANCELLING)
+        self._advance(ClientEvent.STOP)
         self._update(target=None)
         self._sent_at = now
         return [SendStop(now)]
@@ -311,14 +346,14 @@ class MoveClient:
 
     def _stopped(self, now: float) -> list[Instruction]:
         self._goal = self._quiet_since = None
-        self._become(ClientState.IDLE)
+        self._advance(ClientEvent.STOPPED)
         return [*self._proceed(now), self._report]
 
     # -- books ----------------------------------------------------------------------------------
 
-    def _become(self, state: ClientState) -> None:
-        if state not in _TRANSITIONS[self._report.state]:
-            raise AssertionError(f"{self._report.state.value} cannot become {state.value}")
+    def _advance(self, event: ClientEvent) -> None:
+        state = CLIENT_LIFE.advance(self._report.state, event, self.name, self._recent)
+        self._recent = remember(self._recent, event)
         self._update(state=state)
 
     def _update(self, **changes: Any) -> None:

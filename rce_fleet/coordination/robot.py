@@ -7,6 +7,7 @@ from enum import Enum
 from math import hypot, inf
 from typing import TYPE_CHECKING
 
+from rce.lifecycle import LifeCycle, remember
 from rce_fleet.coordination.move_client import ClientReport, ClientState
 from rce_fleet.exceptions import TransitionError
 
@@ -34,15 +35,24 @@ class Cause(Enum):
     HEARD = "heard"
 
 
-TRANSITIONS: dict[tuple[Phase, Cause], Phase] = {
-    (Phase.HOLDING, Cause.SETTLED): Phase.ACTIVE,
-    (Phase.HOLDING, Cause.HELD): Phase.HOLDING,
-    (Phase.HOLDING, Cause.LOST): Phase.SILENT,
-    (Phase.ACTIVE, Cause.HELD): Phase.HOLDING,
-    (Phase.ACTIVE, Cause.LOST): Phase.SILENT,
-    (Phase.SILENT, Cause.HEARD): Phase.HOLDING,
-}
-"""The life cycle; any other cause in a phase is an error."""
+ROBOT_LIFE: LifeCycle[Phase, Cause] = LifeCycle(
+    "robot",
+    {
+        Phase.HOLDING: {
+            Cause.SETTLED: Phase.ACTIVE,
+            Cause.HELD: Phase.HOLDING,
+            Cause.LOST: Phase.SILENT,
+        },
+        Phase.ACTIVE: {
+            Cause.HELD: Phase.HOLDING,
+            Cause.LOST: Phase.SILENT,
+        },
+        Phase.SILENT: {
+            Cause.HEARD: Phase.HOLDING,
+        },
+    },
+    error=TransitionError,
+)
 
 
 @dataclass(slots=True)
@@ -66,6 +76,7 @@ class RobotRecord:
         held_at: When it was last told to stand still.
         sent_at: When it was last sent a message.
         reason: Why it is not active, for people.
+        recent: What moved it from phase to phase last.
     """
 
     id: str
@@ -86,6 +97,7 @@ class RobotRecord:
     held_at: float = -inf
     sent_at: float = -inf
     reason: str = "new"
+    recent: tuple[Cause, ...] = ()
     _anchor: tuple[float, float] = (inf, inf)
     _anchored_at: float = inf
 
@@ -95,10 +107,8 @@ class RobotRecord:
         Raises:
             TransitionError: The cause does not belong to the phase.
         """
-        phase = TRANSITIONS.get((self.phase, cause))
-        if phase is None:
-            raise TransitionError(f"{self.id} is {self.phase.value} and cannot be {cause.value}")
-        self.phase = phase
+        self.phase = ROBOT_LIFE.advance(self.phase, cause, self.id, self.recent)
+        self.recent = remember(self.recent, cause)
 
     def see(self, x: float, y: float, yaw: float, now: float, settings: FleetSettings) -> None:
         """Take a pose."""

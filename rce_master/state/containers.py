@@ -12,7 +12,7 @@ from rce.model.specs import NodeSpec, ParameterValue
 from rce.protocol.container_checks import find_circle
 from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
 from rce_master.state import activity, capacity, draining, endpoints, limits, packages, placing
-from rce_master.state.lifecycle import ContainerEvent, ContainerPhase, next_phase
+from rce_master.state.lifecycle import ContainerEvent, ContainerPhase
 from rce_master.state.records import Container, ContainerLive
 
 if TYPE_CHECKING:
@@ -211,7 +211,7 @@ def reported(tx: Transaction, container: Container, status: EndpointStatus) -> N
     """Note what its task set reports of a container."""
     before = tx.tables.container_live(container.id)
     event = _EVENTS[status.state]
-    if next_phase(before.phase, event) is not before.phase:
+    if before.after(event, tx.now).phase is not before.phase:
         placing.happened(tx, container.id, event)
         tx.happen(f"container_{event.value}", container.id, status.detail)
     elif before.status and before.status.incarnation != status.incarnation:

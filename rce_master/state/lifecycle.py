@@ -1,4 +1,4 @@
-"""The life cycles of a robot's session and of a container, each a literal transition table.
+"""The life cycles of a robot's session and of a container, each a transition table.
 
 Robot session:
 
@@ -22,7 +22,8 @@ from __future__ import annotations
 
 from enum import Enum
 
-from rce_master.exceptions import InvalidTransition
+from rce.lifecycle import LifeCycle
+from rce_master.exceptions import TransitionError
 
 
 class RobotSession(Enum):
@@ -79,18 +80,22 @@ class ContainerEvent(Enum):
     """Its task set stayed away beyond the grace time."""
 
 
-_ROBOT: dict[RobotSession, dict[RobotEvent, RobotSession]] = {
-    RobotSession.OFFLINE: {
-        RobotEvent.LOGIN: RobotSession.CONNECTED,
+ROBOT_LIFE: LifeCycle[RobotSession, RobotEvent] = LifeCycle(
+    "robot",
+    {
+        RobotSession.OFFLINE: {
+            RobotEvent.LOGIN: RobotSession.CONNECTED,
+        },
+        RobotSession.CONNECTED: {
+            RobotEvent.LEAVE: RobotSession.ABSENT,
+        },
+        RobotSession.ABSENT: {
+            RobotEvent.LOGIN: RobotSession.CONNECTED,
+            RobotEvent.EXPIRE: RobotSession.OFFLINE,
+        },
     },
-    RobotSession.CONNECTED: {
-        RobotEvent.LEAVE: RobotSession.ABSENT,
-    },
-    RobotSession.ABSENT: {
-        RobotEvent.LOGIN: RobotSession.CONNECTED,
-        RobotEvent.EXPIRE: RobotSession.OFFLINE,
-    },
-}
+    error=TransitionError,
+)
 
 _REPORTED: dict[ContainerEvent, ContainerPhase] = {
     ContainerEvent.PLACE: ContainerPhase.PLACED,
@@ -103,38 +108,18 @@ _REPORTED: dict[ContainerEvent, ContainerPhase] = {
     ContainerEvent.LOSE: ContainerPhase.LOST,
 }
 
-_CONTAINER: dict[ContainerPhase, dict[ContainerEvent, ContainerPhase]] = {
-    ContainerPhase.REQUESTED: {ContainerEvent.PLACE: ContainerPhase.PLACED},
-    ContainerPhase.PLACED: _REPORTED,
-    ContainerPhase.STARTING: _REPORTED,
-    ContainerPhase.RUNNING: _REPORTED,
-    ContainerPhase.DEGRADED: _REPORTED,
-    ContainerPhase.FAILED: _REPORTED,
-    ContainerPhase.STOPPING: _REPORTED,
-    ContainerPhase.STOPPED: {ContainerEvent.PLACE: ContainerPhase.PLACED},
-    ContainerPhase.LOST: {ContainerEvent.PLACE: ContainerPhase.PLACED},
-}
-
-
-def next_session(session: RobotSession, event: RobotEvent) -> RobotSession:
-    """Tell a robot's session after an event.
-
-    Raises:
-        InvalidTransition: The event cannot happen now.
-    """
-    try:
-        return _ROBOT[session][event]
-    except KeyError:
-        raise InvalidTransition(session.value, event.value) from None
-
-
-def next_phase(phase: ContainerPhase, event: ContainerEvent) -> ContainerPhase:
-    """Tell a container's phase after an event.
-
-    Raises:
-        InvalidTransition: The event cannot happen now.
-    """
-    try:
-        return _CONTAINER[phase][event]
-    except KeyError:
-        raise InvalidTransition(phase.value, event.value) from None
+CONTAINER_LIFE: LifeCycle[ContainerPhase, ContainerEvent] = LifeCycle(
+    "container",
+    {
+        ContainerPhase.REQUESTED: {ContainerEvent.PLACE: ContainerPhase.PLACED},
+        ContainerPhase.PLACED: _REPORTED,
+        ContainerPhase.STARTING: _REPORTED,
+        ContainerPhase.RUNNING: _REPORTED,
+        ContainerPhase.DEGRADED: _REPORTED,
+        ContainerPhase.FAILED: _REPORTED,
+        ContainerPhase.STOPPING: _REPORTED,
+        ContainerPhase.STOPPED: {ContainerEvent.PLACE: ContainerPhase.PLACED},
+        ContainerPhase.LOST: {ContainerEvent.PLACE: ContainerPhase.PLACED},
+    },
+    error=TransitionError,
+)

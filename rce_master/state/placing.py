@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from rce_master.exceptions import NoRoom
 from rce_master.state import capacity
-from rce_master.state.lifecycle import ContainerEvent, next_phase
+from rce_master.state.lifecycle import ContainerEvent
 from rce_master.state.placement import Room, choose, refusals
 from rce_master.state.records import Container, ContainerLive
 
@@ -90,8 +90,7 @@ def bind(tx: Transaction, container: Container, process: str) -> None:
 def happened(tx: Transaction, id_: str, event: ContainerEvent) -> None:
     """Note a step in a container's life."""
     live = tx.tables.container_live(id_)
-    phase = next_phase(live.phase, event)
-    tx.put(replace(live, phase=phase, since=tx.now, told=False, stays=""))
+    tx.put(replace(live.after(event, tx.now), told=False, stays=""))
 
 
 def tell_waiting(tx: Transaction) -> None:

@@ -9,11 +9,20 @@ from enum import Enum
 from typing import TypeAlias
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from rce.control.messages import MachineInfo, TaskSetKind
 from rce.control.model import EndpointKind, EndpointStatus, LinkAddress
+from rce.lifecycle import remember
 from rce.model.specs import NodeSpec, ParameterValue, Resources
-from rce_master.state.lifecycle import ContainerPhase, RobotSession
+from rce_master.state.lifecycle import (
+    CONTAINER_LIFE,
+    ROBOT_LIFE,
+    ContainerEvent,
+    ContainerPhase,
+    RobotEvent,
+    RobotSession,
+)
 
 
 class UserRole(Enum):
@@ -260,6 +269,17 @@ class RobotLive(Struct, frozen=True, kw_only=True):
     since: float
     """When the session became so; seconds of the clock that commands are applied with."""
     status: EndpointStatus | None = None
+    recent: tuple[RobotEvent, ...] = ()
+    """What happened to it last."""
+
+    def after(self, event: RobotEvent, now: float) -> RobotLive:
+        """Return this record after an event.
+
+        Raises:
+            TransitionError: The event cannot happen now.
+        """
+        session = ROBOT_LIFE.advance(self.session, event, self.id, self.recent)
+        return replace(self, session=session, since=now, recent=remember(self.recent, event))
 
 
 class ContainerLive(Struct, frozen=True, kw_only=True):
@@ -277,6 +297,17 @@ class ContainerLive(Struct, frozen=True, kw_only=True):
     were."""
     rest_until: float = 0.0
     """When a move of it that failed may be tried again."""
+    recent: tuple[ContainerEvent, ...] = ()
+    """What happened to it last."""
+
+    def after(self, event: ContainerEvent, now: float) -> ContainerLive:
+        """Return this record after an event.
+
+        Raises:
+            TransitionError: The event cannot happen now.
+        """
+        phase = CONTAINER_LIFE.advance(self.phase, event, self.id, self.recent)
+        return replace(self, phase=phase, since=now, recent=remember(self.recent, event))
 
 
 class Move(Struct, frozen=True, kw_only=True):

@@ -11,7 +11,7 @@ from rce.control.model import EndpointState, EndpointStatus
 from rce.model.names import EndpointId
 from rce_master.exceptions import Conflict, Forbidden, Invalid, LimitReached, NotFound
 from rce_master.state import activity, endpoints
-from rce_master.state.lifecycle import RobotEvent, RobotSession, next_session
+from rce_master.state.lifecycle import RobotEvent, RobotSession
 from rce_master.state.records import Robot, RobotLive
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def _enter(tx: Transaction, command: RobotLogin) -> None:
         tx.touch(id_)
         endpoints.touch_dialers(tx, id_)
     tx.put(replace(robot, credential=command.credential))
-    tx.put(replace(live, session=next_session(live.session, RobotEvent.LOGIN), since=tx.now, status=None))
+    tx.put(replace(live.after(RobotEvent.LOGIN, tx.now), status=None))
     activity.forget(tx, id_)
 
 
@@ -92,7 +92,7 @@ def leave(tx: Transaction, robot: Robot, reason: str) -> None:
     """Begin a robot's grace time."""
     live = tx.tables.robot_live(robot.id)
     if live.session is RobotSession.CONNECTED:
-        tx.put(replace(live, session=next_session(live.session, RobotEvent.LEAVE), since=tx.now, status=None))
+        tx.put(replace(live.after(RobotEvent.LEAVE, tx.now), status=None))
         activity.forget(tx, robot.id)
         tx.happen("robot_left", robot.id, reason)
 
@@ -111,7 +111,7 @@ def reported(tx: Transaction, robot: Robot, status: EndpointStatus) -> None:
     """Note what its task set reports of a robot."""
     live = tx.tables.robot_live(robot.id)
     if status.state is EndpointState.RUNNING and live.session is RobotSession.ABSENT:
-        live = replace(live, session=next_session(live.session, RobotEvent.LOGIN), since=tx.now)
+        live = live.after(RobotEvent.LOGIN, tx.now)
         tx.happen("robot_connected", robot.id, f"still at {robot.task_set}")
     elif status.state is EndpointState.ABSENT and live.session is RobotSession.CONNECTED:
         if live.status is None:
@@ -128,7 +128,7 @@ def expire(tx: Transaction) -> None:
         live = tx.tables.robot_live(robot.id)
         waited = tx.now - live.since
         if live.session is RobotSession.ABSENT and waited >= tx.settings.robot_grace:
-            next_session(live.session, RobotEvent.EXPIRE)
+            live.after(RobotEvent.EXPIRE, tx.now)  # it is checked, and nothing is left to record
             endpoints.remove(tx, robot.id, "the robot stayed away")
             tx.happen("robot_gone", robot.id, "its interfaces and connections were removed")
         elif live.status is None and waited >= tx.settings.login_timeout:

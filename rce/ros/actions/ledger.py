@@ -14,9 +14,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum, auto
 
-from rce.ros.actions.exceptions import IllegalTransition, UnknownGoal
+from rce.lifecycle import remember
+from rce.ros.actions.exceptions import UnknownGoal
 from rce.ros.actions.goal_id import GoalId
-from rce.ros.actions.states import GOAL_TRANSITIONS, GoalEvent, GoalState
+from rce.ros.actions.states import GOAL_LIFE, GoalEvent, GoalState
 
 MEMORY = 5.0
 """Seconds that a goal stays in the list after its end."""
@@ -35,6 +36,7 @@ class Entry:
         text: The server's words on it.
         has_come: False for a goal of which only the cancellation has come.
         forget_at: When it leaves the list, seconds; None while it is not over.
+        recent: What happened to it last.
     """
 
     goal_id: GoalId
@@ -42,6 +44,7 @@ class Entry:
     text: str = ""
     has_come: bool = True
     forget_at: float | None = None
+    recent: tuple[GoalEvent, ...] = ()
 
 
 class Arrival(Enum):
@@ -111,7 +114,7 @@ class GoalLedger:
                 or (request.stamp and entry.goal_id.stamp <= request.stamp)
                 or request == GoalId()
             )
-            if is_meant and (entry.state, GoalEvent.REQUEST_CANCEL) in GOAL_TRANSITIONS:
+            if is_meant and GOAL_LIFE.allows(entry.state, GoalEvent.REQUEST_CANCEL):
                 self.apply(entry.goal_id.id, GoalEvent.REQUEST_CANCEL, now, entry.text)
                 asked.append(entry.goal_id.id)
         if request.id and request.id not in self._entries:
@@ -130,13 +133,11 @@ class GoalLedger:
 
         Raises:
             UnknownGoal: There is no such goal.
-            IllegalTransition: It is not possible in the goal's state; nothing was changed.
+            IllegalTransitionError: It is not possible in the goal's state; nothing was changed.
         """
         entry = self[goal_id]
-        state = GOAL_TRANSITIONS.get((entry.state, event))
-        if state is None:
-            raise IllegalTransition(goal_id, entry.state, event)
-        entry.state, entry.text = state, text
+        state = GOAL_LIFE.advance(entry.state, event, goal_id, entry.recent)
+        entry.state, entry.text, entry.recent = state, text, remember(entry.recent, event)
         if state.is_over:
             entry.forget_at = now + self.memory
         return entry

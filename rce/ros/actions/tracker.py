@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rce.ros.actions.exceptions import IllegalTransition
+from rce.ros.actions.exceptions import IllegalTransitionError
 from rce.ros.actions.states import CLIENT_TRANSITIONS, CommState, GoalState
 
 REPEAT_AFTER = 1.0
@@ -54,13 +54,14 @@ class GoalTracker:
             The communication states that were passed, the present one last; empty if there is no change.
 
         Raises:
-            IllegalTransition: No goal goes this way; nothing was changed.
+            IllegalTransitionError: No goal goes this way; nothing was changed.
         """
         if self.is_done:
             return ()
-        passed = CLIENT_TRANSITIONS[self.comm].get(state)
+        row = CLIENT_TRANSITIONS[self.comm]
+        passed = row.get(state)
         if passed is None:
-            raise IllegalTransition(self.goal_id, self.comm, state)
+            raise IllegalTransitionError(f"goal {self.goal_id}", self.comm, state, tuple(row), ())
         self.is_acknowledged = True
         self.state, self.text = state, text
         return self._pass(passed, now)

@@ -30,7 +30,7 @@ from rce_container.environment.nodes.events import (
     Tell,
     Tick,
 )
-from rce_container.environment.nodes.life import LifeEvent, after
+from rce_container.environment.nodes.life import LifeEvent
 from rce_container.environment.nodes.order import StartOrder, levels, ready_to_end
 from rce_container.environment.nodes.record import LAST_CHANCE_S, Node
 
@@ -337,7 +337,7 @@ class NodesCore:
         self._out.append(Forget(node.spec.tag))
 
     def _become(self, node: Node, life_event: LifeEvent, *, detail: str = "") -> None:
-        node.state = after(node.state, life_event)
+        node.course.advance(life_event)
         node.detail = detail
 
     def _note(self, node: Node, text: str) -> None:

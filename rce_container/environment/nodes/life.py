@@ -9,6 +9,7 @@ from __future__ import annotations
 from enum import Enum
 
 from rce.control.model import NodeState
+from rce.lifecycle import LifeCycle
 
 
 class LifeEvent(Enum):
@@ -34,56 +35,47 @@ class LifeEvent(Enum):
     """It ended for good, and is another one now."""
 
 
-NEXT: dict[NodeState, dict[LifeEvent, NodeState]] = {
-    NodeState.WAITING: {
-        LifeEvent.LAUNCH: NodeState.STARTING,
-        LifeEvent.RENEW: NodeState.WAITING,
+NODE_LIFE: LifeCycle[NodeState, LifeEvent] = LifeCycle(
+    "node",
+    {
+        NodeState.WAITING: {
+            LifeEvent.LAUNCH: NodeState.STARTING,
+            LifeEvent.RENEW: NodeState.WAITING,
+        },
+        NodeState.STARTING: {
+            LifeEvent.REGISTER: NodeState.RUNNING,
+            LifeEvent.SILENCE: NodeState.STUCK,
+            LifeEvent.HALT: NodeState.STOPPING,
+            LifeEvent.DONE: NodeState.EXITED,
+            LifeEvent.FAIL: NodeState.FAILED,
+            LifeEvent.PAUSE: NodeState.WAITING,
+        },
+        NodeState.RUNNING: {
+            LifeEvent.SILENCE: NodeState.STUCK,
+            LifeEvent.HALT: NodeState.STOPPING,
+            LifeEvent.DONE: NodeState.EXITED,
+            LifeEvent.FAIL: NodeState.FAILED,
+            LifeEvent.PAUSE: NodeState.WAITING,
+        },
+        NodeState.STUCK: {
+            LifeEvent.BEAT: NodeState.RUNNING,
+            LifeEvent.HALT: NodeState.STOPPING,
+            LifeEvent.DONE: NodeState.EXITED,
+            LifeEvent.FAIL: NodeState.FAILED,
+            LifeEvent.PAUSE: NodeState.WAITING,
+        },
+        NodeState.STOPPING: {
+            LifeEvent.FAIL: NodeState.FAILED,
+            LifeEvent.PAUSE: NodeState.WAITING,
+        },
+        NodeState.EXITED: {
+            LifeEvent.RENEW: NodeState.WAITING,
+        },
+        NodeState.FAILED: {
+            LifeEvent.RENEW: NodeState.WAITING,
+        },
     },
-    NodeState.STARTING: {
-        LifeEvent.REGISTER: NodeState.RUNNING,
-        LifeEvent.SILENCE: NodeState.STUCK,
-        LifeEvent.HALT: NodeState.STOPPING,
-        LifeEvent.DONE: NodeState.EXITED,
-        LifeEvent.FAIL: NodeState.FAILED,
-        LifeEvent.PAUSE: NodeState.WAITING,
-    },
-    NodeState.RUNNING: {
-        LifeEvent.SILENCE: NodeState.STUCK,
-        LifeEvent.HALT: NodeState.STOPPING,
-        LifeEvent.DONE: NodeState.EXITED,
-        LifeEvent.FAIL: NodeState.FAILED,
-        LifeEvent.PAUSE: NodeState.WAITING,
-    },
-    NodeState.STUCK: {
-        LifeEvent.BEAT: NodeState.RUNNING,
-        LifeEvent.HALT: NodeState.STOPPING,
-        LifeEvent.DONE: NodeState.EXITED,
-        LifeEvent.FAIL: NodeState.FAILED,
-        LifeEvent.PAUSE: NodeState.WAITING,
-    },
-    NodeState.STOPPING: {
-        LifeEvent.FAIL: NodeState.FAILED,
-        LifeEvent.PAUSE: NodeState.WAITING,
-    },
-    NodeState.EXITED: {
-        LifeEvent.RENEW: NodeState.WAITING,
-    },
-    NodeState.FAILED: {
-        LifeEvent.RENEW: NodeState.WAITING,
-    },
-}
+)
 
-WITH_PROCESS = frozenset(state for state, row in NEXT.items() if LifeEvent.PAUSE in row)
+WITH_PROCESS = frozenset(state for state, row in NODE_LIFE.table.items() if LifeEvent.PAUSE in row)
 """The states in which a node has a process."""
-
-
-def after(state: NodeState, life_event: LifeEvent) -> NodeState:
-    """The state that follows.
-
-    Raises:
-        ValueError: This cannot happen in that state.
-    """
-    found = NEXT[state].get(life_event)
-    if found is None:
-        raise ValueError(f"{life_event.value} cannot happen to a node that is {state.value}")
-    return found

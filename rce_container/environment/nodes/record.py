@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from rce.control.model import NodeState, NodeStatus
+from rce.lifecycle import StateMachine
 from rce.model.specs import NodeSpec, RestartPolicy
-from rce_container.environment.nodes.life import WITH_PROCESS
+from rce_container.environment.nodes.life import NODE_LIFE, WITH_PROCESS, LifeEvent
 
 WELL_S = 30.0
 """A node that ran well for so long starts at the first pause again, and its restarts count anew."""
@@ -22,7 +23,6 @@ class Node:
     spec: NodeSpec
     """What its newest life was launched with, or with what it is to be."""
     desired: NodeSpec | None
-    state: NodeState = NodeState.WAITING
     life: int = 0
     pid: int = 0
     exit_code: int | None = None
@@ -47,6 +47,15 @@ class Node:
     share: float = 1.0
     told: str = ""
     """The last failure that the user was told of."""
+    course: StateMachine[NodeState, LifeEvent] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.course = NODE_LIFE.start(NodeState.WAITING, self.spec.tag)
+
+    @property
+    def state(self) -> NodeState:
+        """Where it is in its life."""
+        return self.course.state
 
     @property
     def has_process(self) -> bool:

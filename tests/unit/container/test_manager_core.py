@@ -10,7 +10,7 @@ from rce.control.messages import Fault, Gone, Status
 from rce.control.model import EndpointKind, EndpointSpec, EndpointState, EndpointStatus, LinkAddress
 from rce_container import core, events
 from rce_container.core import ManagerCore
-from rce_container.life import NEXT, Phase
+from rce_container.life import CONTAINER_LIFE, Phase
 
 ID = "user/box"
 ADDRESS = LinkAddress(machine="m", unix="/run/x")
@@ -175,7 +175,7 @@ def test_every_phase_can_end() -> None:
     for phase in Phase:
         reached, edge = {phase}, [phase]
         while edge:
-            new = {after for after in NEXT[edge.pop()].values() if after not in reached}
+            new = {after for after in CONTAINER_LIFE.table[edge.pop()].values() if after not in reached}
             reached |= new
             edge += new
         assert Phase.GONE in reached

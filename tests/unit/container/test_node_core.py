@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rce.control.model import NodeState, NodeStatus
+from rce.lifecycle import InvalidTransitionError
 from rce.model.specs import NodeSpec, RestartPolicy
 from rce_container.environment.nodes import events as e
 from rce_container.environment.nodes.core import FIRST_BEAT_WITHIN_S, NodesCore
-from rce_container.environment.nodes.life import NEXT, WITH_PROCESS, LifeEvent, after
+from rce_container.environment.nodes.life import NODE_LIFE, WITH_PROCESS, LifeEvent
 from rce_container.environment.nodes.order import StartOrder, levels, ready_to_end
 from rce_container.environment.nodes.record import LAST_CHANCE_S, WELL_S
 
@@ -508,11 +509,12 @@ def test_a_node_that_comes_back_soon_is_waited_for() -> None:
 
 
 def test_the_table_knows_every_state_and_leads_out_of_each() -> None:
-    assert set(NEXT) == set(NodeState)
+    assert set(NODE_LIFE.table) == set(NodeState)
     for state in NodeState:
-        with pytest.raises(ValueError, match=state.value):
-            after(state, next(one for one in LifeEvent if one not in NEXT[state]))
-        assert NEXT[state]
+        impossible = next(one for one in LifeEvent if not NODE_LIFE.allows(state, one))
+        with pytest.raises(InvalidTransitionError, match=f"node is {state.value}"):
+            NODE_LIFE.advance(state, impossible)
+        assert NODE_LIFE.table[state]
     assert {state.value for state in WITH_PROCESS} == {"starting", "running", "stuck", "stopping"}
 
 

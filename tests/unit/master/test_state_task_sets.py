@@ -12,16 +12,16 @@ from rce.control.model import (
     NodeState,
     NodeStatus,
 )
-from rce_master.exceptions import Conflict, Invalid, InvalidTransition, NotFound
+from rce_master.exceptions import Conflict, Invalid, NotFound, TransitionError
 from rce_master.state import commands
 from rce_master.state.core import State
 from rce_master.state.lifecycle import (
+    CONTAINER_LIFE,
+    ROBOT_LIFE,
     ContainerEvent,
     ContainerPhase,
     RobotEvent,
     RobotSession,
-    next_phase,
-    next_session,
 )
 
 MB = 1 << 20
@@ -38,16 +38,16 @@ def kinds(changes: object) -> list[str]:
 
 
 def test_lifecycles_refuse_what_cannot_happen() -> None:
-    with pytest.raises(InvalidTransition, match="login is impossible while connected"):
-        next_session(RobotSession.CONNECTED, RobotEvent.LOGIN)
-    with pytest.raises(InvalidTransition, match="running is impossible while requested"):
-        next_phase(ContainerPhase.REQUESTED, ContainerEvent.RUNNING)
+    with pytest.raises(TransitionError, match="robot is connected: expected leave, found login"):
+        ROBOT_LIFE.advance(RobotSession.CONNECTED, RobotEvent.LOGIN)
+    with pytest.raises(TransitionError, match="container is requested: expected place, found running"):
+        CONTAINER_LIFE.advance(ContainerPhase.REQUESTED, ContainerEvent.RUNNING)
     for phase in ContainerPhase:
         if phase.is_placed:
-            reached = {next_phase(phase, event) for event in ContainerEvent}
+            reached = {CONTAINER_LIFE.advance(phase, event) for event in ContainerEvent}
             assert reached == set(ContainerPhase) - {ContainerPhase.REQUESTED}
         else:
-            assert next_phase(phase, ContainerEvent.PLACE) is ContainerPhase.PLACED
+            assert CONTAINER_LIFE.advance(phase, ContainerEvent.PLACE) is ContainerPhase.PLACED
 
 
 # Placement
