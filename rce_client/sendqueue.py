@@ -7,6 +7,7 @@ from collections import Counter, OrderedDict, deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from rce.aio.queues import BoundedQueue
 from rce_client.exceptions import LostError
 
 if TYPE_CHECKING:
@@ -51,8 +52,7 @@ class SendQueue:
     def __init__(self, limits: QueueLimits) -> None:
         self._limits = limits
         self._control: deque[QueuedMessage] = deque()
-        self._topics: OrderedDict[str, deque[QueuedMessage]] = OrderedDict()
-        self._bytes: Counter[str] = Counter()
+        self._topics: OrderedDict[str, BoundedQueue[QueuedMessage]] = OrderedDict()
         self._filled = asyncio.Event()
         self.dropped: Counter[str] = Counter()
         """Interface tag to the number of its messages that were thrown away."""
@@ -72,17 +72,13 @@ class SendQueue:
 
     def put_data(self, tag: str, queued: QueuedMessage) -> None:
         """Add a message of a topic; where the queue is full the oldest is dropped and counted."""
-        queue = self._topics.setdefault(tag, deque())
-        limits = self._limits
-        while len(queue) >= limits.topic_messages or self._bytes[tag] + queued.size > limits.topic_bytes:
-            index = _oldest_to_drop(queue, queued.key)
-            if index is None:
-                break
-            self._bytes[tag] -= queue[index].size
-            del queue[index]
-            self.dropped[tag] += 1
-        queue.append(queued)
-        self._bytes[tag] += queued.size
+        queue = self._topics.get(tag)
+        if queue is None:
+            limits = self._limits
+            queue = self._topics[tag] = BoundedQueue(
+                limits.topic_messages, limits.topic_bytes, on_drop=lambda _: self.dropped.update((tag,))
+            )
+        queue.put(queued, queued.size, queued.key)
         self._filled.set()
 
     def pop(self) -> QueuedMessage | None:
@@ -92,12 +88,9 @@ class SendQueue:
         if not self._topics:
             return None
         tag, queue = self._topics.popitem(last=False)
-        queued = queue.popleft()
-        self._bytes[tag] -= queued.size
+        queued = queue.take()
         if queue:
             self._topics[tag] = queue
-        else:
-            del self._bytes[tag]
         return queued
 
     async def get(self) -> QueuedMessage:
@@ -112,13 +105,3 @@ class SendQueue:
         while (queued := self.pop()) is not None:
             if queued.sent is not None and not queued.sent.done():
                 queued.sent.set_exception(LostError("the connection ended before the message was sent"))
-
-
-def _oldest_to_drop(queue: Sequence[QueuedMessage], key: str | None) -> int | None:
-    """Return the oldest message that has no key, or one that a newer message or the next one has too."""
-    newest = {queued.key: index for index, queued in enumerate(queue)}
-    if key is not None:
-        newest.pop(key, None)
-    return next(
-        (i for i, queued in enumerate(queue) if queued.key is None or newest.get(queued.key) != i), None
-    )

@@ -9,6 +9,7 @@ from enum import Enum
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self, assert_never
 
+from rce.aio.tasks import TaskScope
 from rce.protocol.codec import encode
 from rce.protocol.http import LATCH, SINGLE_FRAME
 from rce.protocol.messages import (
@@ -95,8 +96,7 @@ class Session:
         self.interfaces = InterfaceTable()
         self._on_error = on_error
         self._on_state = on_state
-        self._tasks: asyncio.TaskGroup | None = None
-        self._work: set[asyncio.Task[Any]] = set()
+        self._tasks: TaskScope | None = None
         self._waiters: set[asyncio.Future[None]] = set()
         self._backlog: list[Request] = []
         self._was_connected = False
@@ -105,7 +105,7 @@ class Session:
 
     async def __aenter__(self) -> Self:
         """Connect, and wait until it is done."""
-        self._tasks = await asyncio.TaskGroup().__aenter__()
+        self._tasks = await TaskScope().__aenter__()
         self.spawn(self._run())
         try:
             await self.until(lambda: self._was_connected)
@@ -126,23 +126,18 @@ class Session:
             if exc is None:
                 await self.transport.flush()
         finally:
-            await self._close(exc_type, exc, traceback)
+            await self._close(self._tasks, exc_type, exc, traceback)
 
     async def _close(
         self,
+        tasks: TaskScope,
         exc_type: type[BaseException] | None,
         exc: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        assert self._tasks is not None
         self.interfaces.close()
-        for task in list(self._work):
-            task.cancel()
         try:
-            if isinstance(exc, asyncio.CancelledError):
-                await self._tasks.__aexit__(exc_type, exc, traceback)
-            else:  # what the program raised is raised as it is, not in a group
-                await self._tasks.__aexit__(None, None, None)
+            await tasks.__aexit__(exc_type, exc, traceback)
         finally:
             self._tasks = None
             self._set_state(State.CLOSED, "closed")
@@ -216,10 +211,7 @@ class Session:
         if self._tasks is None:
             work.close()
             raise NotConnectedError("the connection is not open")
-        task = self._tasks.create_task(work)
-        self._work.add(task)
-        task.add_done_callback(self._work.discard)
-        return task
+        return self._tasks.spawn(work, name=f"connection of {self.robot}")
 
     async def wait_active(self, tag: str, timeout: float | None = None) -> None:
         """Wait until an interface is joined with a peer."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from websockets.exceptions import ConnectionClosed, WebSocketException
 
+from rce.aio.tasks import cancel_and_wait
 from rce.control.execution import MAX_DATA, NOT_RUN, Command, ended_frame
 from rce_container.exceptions import ExecutionError
 
@@ -82,6 +83,4 @@ async def _carry(sock: socket.socket, master: ClientConnection) -> None:
             with contextlib.suppress(ConnectionClosed, OSError):  # either side may go at any time
                 task.result()
     finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await cancel_and_wait(*tasks)

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import msgspec
 
+from rce.aio.tasks import BackgroundTasks
 from rce.control.execution import FEATURE as EXEC
 from rce.control.execution import Command
 from rce.control.model import EndpointSpec, EndpointStatus, LinkAddress, NodeStatus
 from rce.link.handover import HandoverSender, LinkAcceptor
-from rce.link.tasks import TaskScope
 from rce.model.names import EndpointId
 from rce_container import events, intake
 from rce_container.archive import LogArchive
@@ -105,7 +105,7 @@ class Incarnation:
         self._stopping = False
         self._stop_reason = ""
         self._hurry = False
-        self._errands = TaskScope()
+        self._errands = BackgroundTasks()
         self._supply = Supply(
             self.mark,
             EndpointId.parse(id).user,
@@ -136,8 +136,8 @@ class Incarnation:
         if self._channel is not None:
             self._channel.send(m.encode(m.Apply(spec=spec)))
         if self._sender is not None:
-            self._errands.spawn(self._route(self._sender, spec), f"links of {self.id}")
-            self._errands.spawn(self._resize(spec), f"limits of {self.id}")
+            self._errands.spawn(self._route(self._sender, spec), name=f"links of {self.id}")
+            self._errands.spawn(self._resize(spec), name=f"limits of {self.id}")
 
     def _tell_of_arrival(self) -> None:
         if self._channel is not None:
@@ -281,7 +281,7 @@ class Incarnation:
                 case m.Killed(request=number):
                     channel.send(m.encode(m.Cause(request=number, text=self.enforcer.claim())))
                 case m.Dial() as request:
-                    self._errands.spawn(self._dial(channel, request), f"dial for {self.id}")
+                    self._errands.spawn(self._dial(channel, request), name=f"dial for {self.id}")
             if pause := pace.pause:
                 await asyncio.sleep(pause)
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
+from rce.aio.tasks import BackgroundTasks
 from rce.control.messages import LogChunk, ReadLog
 from rce.guard.turns import CrowdedError, Turns
-from rce.link.tasks import TaskScope
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -28,14 +28,14 @@ class LogReads:
         self._read = read
         self._send = send
         self._turns = Turns(AT_ONCE, waiting=MAX_WAITING)
-        self._tasks = TaskScope()
+        self._tasks = BackgroundTasks()
         self._closed = False
 
     def take(self, message: ReadLog) -> None:
         """Answer a question, some time later."""
         if self._closed:
             return
-        self._tasks.spawn(self._answer(message), f"read of the log of {message.id}")
+        self._tasks.spawn(self._answer(message), name=f"read of the log of {message.id}")
 
     async def close(self) -> None:
         """Answer nothing any more."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 from abc import abstractmethod
 from typing import TYPE_CHECKING, Any, Protocol
 
+from rce.aio.queues import OverflowPolicy
 from rce.link import Interface
 from rce.protocol.messages import NO_ID
 from rce_robot.exceptions import MisdirectedError, UnreadableError
 from rce_robot.offload import Offload, Read
-from rce_robot.outbox import Overflow
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
@@ -38,7 +38,7 @@ class RobotSide(Protocol):
     def connected(self) -> bool:
         """Whether the robot is there."""
 
-    def send_data(self, tag: str, message: Queued, overflow: Overflow) -> bool:
+    def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy) -> bool:
         """Send in the data lane; False if the queue refuses or the robot is away."""
 
     def send_urgent(self, message: Queued) -> bool:
@@ -214,8 +214,8 @@ class RobotInterface(Interface):
         """
         if self.form_out.is_heavy(payload):
             outgoing = await self.offload.show(payload, msg_id)
-            return self.robot.send_data(self.tag, outgoing, Overflow.REFUSE)
+            return self.robot.send_data(self.tag, outgoing, OverflowPolicy.REFUSE)
         delivery = Delivery(self, payload, msg_id)
         if len(payload) < URGENT_BELOW:
             return self.robot.send_urgent(delivery)
-        return self.robot.send_data(self.tag, delivery, Overflow.REFUSE)
+        return self.robot.send_data(self.tag, delivery, OverflowPolicy.REFUSE)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 
+from rce.aio.queues import OverflowPolicy
 from rce.control.model import EndpointState, EndpointStatus, EndpointUsage
 from rce.guard.holdings import Holdings
 from rce.link import Endpoint, InterfaceError
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from rce_robot.conversion.jobs import Job
     from rce_robot.forms import Form
     from rce_robot.interface import RobotInterface
-    from rce_robot.outbox import Overflow, Queued
+    from rce_robot.outbox import Queued
     from rce_robot.outgoing import Buffer
     from rce_robot.session import Session
 
@@ -271,7 +272,7 @@ class Namespace:
         """Whether something can be sent to the robot."""
         return self._live is not None
 
-    def send_data(self, tag: str, message: Queued, overflow: Overflow) -> bool:
+    def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy) -> bool:
         """Send in the data lane."""
         return self._live is not None and self._live.send_data(tag, message, overflow)
 

@@ -13,20 +13,14 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from dataclasses import dataclass
-from enum import Enum
 from typing import TYPE_CHECKING, Protocol
 
+from rce.aio.queues import BoundedQueue, OverflowPolicy
+
 if TYPE_CHECKING:
+    from collections.abc import Hashable
+
     from rce_robot.outgoing import Rendered
-
-
-class Overflow(Enum):
-    """What a full queue does with a new message."""
-
-    DROP_OLDEST = "drop oldest"
-    """Forget the oldest message and count it. Topics."""
-    REFUSE = "refuse"
-    """Take no more; the sender is told. Services."""
 
 
 class Queued(Protocol):
@@ -60,64 +54,22 @@ class OutboxLimits:
 
 
 class _Flow:
-    """The queue of one interface in the data lane. ``credit`` is what it may send now, in bytes."""
+    """The queue of one interface in the data lane. Latched messages are kept in it, by their sources.
 
-    __slots__ = ("bytes", "credit", "latched", "messages", "overflow", "sources", "tag")
+    Attributes:
+        tag: Of the interface.
+        queue: What waits, oldest first.
+        credit: What it may send now, in bytes.
+        latched: By source, the bytes that its latched message counts: none if they are counted elsewhere.
+    """
 
-    def __init__(self, tag: str, overflow: Overflow) -> None:
+    __slots__ = ("credit", "latched", "queue", "tag")
+
+    def __init__(self, tag: str, queue: BoundedQueue[Queued]) -> None:
         self.tag = tag
-        self.overflow = overflow
-        self.messages: deque[tuple[Queued, int]] = deque()
-        self.bytes = 0
-        """Of all but the latched messages."""
+        self.queue = queue
         self.credit = 0
-        self.latched: dict[str, tuple[tuple[Queued, int], int]] = {}
-        """By source: the latched message as it is in the queue, and the bytes that it counts."""
-        self.sources: dict[int, str] = {}
-        """The sources of latched messages, by the ``id`` of the queue's entries."""
-
-    @property
-    def droppable(self) -> int:
-        """How many messages may be dropped: all but the latched ones."""
-        return len(self.messages) - len(self.latched)
-
-    def push(self, message: Queued, size: int) -> None:
-        self.messages.append((message, size))
-        self.bytes += size
-
-    def push_latched(self, source: str, message: Queued, *, shared: bool) -> int:
-        """Add the latched message of a source; return the bytes that it counts."""
-        entry = (message, message.size)
-        counted = 0 if shared else entry[1]
-        self.messages.append(entry)
-        self.latched[source] = (entry, counted)
-        self.sources[id(entry)] = source
-        return counted
-
-    def pop(self) -> tuple[Queued, int, int]:
-        """Return the oldest message, its size, and the bytes that it counts as latched one."""
-        entry = self.messages.popleft()
-        source = self.sources.pop(id(entry), None)
-        if source is not None:
-            return (*entry, self.latched.pop(source)[1])
-        self.bytes -= entry[1]
-        return (*entry, -1)
-
-    def drop_oldest(self) -> int:
-        """Drop the oldest that is not latched; return its size."""
-        index = next(i for i, entry in enumerate(self.messages) if id(entry) not in self.sources)
-        size = self.messages[index][1]
-        del self.messages[index]
-        self.bytes -= size
-        return size
-
-    def drop_latched(self, source: str) -> int:
-        """Drop the latched message of a source; return the bytes that it counted."""
-        entry, counted = self.latched.pop(source)
-        del self.sources[id(entry)]
-        index = next(i for i, other in enumerate(self.messages) if other is entry)
-        del self.messages[index]
-        return counted
+        self.latched: dict[Hashable, int] = {}
 
 
 class Outbox:
@@ -167,25 +119,23 @@ class Outbox:
         self._control_bytes += size
         return True
 
-    def put_data(self, tag: str, message: Queued, overflow: Overflow = Overflow.DROP_OLDEST) -> bool:
+    def put_data(
+        self, tag: str, message: Queued, overflow: OverflowPolicy = OverflowPolicy.DROP_OLDEST
+    ) -> bool:
         """Queue a message of the interface ``tag``; its first message settles the queue's ``overflow``.
 
         Returns:
             False if the queue is full and refuses.
         """
         size = message.size
-        flow = self._flows.get(tag)
-        if flow is None:
-            flow = self._flows[tag] = _Flow(tag, overflow)
-        if flow.overflow is Overflow.REFUSE and self._over(flow, size):
+        flow = self._flow(tag, overflow)
+        if not self._make_room_in(flow, size):
             return False
-        while self._over(flow, size):
-            self._drop(flow)
-        if self._data_bytes + size > self._limits.total_bytes:
-            self._make_room(size)
-        if not flow.messages:
+        while self._data_bytes + size > self._limits.total_bytes and self._drop_of_largest_topic():
+            pass
+        if not flow.queue:
             self._ring.append(flow)
-        flow.push(message, size)
+        flow.queue.put(message, size)
         self._data_bytes += size
         return True
 
@@ -201,21 +151,22 @@ class Outbox:
             message: The message.
             shared: Its bytes are kept elsewhere too and counted there.
         """
-        flow = self._flows.get(tag)
-        if flow is None:
-            flow = self._flows[tag] = _Flow(tag, Overflow.DROP_OLDEST)
-        if source in flow.latched:
-            self._latched_bytes -= flow.drop_latched(source)
+        flow = self._flow(tag, OverflowPolicy.DROP_OLDEST)
+        if flow.queue.remove_kept(source):
+            self._latched_bytes -= flow.latched[source]
             self.dropped[tag] += bool(source)
-        elif not flow.messages:
+        elif not flow.queue:
             self._ring.append(flow)
-        self._latched_bytes += flow.push_latched(source, message, shared=shared)
+        size = message.size
+        flow.queue.put(message, size, source)
+        flow.latched[source] = 0 if shared else size
+        self._latched_bytes += flow.latched[source]
 
-    def drop_latched(self, tag: str, source: str) -> None:
+    def drop_latched(self, tag: str, source: Hashable) -> None:
         """Forget the latched message of a source that was not sent yet."""
         flow = self._flows.get(tag)
-        if flow is not None and source in flow.latched:
-            self._latched_bytes -= flow.drop_latched(source)
+        if flow is not None and flow.queue.remove_kept(source):
+            self._latched_bytes -= flow.latched.pop(source)
             self.dropped[tag] += 1
             self._leave_if_empty(flow)
 
@@ -235,10 +186,10 @@ class Outbox:
     def discard(self, tag: str) -> None:
         """Forget the messages of an interface that is gone; that it is gone is still said."""
         flow = self._flows.pop(tag, None)
-        if flow is not None and flow.messages:
+        if flow is not None and flow.queue:
             self._ring.remove(flow)
-            self._data_bytes -= flow.bytes
-            self._latched_bytes -= sum(counted for _, counted in flow.latched.values())
+            self._data_bytes -= flow.queue.droppable_bytes
+            self._latched_bytes -= sum(flow.latched.values())
 
     def shed(self, size: int) -> None:
         """Forget the oldest messages of the topics that hold most, until ``size`` bytes are free.
@@ -249,44 +200,57 @@ class Outbox:
         while self.bytes > goal and self._drop_of_largest_topic():
             pass
         for flow in list(self._ring):
-            for source, (_, counted) in list(flow.latched.items()):
+            for source, counted in list(flow.latched.items()):
                 if self.bytes > goal and counted:
                     self.drop_latched(flow.tag, source)
 
     def clear(self) -> None:
         """Forget everything."""
         for flow in self._ring:
-            self.dropped[flow.tag] += len(flow.messages)
+            self.dropped[flow.tag] += len(flow.queue)
         self._flows.clear()
         self._ring.clear()
         self._control.clear()
         self._states.clear()
         self._data_bytes = self._control_bytes = self._latched_bytes = 0
 
-    def _over(self, flow: _Flow, size: int) -> bool:
-        limits = self._limits
-        return bool(flow.droppable) and (
-            flow.droppable >= limits.queue_messages or flow.bytes + size > limits.queue_bytes
-        )
+    def _flow(self, tag: str, overflow: OverflowPolicy) -> _Flow:
+        """Return the queue of an interface; it is made if there is none."""
+        flow = self._flows.get(tag)
+        if flow is None:
+            limits = self._limits
+            queue: BoundedQueue[Queued] = BoundedQueue(
+                limits.queue_messages, limits.queue_bytes, overflow, lambda _: self.dropped.update((tag,))
+            )
+            flow = self._flows[tag] = _Flow(tag, queue)
+        return flow
 
-    def _make_room(self, size: int) -> None:
-        """Drop from whichever topic holds most, until ``size`` more bytes fit or no topic holds anything."""
-        while self._data_bytes + size > self._limits.total_bytes and self._drop_of_largest_topic():
-            pass
+    def _make_room_in(self, flow: _Flow, size: int) -> bool:
+        """Drop what an interface must lose before ``size`` more bytes may come; False if it refuses them."""
+        if not flow.queue:
+            return True
+        before = flow.queue.droppable_bytes
+        has_room = flow.queue.make_room(size)
+        self._data_bytes -= before - flow.queue.droppable_bytes
+        self._leave_if_empty(flow)
+        return has_room
 
     def _drop_of_largest_topic(self) -> bool:
-        topics = [flow for flow in self._ring if flow.overflow is Overflow.DROP_OLDEST and flow.droppable]
+        topics = [
+            flow
+            for flow in self._ring
+            if flow.queue.policy is OverflowPolicy.DROP_OLDEST and flow.queue.droppable
+        ]
         if topics:
-            self._drop(max(topics, key=lambda flow: flow.bytes))
+            flow = max(topics, key=lambda flow: flow.queue.droppable_bytes)
+            before = flow.queue.droppable_bytes
+            flow.queue.drop_oldest()
+            self._data_bytes -= before - flow.queue.droppable_bytes
+            self._leave_if_empty(flow)
         return bool(topics)
 
-    def _drop(self, flow: _Flow) -> None:
-        self._data_bytes -= flow.drop_oldest()
-        self.dropped[flow.tag] += 1
-        self._leave_if_empty(flow)
-
     def _leave_if_empty(self, flow: _Flow) -> None:
-        if not flow.messages:
+        if not flow.queue:
             self._ring.remove(flow)
             flow.credit = 0
 
@@ -294,17 +258,18 @@ class Outbox:
         ring = self._ring
         while True:
             flow = ring[0]
-            if len(ring) == 1 or flow.messages[0][1] <= flow.credit:
+            if len(ring) == 1 or flow.queue.head_size <= flow.credit:
                 break
             flow.credit += self._limits.quantum
             ring.rotate(-1)
-        message, size, latched = flow.pop()
-        if latched < 0:
+        size, source = flow.queue.head_size, flow.queue.kept_head
+        message = flow.queue.take()
+        if source is None:
             self._data_bytes -= size
         else:
-            self._latched_bytes -= latched
+            self._latched_bytes -= flow.latched.pop(source)
         flow.credit = max(0, flow.credit - size)
-        if not flow.messages:
+        if not flow.queue:
             ring.popleft()
             flow.credit = 0
         return message

@@ -15,6 +15,7 @@ import msgspec
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 
+from rce.aio.queues import OverflowPolicy
 from rce.protocol.calls import call_at
 from rce.protocol.codec import encode
 from rce.protocol.http import LATCH, SINGLE_FRAME
@@ -31,7 +32,7 @@ from rce.protocol.messages import (
 from rce.protocol.stream import Fault, LargeData, ProtocolStream
 from rce.protocol.weight import is_light, utf8_in_steps
 from rce_robot.exceptions import RobotError
-from rce_robot.outbox import Outbox, Overflow
+from rce_robot.outbox import Outbox
 from rce_robot.outgoing import LatchedDelivery, Outgoing, Serialized
 from rce_robot.websocket import LARGE_PART
 
@@ -196,7 +197,7 @@ class Session:
 
     # To the robot
 
-    def send_data(self, tag: str, message: Queued, overflow: Overflow) -> bool:
+    def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy) -> bool:
         """Send in the data lane; False if the queue refuses or the connection ended."""
         if self._socket.writable and not self._outbox:
             self._write(message)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from rce.aio.queues import OverflowPolicy
 from rce.protocol.messages import NO_ID
 from rce_robot.conversion import ConversionQueue
 from rce_robot.exceptions import BusyError, MisdirectedError, UnreadableError
 from rce_robot.interface import Delivery, RobotInterface
 from rce_robot.offload import Read, pack_value
-from rce_robot.outbox import Overflow
 from rce_robot.outgoing import Outgoing
 
 if TYPE_CHECKING:
@@ -196,7 +196,7 @@ class ToRobot(RobotInterface):
         elif source in self._latched:
             self.robot.send_latched(self.tag, source, Delivery(self, payload, NO_ID), shared=True)
         else:
-            self.robot.send_data(self.tag, Delivery(self, payload, NO_ID), Overflow.DROP_OLDEST)
+            self.robot.send_data(self.tag, Delivery(self, payload, NO_ID), OverflowPolicy.DROP_OLDEST)
 
     async def _show(self, payload: bytes, source: str) -> tuple[Outgoing | None, str, str]:
         try:
@@ -211,7 +211,7 @@ class ToRobot(RobotInterface):
         elif source in self._latched:
             self.robot.send_latched(self.tag, source, outgoing, shared=False)
         else:
-            self.robot.send_data(self.tag, outgoing, Overflow.DROP_OLDEST)
+            self.robot.send_data(self.tag, outgoing, OverflowPolicy.DROP_OLDEST)
 
     def _dropped(self) -> None:
         self.robot.count_dropped(self.tag)

@@ -1,1 +1,1 @@
-"""What asyncio leaves to its users, written once: pauses between attempts, owners of tasks."""
+"""What asyncio leaves to its users, written once: backoff, owners of tasks, bounded queues."""

@@ -7,10 +7,10 @@ import logging
 from collections import deque
 from typing import TYPE_CHECKING
 
+from rce.aio.tasks import BackgroundTasks
 from rce.guard.holdings import Holdings
 from rce.link.exceptions import NotConnected, Overloaded
 from rce.link.frames import MAX_ID
-from rce.link.tasks import TaskScope
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -93,7 +93,7 @@ class CallServer:
         self._serve = serve
         self._limits = limits
         self._name = name
-        self._scope = TaskScope()
+        self._scope = BackgroundTasks()
         self._serving: dict[tuple[Channel, int], asyncio.Task[None]] = {}
         self._waiting: deque[tuple[Channel, int, bytes]] = deque()
         self._holdings = Holdings() if holdings is None else holdings
@@ -151,7 +151,7 @@ class CallServer:
         await self._scope.close()
 
     def _begin(self, channel: Channel, call_id: int, payload: bytes) -> None:
-        task = self._scope.spawn(self._run(channel, call_id, payload), f"{self._name} request {call_id}")
+        task = self._scope.spawn(self._run(channel, call_id, payload), name=f"{self._name} request {call_id}")
         self._serving[channel, call_id] = task
         task.add_done_callback(self._next)
 

@@ -6,6 +6,7 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING
 
+from rce.aio.queues import OverflowPolicy
 from rce.link.calls import PendingCalls
 from rce.link.exceptions import (
     CallTimeout,
@@ -18,7 +19,7 @@ from rce.link.exceptions import (
 )
 from rce.link.frames import LATCHED, OVERLOADED, Frame, FrameType, encode_sources, parse_sources
 from rce.link.handshake import LATCH
-from rce.link.queues import OutgoingQueue, OverflowPolicy
+from rce.link.queues import OutgoingQueue
 
 if TYPE_CHECKING:
     from collections.abc import Collection

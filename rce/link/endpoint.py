@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from rce.aio.tasks import BackgroundTasks
 from rce.guard.holdings import Holdings
 from rce.link.carrier import LocalCarrier
 from rce.link.channel import Channel
@@ -16,7 +17,6 @@ from rce.link.link import Link, add_traffic
 from rce.link.pacing import Pacer
 from rce.link.queues import Backlog
 from rce.link.slot import InterfaceSlot
-from rce.link.tasks import TaskScope
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -73,7 +73,7 @@ class Endpoint:
         self._refused: set[InterfaceSpec | ConnectionSpec] = set()
         self._starts: dict[InterfaceSlot, asyncio.Task[None]] = {}
         self._dials: dict[Link, asyncio.Task[None]] = {}
-        self._tasks = TaskScope()
+        self._tasks = BackgroundTasks()
         self._lock = asyncio.Lock()
         self._notice: asyncio.Handle | None = None
         self._closed = False
@@ -222,7 +222,7 @@ class Endpoint:
         if slots:
             self._changed()
             name = f"{self.id} closes an interface"
-            await asyncio.wait([self._tasks.spawn(self._close_slot(slot), name) for slot in slots])
+            await asyncio.wait([self._tasks.spawn(self._close_slot(slot), name=name) for slot in slots])
 
     async def _close_slot(self, slot: InterfaceSlot) -> None:
         start = self._starts.pop(slot, None)
@@ -272,7 +272,7 @@ class Endpoint:
                 self._dial(link)
 
     def _dial(self, link: Link) -> None:
-        task = self._tasks.spawn(keep_dialed(link, self._hub), f"{self.id} dials {link.spec.peer}")
+        task = self._tasks.spawn(keep_dialed(link, self._hub), name=f"{self.id} dials {link.spec.peer}")
         self._dials[link] = task
 
     def _stop_dialing(self, link: Link) -> None:
@@ -296,7 +296,7 @@ class Endpoint:
             self._refuse(spec, f"interface {spec.tag}: {error}")
             return
         self._slots[spec.tag] = slot
-        self._starts[slot] = self._tasks.spawn(self._start(slot), f"{self.id} starts {spec.tag}")
+        self._starts[slot] = self._tasks.spawn(self._start(slot), name=f"{self.id} starts {spec.tag}")
         self._changed()
 
     async def _start(self, slot: InterfaceSlot) -> None:

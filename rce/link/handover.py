@@ -19,12 +19,12 @@ import os
 import socket
 from typing import TYPE_CHECKING
 
+from rce.aio.tasks import BackgroundTasks
 from rce.guard.lobby import Lobby, address_of
 from rce.link.exceptions import LinkError, LinkRefused
 from rce.link.frames import HANDSHAKE_SIZE, HEADER_SIZE, Frame, FrameType, encode
 from rce.link.opening import LinkSender, PlainLinkRefused, read_hello
 from rce.link.settings import LinkLimits, LinkTimeouts
-from rce.link.tasks import TaskScope
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
@@ -98,7 +98,7 @@ class HandoverReceiver:
         self._sock = sock
         self._adopt = adopt
         self._on_end = on_end
-        self._scope = TaskScope()
+        self._scope = BackgroundTasks()
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(sock, self._read)
         self._open = True
@@ -129,7 +129,7 @@ class HandoverReceiver:
                 if self._on_end is not None:
                     self._on_end()
             for descriptor in descriptors:
-                self._scope.spawn(self._take(descriptor, received), "handed-over connection")
+                self._scope.spawn(self._take(descriptor, received), name="handed-over connection")
 
     async def _take(self, descriptor: int, received: bytes) -> None:
         try:
@@ -191,7 +191,7 @@ class LinkAcceptor:
         self._routes: dict[str, HandoverSender] = {}
         self._assigned = asyncio.Condition()
         self._sockets: list[socket.socket] = []
-        self._scope = TaskScope()
+        self._scope = BackgroundTasks()
 
     async def listen(self, host: str, port: int) -> int:
         """Accept links.
@@ -206,7 +206,7 @@ class LinkAcceptor:
         sock = socket.create_server((host, port), backlog=512)
         sock.setblocking(False)
         self._sockets.append(sock)
-        self._scope.spawn(self._accept(sock), f"link acceptor on port {port}")
+        self._scope.spawn(self._accept(sock), name=f"link acceptor on port {port}")
         taken: int = sock.getsockname()[1]
         return taken
 
@@ -241,7 +241,7 @@ class LinkAcceptor:
                 log.warning("cannot accept a link: %s", error)
                 await asyncio.sleep(_BUSY_PAUSE)
                 continue
-            self._scope.spawn(self._receive(connection, address_of(peer)), "link to hand over")
+            self._scope.spawn(self._receive(connection, address_of(peer)), name="link to hand over")
 
     async def _receive(self, connection: socket.socket, address: str) -> None:
         """Pass a connection on, if there is room for it; one that must make room is cancelled."""

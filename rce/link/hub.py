@@ -10,6 +10,7 @@ import socket
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rce.aio.tasks import BackgroundTasks
 from rce.dialing import open_socket
 from rce.guard.lobby import Lobby, address_of
 from rce.link.carrier import Carrier, LocalCarrier
@@ -21,7 +22,6 @@ from rce.link.opening import secured_link
 from rce.link.secure import Adopter, accept_secure, dial_secure
 from rce.link.settings import LinkLimits, LinkTimeouts
 from rce.link.socket_carrier import SocketCarrier
-from rce.link.tasks import TaskScope
 from rce.link.unix import bind_private, unlink_own
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class LinkHub:
         self._accepting: dict[str, Link] = {}
         self._waiters: dict[str, set[asyncio.Future[None]]] = {}
         self._carriers: set[SocketCarrier] = set()
-        self._greetings = TaskScope()
+        self._greetings = BackgroundTasks()
         self._servers: list[asyncio.Server] = []
         self._unix_sockets: dict[Path, int] = {}
         self._closed = False
@@ -306,7 +306,7 @@ class LinkHub:
         if self._closed or guest is None:
             carrier.abort(crowded)
         else:
-            self._greetings.spawn(self._greet(carrier, guest), "link greeting")
+            self._greetings.spawn(self._greet(carrier, guest), name="link greeting")
 
     async def _greet(self, carrier: SocketCarrier, guest: Guest) -> None:
         """Shake hands as the accepting end."""

@@ -7,6 +7,7 @@ from collections.abc import Callable, Coroutine, Mapping, Sequence
 from typing import Any
 
 from rce.aio.backoff import Backoff
+from rce.aio.tasks import cancel_and_wait
 from rce.supervision.final import FinalCommand
 from rce.supervision.prefork import ForkedProcess, Prepared
 from rce.supervision.process import Child, relay
@@ -120,8 +121,7 @@ class Supervisor:
         finally:
             await child.stop()
             await asyncio.wait([reader], timeout=OUTPUT_TIMEOUT_S)
-            reader.cancel()
-            await asyncio.gather(reader, return_exceptions=True)
+            await cancel_and_wait(reader)
 
     async def _start(self, program: Program) -> Child:
         prepared = self._prepared.pop(program.name, None)

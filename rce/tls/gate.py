@@ -14,6 +14,7 @@ import os
 import socket
 from typing import TYPE_CHECKING, cast
 
+from rce.aio.tasks import BackgroundTasks
 from rce.guard.complaints import Complaints
 from rce.guard.lobby import address_of
 from rce.tls.alerts import alert_of
@@ -52,9 +53,8 @@ class TlsGate:
         self._name = name
         self._context = context
         self._lobby = lobby
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._handshakes = BackgroundTasks()
         self._complaints = Complaints()
-        self._closed = False
 
     def guard(self, protocol: asyncio.Protocol) -> asyncio.Protocol:
         """Return what ``loop.create_server`` is to have in place of ``protocol``."""
@@ -62,23 +62,16 @@ class TlsGate:
 
     async def close(self) -> None:
         """End the handshakes that are not over."""
-        self._closed = True
-        tasks = list(self._tasks)
-        for task in tasks:
-            task.cancel()
-        if tasks:
-            await asyncio.wait(tasks)
+        await self._handshakes.close()
 
     def take(self, transport: asyncio.BaseTransport, protocol: asyncio.Protocol) -> None:
         """Take the socket of an accepted connection over, and shake hands on it."""
         accepted = transport.get_extra_info("socket")
-        sock = None if self._closed else socket.socket(fileno=os.dup(accepted.fileno()))
+        sock = None if self._handshakes.closed else socket.socket(fileno=os.dup(accepted.fileno()))
         address = address_of(transport.get_extra_info("peername"))
         cast("asyncio.Transport", transport).abort()  # uvloop's only behave like one
         if sock is not None:
-            task = asyncio.get_running_loop().create_task(self._run(sock, protocol, address))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+            self._handshakes.spawn(self._run(sock, protocol, address), name=f"TLS handshake with {address}")
 
     async def _run(self, sock: socket.socket, protocol: asyncio.Protocol, address: str) -> None:
         task = asyncio.current_task()

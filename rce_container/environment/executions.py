@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Mapping
 from typing import Self
 
+from rce.aio.tasks import BackgroundTasks, cancel_and_wait
 from rce.control.execution import MAX_DATA, NOT_RUN, Command, Frame, Part, decode, ended_frame, read_size
 from rce_container.environment.descriptors import read_some, write_all
 from rce_container.environment.nodes.launch import NODE_MARK
@@ -50,22 +51,20 @@ class Executions:
         self._environ = environ
         self._mark = mark
         self._home = home
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = BackgroundTasks()
         self._number = 0
 
     def start(self, command: Command, sock: socket.socket) -> None:
         """Run a command; ``sock`` keeps message boundaries, and is this object's now."""
         self._number += 1
-        task = asyncio.create_task(self._run(command, sock, self._number), name=f"command {self._number}")
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        if self._tasks.closed:  # the container ends
+            sock.close()
+            return
+        self._tasks.spawn(self._run(command, sock, self._number), name=f"command {self._number}")
 
     async def close(self) -> None:
         """End all commands."""
-        tasks = list(self._tasks)
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await self._tasks.close()
 
     async def _run(self, command: Command, sock: socket.socket, number: int) -> None:
         sock.setblocking(False)
@@ -214,10 +213,7 @@ class _Conversation:
             await kill_marked(mark, variable=NODE_MARK)
             await asyncio.wait(outputs, timeout=REST_S)
         finally:
-            tasks = (*outputs, listening)
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            await cancel_and_wait(*outputs, listening)
         code = self._child.ended.result()
         return ended_frame(code if code >= 0 else 128 - code)
 

@@ -7,6 +7,7 @@ from abc import abstractmethod
 from collections.abc import Awaitable, Callable, Collection
 from typing import TYPE_CHECKING
 
+from rce.aio.tasks import cancel_and_wait
 from rce.link import Buffer, CallError, Interface, InterfaceError, Port
 from rce.model.names import Form, InterfaceType, Role
 from rce.ros import names
@@ -43,8 +44,7 @@ class Readiness:
         except TimeoutError:
             pass
         finally:
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
+            await cancel_and_wait(task)
 
 
 class RosInterface(Interface):

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rce.aio.backoff import Backoff
+from rce.aio.tasks import BackgroundTasks
 from rce.control.model import PackageSpec
-from rce.link.tasks import TaskScope
 from rce.packages.requirements import FILE_NAME as REQUIREMENTS_FILE
 from rce_container.packages.cache import PackageCache, trouble_of
 from rce_container.packages.disk import in_thread
@@ -77,7 +77,7 @@ class Supply:
         self._shelf = shelf
         self._tell = tell
         self._on_arrival = on_arrival
-        self._tasks = TaskScope()
+        self._tasks = BackgroundTasks()
         self._coming: dict[PackageSpec, asyncio.Task[None]] = {}
         self._closed = False
 
@@ -91,7 +91,7 @@ class Supply:
             self._coming.pop(package).cancel()
         for package in wanted - self._coming.keys():
             name = f"package {package.name} of {self._holder}"
-            self._coming[package] = self._tasks.spawn(self._get(package), name)
+            self._coming[package] = self._tasks.spawn(self._get(package), name=name)
 
     async def close(self) -> None:
         """Stop, and need nothing any more."""

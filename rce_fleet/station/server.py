@@ -10,6 +10,7 @@ from pathlib import Path
 from aiohttp import WSCloseCode, WSMsgType, hdrs, web
 from pydantic import BaseModel, ValidationError
 
+from rce.aio.tasks import cancel_and_wait
 from rce.web.bodies import read_whole
 from rce.web.openapi import PREFIX, Operation, build_document
 from rce.web.origin import ServerNames
@@ -289,9 +290,7 @@ class Station:
                     continue
         finally:
             self._pages.close(page)
-            writer.cancel()
-            watcher.cancel()
-            await asyncio.gather(writer, watcher, return_exceptions=True)
+            await cancel_and_wait(writer, watcher)
         return socket
 
     async def _close_when_logged_out(self, socket: web.WebSocketResponse, request: web.Request) -> None:

@@ -14,6 +14,7 @@ import aiohttp
 import msgspec
 import typer
 
+from rce.aio.tasks import cancel_and_wait
 from rce.cli.main import Plugged
 from rce.control.execution import (
     MAX_DATA,
@@ -102,8 +103,7 @@ async def _run(container: str, command: Command, user: str, stdin: bool) -> int:
             try:
                 return await _show(socket)
             finally:
-                typing.cancel()
-                await asyncio.gather(typing, return_exceptions=True)
+                await cancel_and_wait(typing)
 
 
 async def _show(socket: ClientWebSocketResponse) -> int:

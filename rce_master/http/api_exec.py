@@ -10,6 +10,7 @@ import msgspec
 from aiohttp import WSMsgType, web
 from websockets.exceptions import ConnectionClosed
 
+from rce.aio.tasks import cancel_and_wait
 from rce.control.execution import MAX_COMMAND, NOT_RUN, ended_frame, read_command
 from rce_master.exceptions import Invalid, MasterError
 from rce_master.http.routes import OF_USER, Call, RouteTable
@@ -87,9 +88,7 @@ async def _relay(call: Call, user: web.WebSocketResponse, machine: ServerConnect
             with contextlib.suppress(ConnectionClosed, ConnectionResetError):  # either side may just go
                 task.result()
     finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await cancel_and_wait(*tasks)
 
 
 async def _to_machine(user: web.WebSocketResponse, machine: ServerConnection) -> None:

@@ -13,6 +13,7 @@ from collections import Counter, OrderedDict, deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from rce.aio.tasks import BackgroundTasks
 from rce_robot.conversion.exceptions import ConversionFailed
 from rce_robot.conversion.process import WorkerProcess
 
@@ -79,7 +80,7 @@ class ConversionPool:
         self._count = 0
         self._alive: set[WorkerProcess] = set()
         """All whose end was not seen yet."""
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = BackgroundTasks()
         self._closed = False
         self.killed = 0
 
@@ -115,13 +116,10 @@ class ConversionPool:
             for order in orders:
                 order.refuse()
         self._waiting.clear()
-        for task in self._tasks:
-            task.cancel()
-        if self._tasks:
-            await asyncio.wait(self._tasks)
         for timer in self._idle.values():
             timer.cancel()
         self._idle.clear()
+        await self._tasks.close()
         for worker in list(self._alive):  # those too whose end was cut short above
             await self._end(worker)
 
@@ -143,9 +141,7 @@ class ConversionPool:
                 self._alive.add(worker)
                 self._count += 1
             self._running[order.user] += 1
-            task = asyncio.get_running_loop().create_task(self._serve(worker, order))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+            task = self._tasks.spawn(self._serve(worker, order), name=f"conversion for {order.user}")
             task.add_done_callback(order.refuse)  # a task cancelled before its first step did not
 
     def _next(self) -> _Order | None:
@@ -201,9 +197,7 @@ class ConversionPool:
         """End a process that had nothing to do for a while."""
         if self._idle.pop(worker, None) is not None:
             self._count -= 1
-            task = asyncio.get_running_loop().create_task(self._end(worker))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+            self._tasks.spawn(self._end(worker), name="end of an idle converter")
 
     async def _end(self, worker: WorkerProcess) -> None:
         await worker.end()

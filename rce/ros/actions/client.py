@@ -9,15 +9,15 @@ from contextlib import AsyncExitStack
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+from rce.aio.tasks import TaskScope
 from rce.ros.actions import topics
 from rce.ros.actions.client_goal import ChangeCallback, ClientGoal, FeedbackCallback
-from rce.ros.actions.exceptions import IllegalTransition
+from rce.ros.actions.exceptions import IllegalTransitionError
 from rce.ros.actions.goal_id import GoalId
 from rce.ros.actions.patience import PatientClock
 from rce.ros.actions.states import CommState, GoalState
 from rce.ros.actions.tracker import GoalTracker
 from rce.ros.handles import release
-from rce.ros.tasks import TaskScope
 
 if TYPE_CHECKING:
     from rce.ros.node import Node, Publisher, Subscriber
@@ -104,7 +104,7 @@ class ActionClient:
                 subscriber = await node.subscribe(f"{self.name}/{topic}", kind, callback)
                 stack.push_async_callback(release, subscriber)
                 self._inputs.append(subscriber)
-            tasks.start(self._look_after_goals(), name=f"goals of {self.name}")
+            tasks.spawn(self._look_after_goals(), name=f"goals of {self.name}")
             self._stack = stack.pop_all()
         return self
 
@@ -189,7 +189,7 @@ class ActionClient:
                 continue
             try:
                 self._update(goal, goal.tracker.listed(GoalState(status.status), status.text, now))
-            except (IllegalTransition, ValueError) as error:
+            except (IllegalTransitionError, ValueError) as error:
                 _log.warning("the server of %s says what cannot be: %s", self.name, error)
 
     def _result_received(self, message: Message) -> None:

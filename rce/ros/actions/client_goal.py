@@ -6,11 +6,12 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from typing import TYPE_CHECKING, Any
 
+from rce.aio.queues import BoundedQueue
 from rce.ros.actions.exceptions import GoalFailed
 from rce.ros.actions.goal_id import GoalId
 from rce.ros.actions.states import CommState, GoalState
 from rce.ros.actions.tracker import GoalTracker
-from rce.ros.node.queue import DropOldest
+from rce.ros.node.settings import MAX_QUEUED_BYTES
 
 if TYPE_CHECKING:
     from rce.ros.types import Message, Time
@@ -48,7 +49,7 @@ class ClientGoal:
         self._on_change = on_change
         self._result: Message | None = None
         self._done = asyncio.Event()
-        self._feedback: DropOldest[Message] = DropOldest(FEEDBACK_QUEUE)
+        self._feedback: BoundedQueue[Message] = BoundedQueue(FEEDBACK_QUEUE, MAX_QUEUED_BYTES)
         self._arrived = asyncio.Event()
 
     def __repr__(self) -> str:

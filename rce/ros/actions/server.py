@@ -8,6 +8,7 @@ from contextlib import AsyncExitStack
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+from rce.aio.tasks import TaskScope
 from rce.ros.actions import topics, work
 from rce.ros.actions.goal_id import GoalId
 from rce.ros.actions.ledger import MEMORY, Arrival, Entry, GoalLedger
@@ -15,7 +16,6 @@ from rce.ros.actions.policy import MAX_GOALS, Drop, ManyGoals, Policy, Refuse, S
 from rce.ros.actions.server_goal import Content, ServerGoal
 from rce.ros.actions.states import GoalEvent
 from rce.ros.handles import release
-from rce.ros.tasks import TaskScope
 
 if TYPE_CHECKING:
     from rce.ros.node import Node, Publisher
@@ -116,7 +116,7 @@ class ActionServer:
             self._tasks = await stack.enter_async_context(TaskScope())
             self._publish_status()
             if frequency > 0:
-                self._tasks.start(self._keep_publishing(1 / frequency), name=f"status of {self.name}")
+                self._tasks.spawn(self._keep_publishing(1 / frequency), name=f"status of {self.name}")
             for topic, kind, callback in (
                 ("cancel", topics.GOAL_ID, self._cancel_received),
                 ("goal", types.action_goal, self._goal_received),
@@ -180,7 +180,7 @@ class ActionServer:
             goal = self._goals[step.goal_id]
             match step:
                 case Start():
-                    self._tasks.start(self._work_on(goal), name=f"goal {goal.id}")
+                    self._tasks.spawn(self._work_on(goal), name=f"goal {goal.id}")
                 case Stop():
                     goal.request_cancel()
                 case Drop(text=text):
@@ -199,7 +199,7 @@ class ActionServer:
         """Let something happen to a goal and tell its clients.
 
         Raises:
-            IllegalTransition: It is not possible in the goal's state.
+            IllegalTransitionError: It is not possible in the goal's state.
             SerializationError: The result does not fit its type; nothing was changed.
         """
         content = self._result.type.new(result={} if result is None else result)

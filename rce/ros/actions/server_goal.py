@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
+from rce.aio.tasks import cancel_and_wait
 from rce.ros.actions.goal_id import GoalId
 from rce.ros.actions.ledger import Entry
 from rce.ros.actions.states import GoalEvent, GoalState
@@ -77,7 +78,7 @@ class ServerGoal:
         """Begin to work on it.
 
         Raises:
-            IllegalTransition: It was accepted already, or is over.
+            IllegalTransitionError: It was accepted already, or is over.
         """
         self._server.transition(self._entry, GoalEvent.ACCEPT, text, None)
 
@@ -85,7 +86,7 @@ class ServerGoal:
         """Refuse to work on it.
 
         Raises:
-            IllegalTransition: It was accepted already, or is over.
+            IllegalTransitionError: It was accepted already, or is over.
         """
         self._server.transition(self._entry, GoalEvent.REJECT, text, result)
 
@@ -93,7 +94,7 @@ class ServerGoal:
         """End it: it was reached. ``result`` is a message, or a mapping of its fields.
 
         Raises:
-            IllegalTransition: It was not accepted, or is over.
+            IllegalTransitionError: It was not accepted, or is over.
             SerializationError: The result does not fit its type; the goal continues.
         """
         self._server.transition(self._entry, GoalEvent.SUCCEED, text, result)
@@ -102,7 +103,7 @@ class ServerGoal:
         """End it: it is given up.
 
         Raises:
-            IllegalTransition: It was not accepted, or is over.
+            IllegalTransitionError: It was not accepted, or is over.
             SerializationError: The result does not fit its type; the goal continues.
         """
         self._server.transition(self._entry, GoalEvent.ABORT, text, result)
@@ -111,7 +112,7 @@ class ServerGoal:
         """End it early: preempted if it was accepted, else recalled.
 
         Raises:
-            IllegalTransition: It is over.
+            IllegalTransitionError: It is over.
             SerializationError: The result does not fit its type; the goal continues.
         """
         self._server.transition(self._entry, GoalEvent.CANCEL, text, result)
@@ -149,9 +150,7 @@ class ServerGoal:
             await asyncio.wait((sleeping, stopping), return_when=asyncio.FIRST_COMPLETED)
             return not self._stop.is_set() and sleeping.result()
         finally:
-            for task in (sleeping, stopping):
-                task.cancel()
-            await asyncio.gather(sleeping, stopping, return_exceptions=True)
+            await cancel_and_wait(sleeping, stopping)
 
     def request_cancel(self) -> None:
         """Ask the handler to end it; the server does, programs may."""

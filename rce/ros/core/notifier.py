@@ -6,9 +6,9 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
+from rce.aio.tasks import TaskScope
 from rce.ros.core.events import Call
 from rce.ros.errors import RpcUnreachable, XmlRpcError
-from rce.ros.tasks import TaskScope
 from rce.ros.xmlrpc import RpcClient
 from rce.ros.xmlrpc.codec import encode_call
 from rce.ros.xmlrpc.dispatch import ERROR
@@ -53,7 +53,7 @@ class Notifier:
         queue = self._waiting.get(call.uri)
         if queue is None:
             queue = self._waiting[call.uri] = {}
-            self._tasks.start(self._deliver(call.uri, queue), name=f"notify {call.uri}")
+            self._tasks.spawn(self._deliver(call.uri, queue), name=f"notify {call.uri}")
         queue.pop(call.key, None)
         queue[call.key] = call
 

@@ -11,6 +11,7 @@ from contextlib import AsyncExitStack, contextmanager
 from types import TracebackType
 from typing import Self
 
+from rce.aio.tasks import TaskScope
 from rce.ros.core import Core
 from rce.ros.errors import MasterError
 from rce.ros.multimaster import addresses, messages
@@ -36,7 +37,6 @@ from rce.ros.multimaster.state import MasterInfo
 from rce.ros.multimaster.udp import HeartbeatSocket
 from rce.ros.node import Node
 from rce.ros.node.master import MasterClient
-from rce.ros.tasks import TaskScope
 from rce.ros.types.exceptions import TypesError
 from rce.ros.xmlrpc import RpcClient, RpcServer
 
@@ -150,10 +150,10 @@ class Discovery:
             )
             stack.callback(self._say_goodbye)
             self._tasks = await stack.enter_async_context(TaskScope())
-            self._tasks.start(self._watch_master(source.wait), name="watch the master")
-            self._tasks.start(self._robots.follow(), name="look up robot hosts")
-            self._tasks.start(self._send_heartbeats(), name="send heartbeats")
-            self._tasks.start(self._pass_time(), name="look for silent masters")
+            self._tasks.spawn(self._watch_master(source.wait), name="watch the master")
+            self._tasks.spawn(self._robots.follow(), name="look up robot hosts")
+            self._tasks.spawn(self._send_heartbeats(), name="send heartbeats")
+            self._tasks.spawn(self._pass_time(), name="look for silent masters")
             self._is_listening = True
             self._stack = stack.pop_all()
         return self
@@ -316,7 +316,7 @@ class Discovery:
             if key == self._own:
                 self._follow(self._neighbours.contacted(key, self._contact, self._now()))
             else:
-                self._tasks.start(self._learn(key), name=f"ask {key.monitor_uri} for its name")
+                self._tasks.spawn(self._learn(key), name=f"ask {key.monitor_uri} for its name")
         request = Heartbeat(Kind.REQUEST, self._own.rpc_port, self.settings.heartbeat_hz).encode()
         for host in step.request_state:
             self._socket.send_to(request, (host, self.settings.mcast_port))

@@ -8,12 +8,12 @@ import logging
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from rce.aio.tasks import TaskScope
 from rce.ros.errors import MasterError, ParameterMissing, XmlRpcError
 from rce.ros.multimaster.plan import Clash, Registration, RegistrationKind, split_clashes
 from rce.ros.multimaster.source import multicall, multicall_as
 from rce.ros.node import Node
 from rce.ros.node.master import MasterClient
-from rce.ros.tasks import TaskScope
 
 _log = logging.getLogger(__name__)
 
@@ -159,7 +159,7 @@ class Registrar:
             _log.info("%s %s of %s is registered", entry.kind.value, entry.name, entry.node)
             if entry.kind is RegistrationKind.SUBSCRIBER and isinstance(answer, list) and answer:
                 uris = [*dict.fromkeys([*publishers.get(entry.name, ()), *answer])]
-                self._tasks.start(self._tell_subscriber(entry, uris), name=f"tell {entry.node}")
+                self._tasks.spawn(self._tell_subscriber(entry, uris), name=f"tell {entry.node}")
 
     async def _unregister(self, origin: str, entries: set[Registration]) -> None:
         if not entries:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Self
 
+from rce.aio.tasks import TaskScope
 from rce.ros.errors import MasterError, ServiceError
 from rce.ros.multimaster import messages
 from rce.ros.multimaster.addresses import master_name
@@ -28,7 +29,6 @@ from rce.ros.multimaster.settings import local_master
 from rce.ros.node import Node
 from rce.ros.node.master import MasterClient
 from rce.ros.node.runtime import TypeName
-from rce.ros.tasks import TaskScope
 from rce.ros.tcpros.header import ANY
 from rce.ros.types import MessageType
 from rce.ros.types.exceptions import SerializationError, TypesError
@@ -137,8 +137,8 @@ class MasterSync:
             await self._node.advertise_service("~get_sync_info", messages.GET_SYNC_INFO, self._sync_info)
             stack.push_async_callback(self._take_back)
             self._tasks = await stack.enter_async_context(TaskScope())
-            self._tasks.start(self._follow_discovery(), name="follow the discovery")
-            self._tasks.start(self._watch_master(), name="watch the master")
+            self._tasks.spawn(self._follow_discovery(), name="follow the discovery")
+            self._tasks.spawn(self._watch_master(), name="watch the master")
             await self._start_links()
             self._stack = stack.pop_all()
         return self
@@ -236,7 +236,7 @@ class MasterSync:
             remote.update(master)
         elif self._is_wanted(master):
             remote = self._remotes[master.uri] = self._make_remote(master)
-            self._tasks.start(self._run(remote), name=f"synchronize with {master.name}")
+            self._tasks.spawn(self._run(remote), name=f"synchronize with {master.name}")
 
     def _is_wanted(self, master: Neighbour) -> bool:
         if self._is_leaving or self._own_uri in ("", master.uri) or master.name in self._links.connected:
@@ -280,11 +280,11 @@ class MasterSync:
         name = settings.relay_name or master_name(await self._ask_own_uri())
         self._links = RelayLinks(LinkIdentity(name, settings.relay_token), self._make_ends)
         for host, port in settings.relay_to:
-            self._tasks.start(self._links.dial(host, port), name=f"relay link to {host}:{port}")
+            self._tasks.spawn(self._links.dial(host, port), name=f"relay link to {host}:{port}")
         if settings.relay_listen is not None:
             server = await self._links.open_server(settings.relay_addr or None, settings.relay_listen)
             self.relay_port = server.sockets[0].getsockname()[1]
-            self._tasks.start(self._links.serve(server), name="take relay links")
+            self._tasks.spawn(self._links.serve(server), name="take relay links")
 
     def _make_ends(
         self, send: Callable[[Frame], None], tasks: TaskScope, name: str

@@ -12,7 +12,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Protocol
 
-from rce.ros.node.queue import DropOldest
+from rce.aio.queues import BoundedQueue
+from rce.ros.node.settings import MAX_QUEUED_BYTES
 
 if TYPE_CHECKING:
     from rce.ros.node.topics import Topics
@@ -110,7 +111,7 @@ class LocalLink:
         self.ended: asyncio.Future[None] = loop.create_future()
         self._loop = loop
         self._listener = listener
-        self._queue: DropOldest[tuple[LocalMessage, bool]] = DropOldest(queue_size)
+        self._queue: BoundedQueue[tuple[LocalMessage, bool]] = BoundedQueue(queue_size, MAX_QUEUED_BYTES)
 
     @property
     def bytes_out(self) -> int:

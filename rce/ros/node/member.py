@@ -9,6 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+from rce.aio.tasks import TaskScope
 from rce.ros.errors import HandshakeRefused, MasterError, MasterUnreachable, NodeClosed, TypeMismatch
 from rce.ros.logfiles import LogFile
 from rce.ros.node import clock, rosout, signals
@@ -25,7 +26,6 @@ from rce.ros.node.settings import NodeSettings
 from rce.ros.node.slave import NOTHING, SlaveApi
 from rce.ros.node.subscriber import CallbackSink
 from rce.ros.node.topics import Topics
-from rce.ros.tasks import TaskScope
 from rce.ros.tcpros.connection import Connection
 from rce.ros.tcpros.framing import SCRATCH_SIZE
 from rce.ros.tcpros.listener import Listener
@@ -185,7 +185,7 @@ class GraphMember:
             stack.push_async_callback(self._leave_graph)
             await self._until_master_answers()
             await self._join_graph(stack)
-            tasks.start(self._registrar(master).keep(), name=f"{self.name} stays registered")
+            tasks.spawn(self._registrar(master).keep(), name=f"{self.name} stays registered")
             if self._signals:
                 stack.enter_context(signals.handled(self.shutdown))
             self._stack = stack.pop_all()

@@ -6,10 +6,11 @@ import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
+from rce.aio.queues import BoundedQueue
 from rce.ros.errors import HandshakeRefused, NodeClosed, TypeMismatch
 from rce.ros.node.local import LocalLink, LocalMessage
-from rce.ros.node.queue import DropOldest
 from rce.ros.node.runtime import Runtime
+from rce.ros.node.settings import MAX_QUEUED_BYTES
 from rce.ros.tcpros.connection import Connection
 from rce.ros.tcpros.framing import Chunks, frame, payload_of
 from rce.ros.tcpros.header import ANY, check_type, encode_header, require
@@ -32,7 +33,7 @@ class Link:
         self.messages = 0
         self.bytes_out = 0
         self._output = output
-        self._queue: DropOldest[Chunks] = DropOldest(output.queue_size)
+        self._queue: BoundedQueue[Chunks] = BoundedQueue(output.queue_size, MAX_QUEUED_BYTES)
 
     @property
     def dropped(self) -> int:

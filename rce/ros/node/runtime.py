@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
+from rce.aio.tasks import TaskScope
 from rce.ros.node.master import MasterClient
-from rce.ros.tasks import TaskScope
 from rce.ros.xmlrpc import RpcClient
 
 if TYPE_CHECKING:

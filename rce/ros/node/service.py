@@ -110,7 +110,7 @@ class Service:
 
     def in_background(self, work: Awaitable[Chunks], session: Session) -> None:
         """Handle a request that takes time."""
-        self._runtime.tasks.start(session.finish(work), name=f"service {self.name}")
+        self._runtime.tasks.spawn(session.finish(work), name=f"service {self.name}")
 
     async def close(self) -> None:
         """Stop providing the service: unregister it and disconnect its clients."""

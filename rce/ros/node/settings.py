@@ -19,6 +19,8 @@ from rce.ros.names import Resolver, parse_arguments
 
 DEFAULT_MASTER_URI = "http://127.0.0.1:11311/"
 LOOPBACK = "127.0.0.1"
+MAX_QUEUED_BYTES = 64 * 2**20
+"""Most bytes that one queue of messages holds, unless a single message is longer."""
 _DISCARD = 9
 """A port; that of no service."""
 EVERYWHERE = "0.0.0.0"  # noqa: S104 - nodes of other machines must reach it

@@ -8,11 +8,12 @@ import logging
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
+from rce.aio.queues import BoundedQueue
+from rce.aio.tasks import TaskScope
 from rce.ros.errors import NodeClosed
 from rce.ros.node.local import LocalMessage
-from rce.ros.node.queue import DropOldest
 from rce.ros.node.runtime import TypeName
-from rce.ros.tasks import TaskScope
+from rce.ros.node.settings import MAX_QUEUED_BYTES
 from rce.ros.tcpros.framing import LARGE
 
 if TYPE_CHECKING:
@@ -126,7 +127,7 @@ class QueueSink:
     """Keeps messages until a task takes them; drops the oldest when they are too many."""
 
     def __init__(self, queue_size: int) -> None:
-        self._queue: DropOldest[tuple[Item, bool]] = DropOldest(queue_size)
+        self._queue: BoundedQueue[tuple[Item, bool]] = BoundedQueue(queue_size, MAX_QUEUED_BYTES)
         self._arrived = asyncio.Event()
         self._ended = False
 
@@ -183,7 +184,7 @@ def sink_for(callback: ItemCallback, queue_size: int, topic: str, tasks: TaskSco
     if not inspect.iscoroutinefunction(callback):
         return CallbackSink(callback, topic)
     sink = QueueSink(queue_size)
-    tasks.start(call_in_order(sink, callback, topic), name=f"callback of {topic}")
+    tasks.spawn(call_in_order(sink, callback, topic), name=f"callback of {topic}")
     return sink
 
 

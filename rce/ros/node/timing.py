@@ -8,8 +8,8 @@ import logging
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import NamedTuple
 
+from rce.aio.tasks import TaskScope
 from rce.ros.node.clock import NANOSECONDS, Clock
-from rce.ros.tasks import TaskScope
 
 _log = logging.getLogger(__name__)
 
@@ -96,7 +96,7 @@ class Timer:
         self._rate = Rate(clock, 1.0 / period)
         self._callback = callback
         self._oneshot = oneshot
-        self._task: asyncio.Task[None] = tasks.start(self._run(), name="timer")
+        self._task: asyncio.Task[None] = tasks.spawn(self._run(), name="timer")
 
     def stop(self) -> None:
         """Make no more calls; one that is being made is cancelled."""

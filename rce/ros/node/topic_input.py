@@ -113,7 +113,7 @@ class TopicInput:
         for uri in self._following.keys() - wanted - self._orphans:
             self._following.pop(uri).cancel()
         for uri in wanted - self._following.keys():
-            self._following[uri] = self._runtime.tasks.start(
+            self._following[uri] = self._runtime.tasks.spawn(
                 self._follow(uri), name=f"{self.topic} from {uri}"
             )
 

@@ -9,9 +9,9 @@ from functools import partial
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
+from rce.aio.tasks import TaskScope
 from rce.ros.errors import NodeClosed
 from rce.ros.handles import release
-from rce.ros.tasks import TaskScope
 from rce.ros.tf.broadcaster import KIND, TF, TF_STATIC, find_prefix
 from rce.ros.tf.buffer import Buffer
 from rce.ros.tf.exceptions import (
@@ -75,7 +75,7 @@ class TransformListener:
                 self.prefix = await find_prefix(self._node)
             stack.callback(self._stop)
             tasks = await stack.enter_async_context(TaskScope())
-            tasks.start(self._notice_stop(), name=f"tf of {self._node.name}")
+            tasks.spawn(self._notice_stop(), name=f"tf of {self._node.name}")
             for topic, static in ((TF_STATIC, True), (TF, False)):
                 take = partial(self._received, static=static)
                 stack.push_async_callback(release, await self._node.subscribe(topic, KIND, take))

@@ -13,7 +13,6 @@ from rce.link.carrier import LocalCarrier
 from rce.link.exceptions import MessageTooLarge, NotConnected, Overloaded, PeerFault, PeerLost, ProtocolError
 from rce.link.frames import Frame, FrameType
 from rce.link.settings import LinkLimits
-from rce.link.tasks import TaskScope
 
 if TYPE_CHECKING:
     from rce.link.carrier import Carrier
@@ -133,27 +132,6 @@ async def test_what_a_server_raises_is_told_to_the_peer() -> None:
     await channel.answered.wait()
     assert channel.faults == {1: "nothing like that here"}
     await server.close()
-
-
-async def test_scope_reports_failures_and_ends_its_tasks() -> None:
-    reported: list[BaseException] = []
-    asyncio.get_running_loop().set_exception_handler(lambda _, c: reported.append(c["exception"]))
-    scope = TaskScope()
-
-    async def fail() -> None:
-        raise ValueError("oops")
-
-    async def forever() -> None:
-        await asyncio.Event().wait()
-
-    failing = scope.spawn(fail(), "failing")
-    lasting = scope.spawn(forever(), "lasting")
-    await asyncio.wait([failing])
-    await scope.close()
-    assert [str(error) for error in reported] == ["oops"]
-    assert lasting.cancelled()
-    with pytest.raises(RuntimeError):
-        scope.spawn(forever(), "late")
 
 
 def test_errors_have_texts() -> None:

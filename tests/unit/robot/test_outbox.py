@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce_robot.outbox import Outbox, OutboxLimits, Overflow, Queued
+from rce.aio.queues import OverflowPolicy
+from rce_robot.outbox import Outbox, OutboxLimits, Queued
 from rce_robot.outgoing import LatchedDelivery, Outgoing
 
 
@@ -79,16 +80,16 @@ def test_takes_one_message_however_large() -> None:
 
 def test_a_full_service_refuses() -> None:
     outbox = Outbox(OutboxLimits(queue_messages=2))
-    assert outbox.put_data("map", message("1"), Overflow.REFUSE)
-    assert outbox.put_data("map", message("2"), Overflow.REFUSE)
-    assert not outbox.put_data("map", message("3"), Overflow.REFUSE)
+    assert outbox.put_data("map", message("1"), OverflowPolicy.REFUSE)
+    assert outbox.put_data("map", message("2"), OverflowPolicy.REFUSE)
+    assert not outbox.put_data("map", message("3"), OverflowPolicy.REFUSE)
     assert drain(outbox) == ["1", "2"]
     assert not outbox.dropped
 
 
 def test_the_total_is_bounded_and_the_fattest_topic_pays() -> None:
     outbox = Outbox(OutboxLimits(queue_bytes=1000, total_bytes=1500))
-    outbox.put_data("service", message("s", 400), Overflow.REFUSE)
+    outbox.put_data("service", message("s", 400), OverflowPolicy.REFUSE)
     outbox.put_data("pose", message("p"))
     for tag in ("left", "right"):
         for _ in range(4):
@@ -125,12 +126,12 @@ def test_discard_forgets_an_interface() -> None:
     assert outbox.bytes == 0
 
 
-@pytest.mark.parametrize("overflow", list(Overflow))
+@pytest.mark.parametrize("overflow", list(OverflowPolicy))
 @given(
     operations=st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 300), st.booleans()), max_size=60)
 )
 def test_nothing_is_lost_uncounted_and_memory_is_bounded(
-    overflow: Overflow, operations: list[tuple[str, int, bool]]
+    overflow: OverflowPolicy, operations: list[tuple[str, int, bool]]
 ) -> None:
     limits = OutboxLimits(queue_messages=4, queue_bytes=500, total_bytes=900, quantum=64)
     outbox = Outbox(limits)
@@ -158,7 +159,7 @@ def test_nothing_is_lost_uncounted_and_memory_is_bounded(
         assert got[tag] == sorted(got[tag])
         assert len(put[tag]) == len(got[tag]) + outbox.dropped[tag]
     assert outbox.bytes == 0
-    assert refused == 0 or overflow is Overflow.REFUSE
+    assert refused == 0 or overflow is OverflowPolicy.REFUSE
 
 
 def test_latched_messages_are_neither_dropped_nor_in_the_way() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from rce.aio.queues import OverflowPolicy
 from rce.guard.holdings import Holding, Holdings
 from rce.link import CallTimeout, InterfaceError, NotConnected, Overloaded, PeerFault, PeerLost
 from rce.model.names import InterfaceType
@@ -24,7 +25,7 @@ from rce_robot.exceptions import BusyError, MisdirectedError, UnreadableError
 from rce_robot.factory import FormFactory
 from rce_robot.interface import RobotInterface
 from rce_robot.interfaces import make_interface
-from rce_robot.outbox import Overflow, Queued
+from rce_robot.outbox import Queued
 from rce_robot.outgoing import Outgoing, Serialized
 from rce_robot.services import AnsweredByRobot
 
@@ -61,7 +62,7 @@ class FakeRobot:
     def __init__(self) -> None:
         self.connected = True
         self.room = True
-        self.data: list[tuple[Outgoing, Overflow]] = []
+        self.data: list[tuple[Outgoing, OverflowPolicy]] = []
         self.urgent: list[Outgoing] = []
         self.reports: list[str] = []
         self.states: list[bool] = []
@@ -74,7 +75,7 @@ class FakeRobot:
         self.sources: list[tuple[str, ...]] = []
         self.awaited: list[tuple[LargeData, list[str]]] = []
 
-    def send_data(self, tag: str, message: Queued, overflow: Overflow) -> bool:
+    def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy) -> bool:
         rendered = message.render()
         if rendered is not None and self.room:
             self.data.append((rendered, overflow))
@@ -93,7 +94,7 @@ class FakeRobot:
         self.states.append(active)
 
     def send_latched(self, tag: str, source: str, message: Queued, *, shared: bool) -> None:
-        self.send_data(tag, message, Overflow.DROP_OLDEST)
+        self.send_data(tag, message, OverflowPolicy.DROP_OLDEST)
 
     def send_sources(self, tag: str, sources: Sequence[str]) -> None:
         self.sources.append(tuple(sources))
@@ -213,7 +214,7 @@ def test_to_the_robot() -> None:
     setup.interface.receive(ros_string("x"), latched=False)
     ((message, overflow),) = setup.robot.data
     assert shown(message) == {"iTag": "tag", "type": STRING, "msgID": "nil", "msg": {"data": "x"}}
-    assert overflow is Overflow.DROP_OLDEST
+    assert overflow is OverflowPolicy.DROP_OLDEST
     with pytest.raises(MisdirectedError):
         setup.take({"data": "x"})
 
@@ -436,7 +437,7 @@ async def test_a_large_answer_takes_the_data_lane_and_is_not_dropped() -> None:
     setup.take(b"\x01", "id1")
     await asyncio.gather(*setup.robot.work)
     ((message, overflow),) = setup.robot.data
-    assert overflow is Overflow.REFUSE
+    assert overflow is OverflowPolicy.REFUSE
     assert message.size > 1 << 20
 
 

@@ -4,12 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-
 from rce.ros.names import is_base_name
-from rce.ros.node.queue import DropOldest
 from rce.ros.node.settings import NodeSettings, anonymous_name, parse_value
 
 
@@ -65,20 +60,3 @@ def test_private_parameters_are_yaml() -> None:
 
 def test_anonymous_names_are_names() -> None:
     assert is_base_name(anonymous_name("node"))
-
-
-@given(st.lists(st.integers(0, 50)), st.integers(1, 5), st.integers(1, 100))
-def test_the_newest_items_stay(sizes: list[int], items: int, size: int) -> None:
-    queue: DropOldest[int] = DropOldest(items, size)
-    for number, length in enumerate(sizes):
-        queue.put(number, length)
-    kept = [queue.take() for _ in range(len(queue))]
-    assert kept == list(range(len(sizes)))[len(sizes) - len(kept) :]
-    assert len(kept) <= items
-    assert queue.dropped + len(kept) == len(sizes)
-    assert sum(sizes[number] for number in kept) <= size or len(kept) == 1
-
-
-def test_a_queue_without_room_is_refused() -> None:
-    with pytest.raises(ValueError, match="at least one"):
-        DropOldest(0)

@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Callable
 from typing import cast
 
+from rce.aio.queues import BoundedQueue
 from rce.guard.lobby import Guest, Lobby, address_of
 from rce.ros.multimaster.errors import LinkBroken
 from rce.ros.multimaster.relay.frames import (
@@ -21,7 +22,7 @@ from rce.ros.multimaster.relay.frames import (
     Proof,
     encode,
 )
-from rce.ros.node.queue import DropOldest
+from rce.ros.node.settings import MAX_QUEUED_BYTES
 
 PING_PERIOD = 1.0
 SILENCE = 3.5
@@ -64,7 +65,7 @@ class RelayConnection(asyncio.Protocol):
         self._early: list[Frame] = []
         self._backlog: list[Frame] = []
         self._decoder = Decoder(MAX_GREETING)
-        self._waiting: DropOldest[Data] = DropOldest(QUEUE)
+        self._waiting: BoundedQueue[Data] = BoundedQueue(QUEUE, MAX_QUEUED_BYTES)
         self._full = False
         self._heard = loop.time()
 

@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from rce.aio.tasks import TaskScope
 from rce.ros.errors import MasterError, ServiceError
 from rce.ros.multimaster.errors import NothingToRelay
 from rce.ros.multimaster.filters import SyncFilter
@@ -15,7 +16,6 @@ from rce.ros.multimaster.relay.kinds import ServiceKind, TopicKind, learn_servic
 from rce.ros.multimaster.source import RpcSource, Snapshot
 from rce.ros.node import Node, ServiceClient, Subscriber
 from rce.ros.node.master import MasterClient
-from rce.ros.tasks import TaskScope
 
 _log = logging.getLogger(__name__)
 
@@ -106,7 +106,7 @@ class Exporter:
                 self._send(Answer(frame.call, ok=False, payload=b"too many calls at once"))
                 return
             self._calls += 1
-            self._tasks.start(self._call(frame), name="relayed call")
+            self._tasks.spawn(self._call(frame), name="relayed call")
 
     # ------------------------------------------------------------------ what there is
 

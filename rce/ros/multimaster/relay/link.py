@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
 from rce.aio.backoff import Backoff
+from rce.aio.tasks import TaskScope
 from rce.dialing import open_socket
 from rce.guard.complaints import Complaints
 from rce.guard.lobby import Lobby
@@ -18,7 +19,6 @@ from rce.ros.multimaster.relay.frames import Frame
 from rce.ros.multimaster.relay.handshake import DialerHandshake, ListenerHandshake
 from rce.ros.multimaster.relay.importer import Importer
 from rce.ros.node.settings import is_loopback
-from rce.ros.tasks import TaskScope
 
 _log = logging.getLogger(__name__)
 
@@ -113,7 +113,7 @@ class RelayLinks:
             async with TaskScope() as tasks:
                 while True:
                     link = await self._guests.get()
-                    tasks.start(self._serve_guest(link), name="relay link")
+                    tasks.spawn(self._serve_guest(link), name="relay link")
         finally:
             server.close()
 
@@ -182,9 +182,9 @@ class RelayLinks:
             async with TaskScope() as tasks:
                 exporter, importer = self._make_ends(link.send, tasks, name)
                 link.start(exporter.take, importer.take)
-                tasks.start(exporter.run(), name=f"offer to {name}")
-                tasks.start(importer.run(), name=f"take from {name}")
-                tasks.start(link.ping(), name=f"ping {name}")
+                tasks.spawn(exporter.run(), name=f"offer to {name}")
+                tasks.spawn(importer.run(), name=f"take from {name}")
+                tasks.spawn(link.ping(), name=f"ping {name}")
                 try:
                     await link.ended
                 finally:

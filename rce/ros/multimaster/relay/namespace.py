@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 
+from rce.aio.tasks import TaskScope
 from rce.ros.errors import RosError
 from rce.ros.multimaster import messages
 from rce.ros.multimaster.filters import SyncFilter
@@ -16,7 +17,6 @@ from rce.ros.multimaster.remote import Remote
 from rce.ros.names import SEPARATOR, canonical
 from rce.ros.node import Node
 from rce.ros.node.master import MasterClient
-from rce.ros.tasks import TaskScope
 from rce.ros.xmlrpc import RpcClient
 
 _log = logging.getLogger(__name__)
@@ -73,7 +73,7 @@ class NamespaceRemote(Remote):
     async def synchronize(self) -> None:
         """Begin to relay, unless it is being relayed already."""
         if self._relay is None or self._relay.done():
-            self._relay = self._tasks.start(self._run_relay(), name=f"relay of {self.master.name}")
+            self._relay = self._tasks.spawn(self._run_relay(), name=f"relay of {self.master.name}")
 
     async def release(self) -> None:
         """End the relay."""
