@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import msgspec
 
 from rce.protocol.codec import encode_data
-from rce.ros.types.message import element_min_size
+from rce.ros.types.fields import element_min_size
 from rce_robot.exceptions import UnreadableError
 from rce_robot.outgoing import Outgoing, Serialized
 

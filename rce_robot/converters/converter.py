@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from rce.ros.types.codegen import FAULTS
 from rce.ros.types.faults import read_fault
-from rce.ros.types.message import LARGE
+from rce.ros.types.fields import LARGE
 from rce_robot.converters.codec import make_reader, make_writer
 from rce_robot.converters.custom import load_custom_converters
 from rce_robot.converters.exceptions import ConversionError

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from rce.ros.types import Duration, Time
-from rce.ros.types.message import Message, attribute
+from rce.ros.types.fields import attribute
+from rce.ros.types.values import Message
 
 if TYPE_CHECKING:
     from rce.ros.types import MessageType

@@ -10,9 +10,10 @@
 """
 
 from rce.ros.types.exceptions import BadDefinition, SerializationError, TypesError, UnknownType
-from rce.ros.types.message import Buffer, Field, Message, MessageType, ServiceType
+from rce.ros.types.fields import Buffer, Field
+from rce.ros.types.message import MessageType, ServiceType
 from rce.ros.types.registry import TypeRegistry
-from rce.ros.types.values import Duration, Time
+from rce.ros.types.values import Duration, Message, Time
 
 __all__ = [
     "BadDefinition",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -9,15 +10,16 @@ from rce.ros.types.arrays import BOOL_BYTES, pack_bools, pack_numbers, pack_octe
 from rce.ros.types.codegen import FAULTS, Code
 from rce.ros.types.exceptions import SerializationError
 from rce.ros.types.faults import array_fault, find_fault, read_fault
-from rce.ros.types.message import LARGE, Message, attribute, default_value
+from rce.ros.types.fields import LARGE, attribute
 from rce.ros.types.readers import ReaderBuilder
-from rce.ros.types.values import NUMBERS, Duration, Time
+from rce.ros.types.values import NUMBERS, STAMPS, Duration, Message, Time
 from rce.ros.types.writers import WriterBuilder
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rce.ros.types.message import Buffer, Field, MessageType
+    from rce.ros.types.fields import Buffer, Field
+    from rce.ros.types.message import MessageType
     from rce.ros.types.readers import Reader
 
 _UNSET: Any = object()
@@ -30,13 +32,13 @@ def make_class(kind: MessageType) -> type[Message]:
     unset = code.bind(_UNSET)
     arguments = []
     for slot, field in zip(slots, kind.fields, strict=True):
-        default = default_value(field)
+        default = _default_value(field)
         if isinstance(default, (bool, int, float, str, bytes)):
             arguments.append(f"{slot}={code.bind(default)}")
             code.line(f"self.{slot} = {slot}")
         else:
             arguments.append(f"{slot}={unset}")
-            make = code.bind(lambda field=field: default_value(field))
+            make = code.bind(lambda field=field: _default_value(field))
             code.line(f"self.{slot} = {make}() if {slot} is {unset} else {slot}")
     code.line("pass")
     init = code.compile(f"__init__({', '.join(['self', *arguments])})", f"class of {kind.name}")
@@ -195,3 +197,28 @@ def _loose(field: Field, value: Any, root: str, path: str) -> Any:
         if isinstance(error, SerializationError):
             raise
         raise array_fault(field, value, root, path) from error
+
+
+def _default_value(field: Field) -> Any:
+    """Return a new default of a field: zero, empty, or a message of defaults."""
+    if field.is_array:
+        length = field.length or 0
+        if field.is_bytes:
+            return bytes(length)
+        if field.type in NUMBERS and field.type != "bool":
+            number = NUMBERS[field.type]
+            return array(number.code, bytes(number.size * length))
+        return [_default_element(field) for _ in range(length)]
+    return _default_element(field)
+
+
+def _default_element(field: Field) -> Any:
+    if field.message is not None:
+        return field.message.cls()
+    if field.type in STAMPS:
+        return Time() if field.type == "time" else Duration()
+    if field.type == "string":
+        return ""
+    if field.type == "bool":
+        return False
+    return 0.0 if NUMBERS[field.type].is_float else 0

@@ -6,13 +6,14 @@ import struct
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rce.ros.types.codegen import Code
-from rce.ros.types.message import element_min_size
+from rce.ros.types.fields import element_min_size
 from rce.ros.types.values import NUMBERS, STAMPS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rce.ros.types.message import Buffer, Field, MessageType
+    from rce.ros.types.fields import Buffer, Field
+    from rce.ros.types.message import MessageType
 
     Reader = Callable[[Buffer, int], tuple[Any, int]]
     """Reads a value at a position and returns it with the position after it."""
