@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeVar, assert_never
 
 from msgspec.structs import replace
 
@@ -65,6 +65,8 @@ class Desired:
                     self.connections.pop(frozenset((item.tag_a, item.tag_b)), None)
                 for item in request.connect:
                     self.connections[frozenset((item.tag_a, item.tag_b))] = item
+            case _:
+                assert_never(request)
 
     def restore(self) -> list[Request]:
         """Return the requests that make everything again; the engine takes what is there already silently."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any, Self
+from typing import Any, Self, assert_never
 
 import msgspec
 
@@ -143,6 +143,8 @@ class ManagerCore:
                 self._not_started(id_, reason)
             case Made() | Reported() | Faulted() | Lost() | Removed():
                 self._life(event)
+            case _:
+                assert_never(event)
         return self._out
 
     @property
@@ -246,6 +248,8 @@ class ManagerCore:
                 self._lost(container, reason)
             case Removed():
                 self._removed(container)
+            case _:
+                assert_never(event)
 
     def _made(self, container: Container, event: Made) -> None:
         container.mark = event.mark

@@ -9,6 +9,7 @@ import socket
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import assert_never
 
 import msgspec
 
@@ -16,6 +17,7 @@ from rce.aio.tasks import BackgroundTasks
 from rce.control.execution import FEATURE as EXEC
 from rce.control.execution import Command
 from rce.control.model import EndpointSpec, EndpointStatus, LinkAddress, NodeStatus
+from rce.control.tags import Unknown
 from rce.link.handover import HandoverSender, LinkAcceptor
 from rce.model.names import EndpointId
 from rce_container import events, intake
@@ -282,6 +284,10 @@ class Incarnation:
                     channel.send(m.encode(m.Cause(request=number, text=self.enforcer.claim())))
                 case m.Dial() as request:
                     self._errands.spawn(self._dial(channel, request), name=f"dial for {self.id}")
+                case Unknown(name=name):
+                    log.debug("%s: its environment sent a %s", self.id, intake.sound_text(name))
+                case message:
+                    assert_never(message)
             if pause := pace.pause:
                 await asyncio.sleep(pause)
 

@@ -9,24 +9,30 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, assert_never
 
 from rce.control.execution import FEATURE as EXEC
 from rce.control.execution import Command
 from rce.control.messages import (
     CONTROL_VERSION,
+    ClientReply,
     Drop,
     Execute,
     Hello,
     LogChunk,
+    LoginReply,
     MachineInfo,
+    Notify,
+    Probe,
     Put,
     ReadLog,
+    Refused,
     Sync,
     TaskSetKind,
     ToMaster,
     ToTaskSet,
     Usage,
+    Welcome,
 )
 from rce.control.model import EndpointStatus, LinkAddress
 from rce.control.usage import cpu_seconds, resident_bytes
@@ -162,8 +168,10 @@ class Manager:
                 self._log_reads.take(message)
             case Execute(id=id_) if self._executions is not None:
                 self._tasks.create_task(self._executions.execute(message), name=f"command in {id_}")
-            case _:
+            case Execute() | Notify() | Probe() | Welcome() | Refused() | LoginReply() | ClientReply():
                 log.debug("not for a container task set: %s", type(message).__name__)
+            case _:
+                assert_never(message)
 
     def _execute(self, id_: str, command: Command, sock: socket.socket) -> None:
         container = self._core.containers.get(id_)
@@ -295,6 +303,8 @@ class Manager:
                 self._incarnations[mark].stop(reason)
             case events.Wait(id=id_, ticket=ticket, delay=delay):
                 asyncio.get_running_loop().call_later(delay, self._feed, events.Due(id_, ticket))
+            case _:
+                assert_never(instruction)
 
     def _start_waiting(self) -> None:
         """Start the containers that wait for it, as far as there is room, and let go of those not wanted."""

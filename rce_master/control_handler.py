@@ -5,9 +5,21 @@ from __future__ import annotations
 import asyncio
 import logging
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, assert_never
 
-from rce.control.messages import ClientReply, ClientRequest, Left, Login, LoginReply
+from rce.control.messages import (
+    ClientReply,
+    ClientRequest,
+    Fault,
+    Gone,
+    Hello,
+    Left,
+    LogChunk,
+    Login,
+    LoginReply,
+    Status,
+    Usage,
+)
 from rce_master import requests
 from rce_master.audit_words import describe
 from rce_master.exceptions import (
@@ -26,7 +38,7 @@ from rce_master.tokens import Tokens
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
-    from rce.control.messages import Hello, ToMaster
+    from rce.control.messages import ToMaster
     from rce_master.audit import AuditLog
     from rce_master.auth import Authenticator
     from rce_master.reconciler import Peer, Reconciler
@@ -101,9 +113,11 @@ class ControlHandler:
                 self._take_login(peer, message)
             case ClientRequest():
                 await self._request(peer, message)
-            case _:
+            case Status() | Gone() | Fault() | Usage() | Left() | Hello() | LogChunk():
                 self._note_leaving(process, message)
                 await self._reconciler.on_message(process, message)
+            case _:
+                assert_never(message)
 
     async def _spawn(self, work: Coroutine[None, None, None]) -> None:
         await self._pending.acquire()

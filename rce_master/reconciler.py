@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, assert_never
 
 from rce.control.exceptions import PeerRefusedError
 from rce.control.logs import LogQuery
 from rce.control.messages import (
+    ClientRequest,
     Drop,
     Fault,
     Gone,
     Hello,
     Left,
     LogChunk,
+    Login,
     Notify,
     Probe,
     Put,
@@ -103,9 +105,11 @@ class Reconciler:
                 placed = {e.id for e in self._state_service.tables.endpoints.by("task_set", process)}
                 self.book.note(process, message, placed)
                 return
-            case _:
+            case Hello() | Login() | ClientRequest() | LogChunk():
                 logger.warning("%s sent a %s, which means nothing here", process, type(message).__name__)
                 return
+            case _:
+                assert_never(message)
         await self._state_service.enqueue([command])
 
     async def on_gone(self, peer: Peer) -> None:

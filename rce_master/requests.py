@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import singledispatch
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, assert_never
 
 from rce.model.quantities import read_bandwidth, read_cores, read_memory
 from rce.model.specs import InterfaceSpec, Network, NodeSpec, Resources, RestartPolicy
@@ -64,8 +64,10 @@ def _commands(message: messages.Request, user: str) -> Iterator[commands.Request
                 yield commands.Disconnect(user=user, tag_a=pair.tag_a, tag_b=pair.tag_b)
             for pair in message.connect:
                 yield commands.Connect(user=user, tag_a=pair.tag_a, tag_b=pair.tag_b)
-        case _:
+        case messages.CreateContainer() | messages.ResizeContainer() | messages.DestroyContainer():
             yield _command(message, user)
+        case _:
+            assert_never(message)
 
 
 @singledispatch

@@ -14,7 +14,7 @@ ServiceClient      answers                                 requests of peers
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, assert_never
 
 from rce.model.names import Role
 from rce_robot.services import AnsweredByRobot, AskedByRobot
@@ -39,3 +39,5 @@ def make_interface(
             return AskedByRobot(port, robot, form_in, form_out)
         case Role.SERVICE_CLIENT:
             return AnsweredByRobot(port, robot, form_in, form_out, call_timeout=call_timeout)
+        case _:
+            assert_never(role)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, assert_never
 
 import msgspec
 from websockets.exceptions import ConnectionClosed
@@ -23,10 +23,13 @@ from rce.protocol.limits import Limits
 from rce.protocol.messages import (
     ConfigureComponents,
     ConfigureConnections,
+    CreateContainer,
     DataMessage,
+    DestroyContainer,
     ErrorReport,
     InterfaceStatus,
     LatchedSources,
+    ResizeContainer,
     type_of,
 )
 from rce.protocol.stream import Fault, LargeData, ProtocolStream
@@ -383,8 +386,16 @@ class Session:
                     self._owner.refused(event.call, event.text)
             case ErrorReport() | InterfaceStatus():
                 self.report(f"type: {type_of(event)} is not for clients to send")
-            case _:
+            case (
+                CreateContainer()
+                | ResizeContainer()
+                | DestroyContainer()
+                | ConfigureComponents()
+                | ConfigureConnections()
+            ):
                 self._request(event, size)
+            case _:
+                assert_never(event)
 
     def _handle_large(self, large: LargeData) -> None:
         try:

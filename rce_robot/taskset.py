@@ -9,26 +9,32 @@ from __future__ import annotations
 import asyncio
 import gc
 import logging
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, assert_never
 
 import msgspec
 
 from rce.control.exceptions import ControlError
 from rce.control.messages import (
     CONTROL_VERSION,
+    ClientReply,
     Drop,
+    Execute,
     Fault,
     Gone,
     Hello,
     Left,
+    LoginReply,
     MachineInfo,
     Notify,
     Probe,
     Put,
+    ReadLog,
+    Refused,
     Status,
     Sync,
     TaskSetKind,
     Usage,
+    Welcome,
 )
 from rce.control.usage import cpu_seconds, machine_memory, resident_bytes
 from rce.guard.budget import Ledger
@@ -40,7 +46,7 @@ from rce_robot.memory import UnusedMemory
 from rce_robot.namespace import Namespace
 
 if TYPE_CHECKING:
-    from rce.control.messages import ClientReply, LoginReply, ToMaster, ToTaskSet
+    from rce.control.messages import ToMaster, ToTaskSet
     from rce.control.model import EndpointSpec, LinkAddress
     from rce.guard.lobby import Lobby
     from rce.link import LinkHub
@@ -152,8 +158,10 @@ class RobotTaskSet:
                 self._notify(message)
             case Probe():
                 self._probe(EndpointId.parse(message.id))
-            case _:
+            case Welcome() | Refused() | LoginReply() | ClientReply() | ReadLog() | Execute():
                 _log.debug("not for a robot task set: %s", type(message).__name__)
+            case _:
+                assert_never(message)
 
     def _probe(self, id_: EndpointId) -> None:
         """End a robot's connection unless the robot answers: it wants to come in at another task set."""

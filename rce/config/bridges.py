@@ -15,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import re
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, assert_never, get_args
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
@@ -173,6 +173,8 @@ class Bridge(Strict):
                 yield Part("status", "actionlib_msgs/GoalStatusArray", Role.SUBSCRIBER)
                 yield Part("feedback", f"{action}ActionFeedback", Role.SUBSCRIBER)
                 yield Part("result", f"{action}ActionResult", Role.SUBSCRIBER)
+            case _:
+                assert_never(self.kind)
 
     def _place(self, end: End) -> tuple[str, str]:
         return end.endpoint, (end.name or self.name).lstrip("/")

@@ -11,7 +11,7 @@ import asyncio
 import itertools
 import logging
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, assert_never
 
 import msgspec
 from websockets.asyncio.client import connect
@@ -21,9 +21,16 @@ from rce.control.exceptions import MasterUnavailableError, UnsendableError
 from rce.control.messages import (
     ClientReply,
     ClientRequest,
+    Drop,
+    Execute,
     Login,
     LoginReply,
+    Notify,
+    Probe,
+    Put,
+    ReadLog,
     Refused,
+    Sync,
     Welcome,
     decode_to_task_set,
     encode,
@@ -305,8 +312,10 @@ class TaskSetChannel:
                 pending = self._pending.get(message.request)
                 if pending is not None and not pending.reply.done():
                     pending.reply.set_result(message)
-            case _:
+            case Sync() | Put() | Drop() | Notify() | Probe() | ReadLog() | Execute():
                 await self._inbox.put(message)
+            case _:
+                assert_never(message)
 
     async def _handle_inbox(self) -> None:
         while True:

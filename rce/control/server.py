@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from http import HTTPStatus
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, assert_never
 from weakref import WeakKeyDictionary
 
 import msgspec
@@ -18,9 +18,16 @@ from rce.control.execution import run_of
 from rce.control.messages import (
     ACCEPTED_VERSIONS,
     CONTROL_VERSION,
+    ClientRequest,
+    Fault,
+    Gone,
     Hello,
+    Left,
     LogChunk,
+    Login,
     Refused,
+    Status,
+    Usage,
     Welcome,
     decode_to_master,
     encode,
@@ -298,8 +305,10 @@ class ControlServer:
                     return
                 case Unknown(name=name):
                     _log.info("%r sent a %s, which this release does not know", peer, name)
-                case _:
+                case Status() | Gone() | Fault() | Usage() | Login() | Left() | ClientRequest():
                     await self._on_message(peer, message)
+                case _:
+                    assert_never(message)
 
 
 def _serial_of(socket: ServerConnection) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, assert_never
 
 from rce.aio.queues import OverflowPolicy
 from rce.link.calls import PendingCalls
@@ -209,8 +209,22 @@ class Channel:
             case FrameType.CANCEL:
                 if self.slot.server is not None:
                     self.slot.server.cancel(self, frame.id)
-            case _:
+            case (
+                FrameType.HELLO
+                | FrameType.WELCOME
+                | FrameType.REFUSE
+                | FrameType.PING
+                | FrameType.PONG
+                | FrameType.SECURE
+                | FrameType.GRANT
+                | FrameType.OPEN
+                | FrameType.CLOSE
+                | FrameType.FRAGMENT
+                | FrameType.ABORT
+            ):
                 raise ProtocolError(f"{frame.type.name} on a channel")
+            case _:
+                assert_never(frame.type)
 
     def frame_dropped(self, frame: Frame) -> None:
         """Take note that a message of the peer was dropped while it came in, because memory is short.
@@ -225,6 +239,8 @@ class Channel:
                 self.fault(frame.id, Overloaded("the request was dropped: memory is short"))
             case FrameType.REPLY:
                 self._calls.fail(frame.id, Overloaded("the answer was dropped: memory is short"))
+            case _:
+                raise AssertionError(f"{frame.type.name} never comes in parts")
 
     def _request_received(self, call_id: int, payload: bytes) -> None:
         server = self.slot.server

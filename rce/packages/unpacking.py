@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, assert_never
 
 from rce.packages.archive import read_archive
 from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
@@ -45,6 +45,8 @@ def unpack(file: BinaryIO, into: Path, limits: ArchiveLimits = DEFAULT_LIMITS) -
                 path.symlink_to(entry.target)
             case Kind.FILE:
                 _write(path, data, _EXECUTABLE if entry.executable else _FILE)
+            case _:
+                assert_never(entry.kind)
 
     return read_archive(file, write, limits)
 

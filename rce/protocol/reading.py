@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from typing import TYPE_CHECKING, Annotated, Any, AnyStr, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, AnyStr, Literal, TypeVar, assert_never
 
 import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType, field
@@ -33,6 +33,7 @@ from rce.protocol.messages import (
     CreateContainer,
     DataMessage,
     DeleteParam,
+    DestroyContainer,
     ErrorReport,
     MessageId,
     MessageTypeName,
@@ -284,8 +285,10 @@ def _checked(request: Request) -> Request:
             faults = list(container_faults(request.container_data))
         case ResizeContainer():
             faults = list(resize_faults(request.container_data))
-        case _:
+        case DestroyContainer() | ConfigureComponents() | ConfigureConnections():
             return request
+        case _:
+            assert_never(request)
     if faults:
         texts = [f"{_below('data.containerData', fault.key)}: {fault.problem}" for fault in faults]
         place, problem = texts[0].split(": ", 1)

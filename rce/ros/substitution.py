@@ -75,4 +75,5 @@ def _evaluate(expression: str, packages: PackageIndex, environ: Mapping[str, str
             if variable not in environ:
                 raise SubstitutionError(f"$({expression}): there is no environment variable {variable}")
             return environ[variable]
-    raise SubstitutionError(f"$({expression}) is not known; use $(find PKG) or $(env VAR)")
+        case _:
+            raise SubstitutionError(f"$({expression}) is not known; use $(find PKG) or $(env VAR)")

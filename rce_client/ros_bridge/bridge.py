@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, assert_never
 
 from rce.model.names import Role
 from rce.ros.errors import MasterError
@@ -92,6 +92,8 @@ async def lay(span: Span, conn: Connection, node: Node) -> None:
                 return bytes(await service.call_serialized(request, timeout=CALL_TIMEOUT))
 
             await conn.service_provider(span.tag, span.message_type, ask_robot, raw=True)
+        case _:
+            assert_never(span.role)
 
 
 class Uplink:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, assert_never
 
 from rce.config.bridges import action_of
 from rce.config.exceptions import ConfigError, Fault
@@ -97,3 +97,5 @@ async def _type_of(bridge: Bridge, topics: Mapping[str, str], master: MasterClie
                 return await service_type(name, master)
             except (ToolError, RosError):  # it is not there yet, or does not answer: both are waited for
                 return None
+        case _:
+            assert_never(bridge.kind)

@@ -9,6 +9,7 @@ import os
 import socket
 from collections import deque
 from pathlib import Path
+from typing import assert_never
 
 import msgspec
 
@@ -348,10 +349,12 @@ class Environment:
                 if self._handover is not None:
                     await self._handover.close()
                 self._handover = HandoverReceiver(socket.socket(fileno=channel.take_fd()), self._hub.adopt)
-            case _:
+            case m.Execute() | m.Stop() | Unknown():
                 self._take_order(channel, message)
+            case _:
+                assert_never(message)
 
-    def _take_order(self, channel: Channel, message: m.ToEnvironment | Unknown) -> None:
+    def _take_order(self, channel: Channel, message: m.Execute | m.Stop | Unknown) -> None:
         match message:
             case m.Execute(command=command):
                 self._executions.start(command, socket.socket(fileno=channel.take_fd()))
@@ -359,6 +362,8 @@ class Environment:
                 self.end("the manager says so")
             case Unknown(name=name):
                 log.info("the manager sent a %s, which this release does not know", name)
+            case _:
+                assert_never(message)
 
     def _ask(self, message: m.Dial | m.Killed) -> bool:
         if self._channel is None:

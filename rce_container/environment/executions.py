@@ -10,7 +10,7 @@ import signal
 import socket
 import sys
 from collections.abc import Callable, Mapping
-from typing import Self
+from typing import Self, assert_never
 
 from rce.aio.tasks import BackgroundTasks, cancel_and_wait
 from rce.control.execution import MAX_DATA, NOT_RUN, Command, Frame, Part, decode, ended_frame, read_size
@@ -255,3 +255,5 @@ class _Conversation:
                 self._child.signal_group(number)
             case Part.OUTPUT | Part.ERROR | Part.STARTED | Part.ENDED:
                 raise ValueError(f"a user sent {frame.part.name}")
+            case _:
+                assert_never(frame.part)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Coroutine, Iterable
 from dataclasses import fields
 from pathlib import Path
 from random import Random
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, assert_never
 
 import aiohttp
 import typer
@@ -205,10 +205,12 @@ def _needed_ports(mode: Mode, core_uri: str) -> tuple[str, ...]:
     match mode:
         case Mode.CLOUD:
             return tuple(field.name for field in fields(Ports) if field.name != "core")
-        case Mode.SINGLE if not core_uri:
-            return ("page", "core")
-        case _:
+        case Mode.SINGLE:
+            return ("page",) if core_uri else ("page", "core")
+        case Mode.MULTI:
             return ("page",)
+        case _:
+            assert_never(mode)
 
 
 def _choose_ports(headless: bool, given: dict[str, int | None], needed: Iterable[str]) -> Ports:

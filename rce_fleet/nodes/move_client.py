@@ -7,7 +7,7 @@ The work is done by :mod:`rce_fleet.coordination.move_client`; this node carries
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, assert_never
 
 from rce.ros.node import Node, run
 from rce.ros.types import Time
@@ -136,6 +136,8 @@ class MoveClientNode:
                     self._stops.publish(stamp=Time.from_sec(stamp), id="")
                 case ClientReport():
                     self._report(instruction)
+                case _:
+                    assert_never(instruction)
 
     def _send_goal(self, goal: SendGoal) -> None:
         assert self._client is not None

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias, assert_never
 
 from rce_fleet.station.desired import Desired, DesiredCell, DesiredGoal
 from rce_fleet.station.view import FleetView
@@ -172,6 +172,8 @@ class FleetLink:
                         await self.block_cell(cell, blocked=blocked)
                     case DesiredGoal(robot, cell):
                         await self.set_goal(robot, cell)
+                    case _:
+                        assert_never(desired)
 
     # -- what comes in ------------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ import os
 import shutil
 import signal
 import sys
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, assert_never
 
 import aiohttp
 import msgspec
@@ -122,8 +122,12 @@ async def _show(socket: ClientWebSocketResponse) -> int:
                 if ended.reason:
                     _write(2, f"rce: {ended.reason}\n".encode())
                 return ended.code
+            case Part.STARTED:
+                pass  # there is nothing to show
+            case Part.INPUT | Part.END_OF_INPUT | Part.SIZE | Part.SIGNAL:
+                raise CliError(f"the engine sent {frame.part.name}, which only a user sends")
             case _:
-                pass
+                assert_never(frame.part)
     raise CliError("the connection to the master was lost; the command has been ended")
 
 

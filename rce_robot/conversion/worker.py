@@ -15,7 +15,7 @@ import socket
 import struct
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, assert_never
 
 import msgspec
 
@@ -67,6 +67,8 @@ class Worker:
                     return self._read(job, msgspec.msgpack.decode(parts[0]), "")
                 case Show():
                     return self._show(job, parts[0])
+                case _:
+                    assert_never(job)
         except (UnreadableError, ProtocolError, InterfaceError) as error:
             return Result(fault=str(error)), []
         except MemoryError:

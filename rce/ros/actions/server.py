@@ -6,7 +6,7 @@ import asyncio
 import logging
 from contextlib import AsyncExitStack
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, assert_never
 
 from rce.aio.tasks import TaskScope
 from rce.ros.actions import topics, work
@@ -187,6 +187,8 @@ class ActionServer:
                     self._end_unstarted(goal, GoalEvent.CANCEL, text)
                 case Refuse(text=text):
                     self._end_unstarted(goal, GoalEvent.REJECT, text)
+                case _:
+                    assert_never(step)
 
     def _end_unstarted(self, goal: ServerGoal, event: GoalEvent, text: str) -> None:
         del self._goals[goal.id]

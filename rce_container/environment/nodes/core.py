@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from itertools import count
+from typing import assert_never
 
 from rce.aio.backoff import Backoff
 from rce.control.model import NodeState, NodeStatus
@@ -87,6 +88,8 @@ class NodesCore:
                 node = self._nodes.get(event.tag)
                 if node is not None and node.life == event.life and node.has_process:
                     self._happen(node, event)
+            case _:
+                assert_never(event)
         self._end_those_whose_turn_it_is()
         self._launch_those_whose_turn_it_is()
         return self._out
@@ -177,6 +180,8 @@ class NodesCore:
             case Ended(code=code, reason=reason):
                 self._note(node, f"ended: {reason}")
                 self._end(node, code, reason)
+            case _:
+                assert_never(event)
 
     def _register(self, node: Node) -> None:
         if node.registered_at is None:
@@ -360,7 +365,17 @@ class NodesCore:
                 return math.inf
             case NodeState.WAITING if node.pausing and node.due - self._now <= SOON_S:
                 return node.due + REGISTERS_WITHIN_S
-        return -math.inf
+            case (
+                NodeState.RUNNING
+                | NodeState.STOPPING
+                | NodeState.WAITING
+                | NodeState.STUCK
+                | NodeState.EXITED
+                | NodeState.FAILED
+            ):
+                return -math.inf
+            case _:
+                assert_never(node.state)
 
     def _deadline(self, node: Node) -> float:
         return min(self._moments(node), default=math.inf)

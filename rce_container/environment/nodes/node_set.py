@@ -7,6 +7,7 @@ import math
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from typing import assert_never
 
 from rce.control.model import NodeStatus
 from rce.model.specs import NodeSpec
@@ -130,6 +131,8 @@ class NodeSet:
                 self._context.on_fault(text)
             case e.Forget(tag=tag):
                 self._forget(tag)
+            case _:
+                assert_never(instruction)
 
     def _launch(self, tag: str, number: int, spec: NodeSpec) -> None:
         try:
