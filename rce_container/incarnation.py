@@ -285,7 +285,7 @@ class Incarnation:
                 case m.Dial() as request:
                     self._errands.spawn(self._dial(channel, request), name=f"dial for {self.id}")
                 case Unknown(name=name):
-                    log.debug("%s: its environment sent a %s", self.id, intake.sound_text(name))
+                    log.debug("%s: its environment sent a %s", self.id, intake.sanitize_text(name))
                 case message:
                     assert_never(message)
             if pause := pace.pause:
