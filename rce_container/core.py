@@ -1,6 +1,6 @@
 """What a manager decides: events in, instructions out. Pure: no I/O, no clock, no task.
 
-A container lives several lives, each with a *mark* of its own (reported as its incarnation). Events of a
+A container lives several incarnations, one after the other, each with an id of its own. Events of a
 life that is over are ignored.
 """
 
@@ -54,7 +54,7 @@ class Container:
     desired: EndpointSpec | None = None
     """None also for an adopted one of which the master has not spoken yet."""
     drop_revision: int = 0
-    mark: str = ""
+    incarnation_id: str = ""
     address: LinkAddress = field(default_factory=LinkAddress)
     reported: EndpointStatus | None = None
     failures: int = 0
@@ -87,7 +87,7 @@ class Container:
             id=self.id,
             revision=max(0, base.revision),
             state=state,
-            incarnation=self.mark,
+            incarnation=self.incarnation_id,
             address=self.address,
             detail=self.detail,
         )
@@ -107,7 +107,7 @@ _STATES = {
 class ManagerCore:
     """All containers of one manager.
 
-    Invariants: a container has a mark exactly while something of a life may be there; a container that is
+    Invariants: a container has an incarnation id exactly while something of it may be there; one that is
     gone is forgotten.
     """
 
@@ -139,7 +139,7 @@ class ManagerCore:
                 self._due(id_, ticket)
             case Quit():
                 self._quit()
-            case Lost(id=id_, mark="", reason=reason):
+            case Lost(id=id_, incarnation_id="", reason=reason):
                 self._not_started(id_, reason)
             case Made() | Reported() | Faulted() | Lost() | Removed():
                 self._life(event)
@@ -163,9 +163,9 @@ class ManagerCore:
             assert container.id == id_
             assert container.phase is not Phase.GONE, f"{id_} is gone and not forgotten"
             if container.phase is Phase.WAITING:
-                assert not container.mark, f"{id_} waits although something of it is there"
+                assert not container.incarnation_id, f"{id_} waits although something of it is there"
             if container.phase in {*ALIVE, Phase.CLEANING}:
-                assert container.mark, f"{id_} is {container.phase.value} without a life"
+                assert container.incarnation_id, f"{id_} is {container.phase.value} without an incarnation"
 
     # What the master desires
 
@@ -182,8 +182,8 @@ class ManagerCore:
         container.course.advance(LifeEvent.DESIRE)
         if was is Phase.GONE:
             self._start(container)
-        elif container.phase in {*ALIVE, Phase.STARTING} and container.mark:
-            self._out.append(Apply(spec.id, container.mark, spec))
+        elif container.phase in {*ALIVE, Phase.STARTING} and container.incarnation_id:
+            self._out.append(Apply(spec.id, container.incarnation_id, spec))
 
     def _drop(self, id_: str, revision: int, reason: str) -> None:
         container = self.containers.get(id_)
@@ -215,8 +215,8 @@ class ManagerCore:
         if container.phase is Phase.GONE:
             self._forget(container)
         elif was in {*ALIVE, Phase.STARTING}:
-            if container.mark:
-                self._out.append(Stop(container.id, container.mark, reason))
+            if container.incarnation_id:
+                self._out.append(Stop(container.id, container.incarnation_id, reason))
             self._tell(container)
 
     # What happens to containers
@@ -226,7 +226,9 @@ class ManagerCore:
         assert id_ not in self.containers, "containers are adopted before anything else happens"
         is_ill = event.status.state is EndpointState.DEGRADED
         phase = Phase.DEGRADED if is_ill else Phase.RUNNING
-        container = self.containers[id_] = Container.make(id_, phase, mark=event.mark, address=event.address)
+        container = self.containers[id_] = Container.make(
+            id_, phase, incarnation_id=event.incarnation_id, address=event.address
+        )
         container.reported = event.status
         container.running_since = self._now
 
@@ -237,7 +239,7 @@ class ManagerCore:
         if isinstance(event, Made):
             self._made(container, event)
             return
-        if event.mark != container.mark:
+        if event.incarnation_id != container.incarnation_id:
             return
         match event:
             case Reported(status=status):
@@ -252,12 +254,12 @@ class ManagerCore:
                 assert_never(event)
 
     def _made(self, container: Container, event: Made) -> None:
-        container.mark = event.mark
+        container.incarnation_id = event.incarnation_id
         container.address = event.address
         if container.phase is not Phase.STARTING or container.desired is None:
-            self._out.append(Stop(container.id, event.mark, "it is not desired any more"))
+            self._out.append(Stop(container.id, event.incarnation_id, "it is not desired any more"))
             return
-        self._out.append(Apply(container.id, event.mark, container.desired))
+        self._out.append(Apply(container.id, event.incarnation_id, container.desired))
         self._tell(container)
 
     def _report(self, container: Container, status: EndpointStatus) -> None:
@@ -287,7 +289,7 @@ class ManagerCore:
         if container.phase not in (Phase.STOPPING, Phase.CLEANING):
             self._lost(container, "its processes ended")
         container.course.advance(LifeEvent.REMOVED)
-        container.mark = ""
+        container.incarnation_id = ""
         container.address = LinkAddress()
         container.reported = None
         if container.phase is Phase.GONE:

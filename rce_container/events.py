@@ -35,17 +35,17 @@ class Sync:
 class Adopted:
     """A container was found that an earlier manager had started; its environment has reported."""
 
-    mark: str
+    incarnation_id: str
     status: EndpointStatus
     address: LinkAddress
 
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """The processes of a new life were started."""
+    """The processes of a new incarnation were started."""
 
     id: str
-    mark: str
+    incarnation_id: str
     address: LinkAddress
 
 
@@ -54,7 +54,7 @@ class Reported:
     """An environment reported."""
 
     id: str
-    mark: str
+    incarnation_id: str
     status: EndpointStatus
 
 
@@ -63,25 +63,25 @@ class Faulted:
     """An environment has a fault to tell the user of."""
 
     id: str
-    mark: str
+    incarnation_id: str
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """An environment is gone, or could not be started (``mark`` is empty then)."""
+    """An environment is gone, or could not be started (``incarnation_id`` is empty then)."""
 
     id: str
-    mark: str
+    incarnation_id: str
     reason: str
 
 
 @dataclass(frozen=True, slots=True)
 class Removed:
-    """Nothing is left of a life."""
+    """Nothing is left of an incarnation."""
 
     id: str
-    mark: str
+    incarnation_id: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +102,7 @@ Event = Put | Drop | Sync | Adopted | Made | Reported | Faulted | Lost | Removed
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Start a new life; answered by :class:`Made` or :class:`Lost`."""
+    """Start a new incarnation; answered by :class:`Made` or :class:`Lost`."""
 
     id: str
 
@@ -112,18 +112,18 @@ class Apply:
     """Give a specification to an environment."""
 
     id: str
-    mark: str
+    incarnation_id: str
     spec: EndpointSpec
 
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """End a life, nodes first; answered by :class:`Removed` in the end."""
+    """End an incarnation, nodes first; answered by :class:`Removed` in the end."""
 
     id: str
-    mark: str
+    incarnation_id: str
     reason: str = ""
-    """Why, for the record of that life."""
+    """Why, for the record of that incarnation."""
 
 
 @dataclass(frozen=True, slots=True)

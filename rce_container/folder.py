@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Self
 
 import msgspec
-from msgspec import Struct
+from msgspec import Struct, field
 
 from rce_container.archive import LOG_DAYS, LOG_SPACE, LogArchive
 from rce_container.environment import proc
@@ -27,7 +27,7 @@ from rce_container.exceptions import StateBusyError, StateError
 from rce_container.trees import remove
 from rce_container.writing import write_whole
 
-_MARK = re.compile(r"[0-9a-f]{12}")
+_INCARNATION_ID = re.compile(r"[0-9a-f]{12}")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,127}")
 _MAX_SOCKET_PATH = 107
 
@@ -36,7 +36,7 @@ class Record(Struct, frozen=True, kw_only=True):
     """What a manager must know of a container that an earlier manager started."""
 
     id: str
-    mark: str
+    incarnation_id: str = field(name="mark")
     runtime: str
     pid: int
     """The outermost process of the container."""
@@ -56,19 +56,19 @@ class Record(Struct, frozen=True, kw_only=True):
 
 
 class ContainerFolder:
-    """The paths of one life of one container.
+    """The paths of one incarnation of one container.
 
     Args:
-        root: Holds the folders of all lives.
+        root: Holds the folders of all incarnations.
         run: Holds those for sockets.
-        mark: Names the life.
+        incarnation_id: Names the incarnation.
         logs: Where its logs are; by default in its own folder.
     """
 
-    def __init__(self, root: Path, run: Path, mark: str, logs: Path | None = None) -> None:
-        self.mark = mark
-        self.path = root / mark
-        self.run = run / mark
+    def __init__(self, root: Path, run: Path, incarnation_id: str, logs: Path | None = None) -> None:
+        self.incarnation_id = incarnation_id
+        self.path = root / incarnation_id
+        self.run = run / incarnation_id
         self.home = self.path / "home"
         self.logs = logs or self.path / "logs"
         self.etc = self.path / "etc"
@@ -262,30 +262,30 @@ class StateFolder:
         return self._state / "cgroups"
 
     def create(self, id_: str) -> ContainerFolder:
-        """Make the folder of a new life of a container.
+        """Make the folder of a new incarnation of a container.
 
         Raises:
             StateError: It cannot be made.
         """
-        mark = secrets.token_hex(6)
-        logs = self.archive.begin(id_, mark, time.time())
-        folder = ContainerFolder(self._containers, self._run, mark, logs)
+        incarnation_id = secrets.token_hex(6)
+        logs = self.archive.begin(id_, incarnation_id, time.time())
+        folder = ContainerFolder(self._containers, self._run, incarnation_id, logs)
         try:
             folder.make()
         except StateError as error:
             folder.remove()
-            self.archive.end(id_, mark, str(error), time.time())
+            self.archive.end(id_, incarnation_id, str(error), time.time())
             raise
         return folder
 
     def existing(self) -> list[ContainerFolder]:
-        """All folders of lives of containers that are there, by mark."""
-        marks = {path.name for parent in (self._containers, self._run) for path in parent.iterdir()}
+        """All folders of incarnations of containers that are there, by id."""
+        incarnation_ids = {path.name for parent in (self._containers, self._run) for path in parent.iterdir()}
         logs = self.archive.folders()
         return [
-            ContainerFolder(self._containers, self._run, mark, logs.get(mark))
-            for mark in sorted(marks)
-            if _MARK.fullmatch(mark)
+            ContainerFolder(self._containers, self._run, incarnation_id, logs.get(incarnation_id))
+            for incarnation_id in sorted(incarnation_ids)
+            if _INCARNATION_ID.fullmatch(incarnation_id)
         ]
 
     def _word(self, file: str, default: str) -> str:

@@ -1,4 +1,4 @@
-"""One life of one container: its processes, its control connection and its folder, owned by one task."""
+"""One incarnation of a container: its processes, control connection and folder, owned by one task."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _DIAL_TIMEOUT_S = 5.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IncarnationContext:
-    """What all lives of all containers share."""
+    """What all incarnations of all containers share."""
 
     settings: ContainerSettings
     acceptor: LinkAcceptor
@@ -65,14 +65,14 @@ class IncarnationContext:
 
 
 class Incarnation:
-    """One life of one container, from the first process to the removal of the last file.
+    """One incarnation of one container, from the first process to the removal of the last file.
 
     Args:
         id: The container.
-        folder: Belongs to this life.
+        folder: Belongs to this incarnation.
         handle: Its outermost process.
         enforcer: Looks after its control group.
-        context: What all lives share.
+        context: What all incarnations share.
         isolated: Whether pids that the environment reports are those of a namespace of its own.
     """
 
@@ -109,18 +109,18 @@ class Incarnation:
         self._hurry = False
         self._errands = BackgroundTasks()
         self._supply = Supply(
-            self.mark,
+            self.incarnation_id,
             EndpointId.parse(id).user,
             context.library,
             Shelf(folder.user_packages, link=isolated),
-            tell=lambda text: context.feed(events.Faulted(id, folder.mark, text)),
+            tell=lambda text: context.feed(events.Faulted(id, folder.incarnation_id, text)),
             on_arrival=self._tell_of_arrival,
         )
 
     @property
-    def mark(self) -> str:
-        """Names this life."""
-        return self.folder.mark
+    def incarnation_id(self) -> str:
+        """Names this incarnation."""
+        return self.folder.incarnation_id
 
     @property
     def node_pids(self) -> dict[str, int]:
@@ -169,13 +169,13 @@ class Incarnation:
             return
         self._channel.send(m.encode(m.Poll()))
         for text in self.enforcer.review():
-            self._context.feed(events.Faulted(self.id, self.mark, text))
+            self._context.feed(events.Faulted(self.id, self.incarnation_id, text))
 
     def stop(self, reason: str = "") -> None:
         """Tell the environment to end; if it does not, it is killed.
 
         Args:
-            reason: For the record of this life.
+            reason: For the record of this incarnation.
         """
         self._stopping = True
         self._stop_reason = reason or self._stop_reason
@@ -196,7 +196,7 @@ class Incarnation:
                 reason = self.enforcer.claim_all() or reason
                 reason += await asyncio.to_thread(self._last_words)
                 log.warning("container %s: %s", self.id, reason)
-            self._context.feed(events.Lost(self.id, self.mark, reason))
+            self._context.feed(events.Lost(self.id, self.incarnation_id, reason))
             await asyncio.to_thread(self._note_end, reason)
             await self._clean(_SHIM_TIMEOUT_S if self._stopping and not self._hurry else 0.0)
         except asyncio.CancelledError:
@@ -253,7 +253,7 @@ class Incarnation:
         )
 
     async def _prepare(self, pid: int) -> None:
-        await self._context.networks.attach(self.mark, pid)
+        await self._context.networks.attach(self.incarnation_id, pid)
 
     async def _hang_up(self) -> None:
         self._deadline = None
@@ -277,7 +277,9 @@ class Incarnation:
                     self._report(self._sanitize(status), pace)
                 case m.Fault(text=text):
                     pace.pay(intake.PER_FAULT)
-                    self._context.feed(events.Faulted(self.id, self.mark, intake.sanitize_text(text)))
+                    self._context.feed(
+                        events.Faulted(self.id, self.incarnation_id, intake.sanitize_text(text))
+                    )
                 case m.Counters() as counters:
                     self.counters = intake.sanitize_counters(counters)
                 case m.Killed(request=number):
@@ -305,7 +307,7 @@ class Incarnation:
             status = msgspec.structs.replace(status, nodes=self._with_outer_pids(status, pace))
         self.status = status
         self.reported.set()
-        self._context.feed(events.Reported(self.id, self.mark, status))
+        self._context.feed(events.Reported(self.id, self.incarnation_id, status))
 
     def _with_outer_pids(self, status: EndpointStatus, pace: intake.Pace) -> tuple[NodeStatus, ...]:
         """Replace the nodes' pids inside the container by those outside."""
@@ -327,7 +329,7 @@ class Incarnation:
 
     async def _resize(self, spec: EndpointSpec) -> None:
         if text := await self.enforcer.apply(spec.resources):
-            self._context.feed(events.Faulted(self.id, self.mark, text))
+            self._context.feed(events.Faulted(self.id, self.incarnation_id, text))
 
     # Links
 
@@ -361,7 +363,7 @@ class Incarnation:
     def _note_end(self, reason: str) -> None:
         if self._stopping:
             reason = "; ".join(filter(None, (self._stop_reason, reason if self._hurry else "")))
-        self._context.archive.end(self.id, self.mark, reason, time.time())
+        self._context.archive.end(self.id, self.incarnation_id, reason, time.time())
 
     def _last_words(self) -> str:
         words = last_line(self.folder.logs)[:_LAST_WORDS_LENGTH]
@@ -377,7 +379,7 @@ class Incarnation:
             await self.handle.kill()
         except KillError as error:
             log.error("container %s: %s", self.id, error)  # noqa: TRY400 - its text says it all
-        await self._context.networks.detach(self.mark)
+        await self._context.networks.detach(self.incarnation_id)
         await asyncio.to_thread(self.folder.remove)
         try:
             await self.enforcer.remove()

@@ -78,7 +78,7 @@ class Launcher:
             OSError: The machine has no more of something.
         """
         runtime = self._runtime_for(resources)
-        control_group = self._limiter.create(folder.mark, limits_of(resources, self._settings))
+        control_group = self._limiter.create(folder.incarnation_id, limits_of(resources, self._settings))
         membership = self._enroll(id_, folder, resources)
         boot = self._boot(id_, folder, resources, runtime, control_group, membership)
         with folder.listen(folder.control_socket) as control, folder.listen(folder.link_socket) as links:
@@ -98,7 +98,7 @@ class Launcher:
         process = handle.process
         record = Record(
             id=id_,
-            mark=folder.mark,
+            incarnation_id=folder.incarnation_id,
             runtime=runtime.name,
             pid=process.pid,
             start=process.start,
@@ -112,15 +112,15 @@ class Launcher:
             raise
         return Launched(handle, control_group, runtime.isolated)
 
-    async def undo(self, mark: str) -> None:
+    async def undo(self, incarnation_id: str) -> None:
         """Remove a container's cell, with all that is in it, and its place in a network."""
-        control_group = self._limiter.adopt(mark)
+        control_group = self._limiter.adopt(incarnation_id)
         try:
             await asyncio.to_thread(control_group.kill)
             await asyncio.to_thread(control_group.remove)
         except ContainerError as error:
             log.error("a container that did not start: %s", error)  # noqa: TRY400 - its text says it all
-        await self._networks.detach(mark)
+        await self._networks.detach(incarnation_id)
 
     def _runtime_for(self, resources: Resources) -> Runtime:
         """The runtime that makes a container: an image needs one that can run images.
@@ -141,7 +141,7 @@ class Launcher:
         if resources.network is not Network.GROUP:
             return None
         return self._networks.enroll(
-            EndpointId.parse(id_), resources.group, resources.group_ip, folder.mark, folder.hosts
+            EndpointId.parse(id_), resources.group, resources.group_ip, folder.incarnation_id, folder.hosts
         )
 
     def _boot(
@@ -157,7 +157,7 @@ class Launcher:
         own_network = runtime.isolated and resources.network is not Network.HOST
         return m.Boot(
             id=id_,
-            mark=folder.mark,
+            mark=folder.incarnation_id,
             machine=settings.machine,
             tls=settings.tls,
             home="",

@@ -133,7 +133,7 @@ class Manager:
         )
         self._executions = Executions(dialer, self._execute) if dialer is not None else None
         self._incarnations: dict[str, Incarnation] = {}
-        """All lives of which something may be left, by mark."""
+        """All incarnations of which something may be left, by id."""
         self._queue: deque[str] = deque()
         """Containers that are to be started when fewer are starting."""
         self._starting: set[Incarnation] = set()
@@ -175,7 +175,7 @@ class Manager:
 
     def _execute(self, id_: str, command: Command, sock: socket.socket) -> None:
         container = self._core.containers.get(id_)
-        incarnation = self._incarnations.get(container.mark) if container is not None else None
+        incarnation = self._incarnations.get(container.incarnation_id) if container is not None else None
         if incarnation is None:
             raise ExecutionError("the container is not running here")
         incarnation.execute(command, sock)
@@ -218,9 +218,9 @@ class Manager:
 
     async def _deal_with_the_past(self) -> None:
         folders = await asyncio.to_thread(self._state.existing)
-        await self._sweep_control_groups({folder.mark for folder in folders})
-        marks = {folder.mark for folder in folders}
-        await asyncio.to_thread(self._state.archive.settle, marks, time.time())
+        await self._sweep_control_groups({folder.incarnation_id for folder in folders})
+        incarnation_ids = {folder.incarnation_id for folder in folders}
+        await asyncio.to_thread(self._state.archive.settle, incarnation_ids, time.time())
         async with asyncio.TaskGroup() as tasks:
             for folder in folders:
                 tasks.create_task(self._adopt_or_prune(folder))
@@ -230,7 +230,7 @@ class Manager:
         process = proc.read(record.pid) if record is not None else None
         runtime = self._runtimes.get(record.runtime, self._runtime) if record is not None else self._runtime
         if record is None or process is None or process.start != record.start or runtime.is_starting(record):
-            self._tasks.create_task(self._prune(folder), name=f"prune {folder.mark}")
+            self._tasks.create_task(self._prune(folder), name=f"prune {folder.incarnation_id}")
             return
         if record.group:
             try:
@@ -238,21 +238,21 @@ class Manager:
             except NetworkError as error:
                 log.warning("container %s has lost its group: %s", record.id, error)
         handle = runtime.adopt(process, record)
-        control_group = self._limiter.adopt(folder.mark)
+        control_group = self._limiter.adopt(folder.incarnation_id)
         incarnation = self._own(record.id, folder, handle, control_group, isolated=runtime.isolated)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._settings.adopt_timeout):
                 await incarnation.reported.wait()
         if (
             incarnation.status is None
-            or incarnation.mark not in self._incarnations
+            or incarnation.incarnation_id not in self._incarnations
             or record.id in self._core.containers
         ):
             log.warning("container %s of an earlier manager does not answer; it is removed", record.id)
             incarnation.kill()
             return
         log.info("adopted container %s", record.id)
-        self._feed(events.Adopted(incarnation.mark, incarnation.status, self._address(folder)))
+        self._feed(events.Adopted(incarnation.incarnation_id, incarnation.status, self._address(folder)))
 
     async def _prune(self, folder: ContainerFolder) -> None:
         """Remove what a dead container left."""
@@ -266,10 +266,10 @@ class Manager:
                         pass
             finally:
                 channel.close()
-        await kill_marked(folder.mark)
-        await self._launcher.undo(folder.mark)
+        await kill_marked(folder.incarnation_id)
+        await self._launcher.undo(folder.incarnation_id)
         await asyncio.to_thread(folder.remove)
-        await asyncio.to_thread(self._state.archive.settle_one, folder.mark, time.time())
+        await asyncio.to_thread(self._state.archive.settle_one, folder.incarnation_id, time.time())
 
     async def _prune_logs(self) -> None:
         """Remove the logs of containers that ended long ago, now and then."""
@@ -297,10 +297,10 @@ class Manager:
             case events.Start(id=id_):
                 self._queue.append(id_)
                 self._start_waiting()
-            case events.Apply(mark=mark, spec=spec):
-                self._incarnations[mark].apply(spec)
-            case events.Stop(mark=mark, reason=reason):
-                self._incarnations[mark].stop(reason)
+            case events.Apply(incarnation_id=incarnation_id, spec=spec):
+                self._incarnations[incarnation_id].apply(spec)
+            case events.Stop(incarnation_id=incarnation_id, reason=reason):
+                self._incarnations[incarnation_id].stop(reason)
             case events.Wait(id=id_, ticket=ticket, delay=delay):
                 asyncio.get_running_loop().call_later(delay, self._feed, events.Due(id_, ticket))
             case _:
@@ -327,15 +327,17 @@ class Manager:
         try:
             handle, control_group, isolated = self._launcher.launch(id_, folder, self._core.resources(id_))
         except (ContainerError, OSError) as error:  # disk, descriptors or memory of this machine ran out
-            self._tasks.create_task(self._launcher.undo(folder.mark), name=f"what was made of {id_}")
+            self._tasks.create_task(
+                self._launcher.undo(folder.incarnation_id), name=f"what was made of {id_}"
+            )
             folder.remove()
-            self._state.archive.end(id_, folder.mark, f"cannot be started: {error}", time.time())
+            self._state.archive.end(id_, folder.incarnation_id, f"cannot be started: {error}", time.time())
             self._feed(events.Lost(id_, "", str(error)))
             return
         incarnation = self._own(id_, folder, handle, control_group, isolated=isolated)
         self._starting.add(incarnation)
         self._tasks.create_task(self._await_start(incarnation), name=f"start of {id_}")
-        self._feed(events.Made(id_, folder.mark, self._address(folder)))
+        self._feed(events.Made(id_, folder.incarnation_id, self._address(folder)))
 
     async def _await_start(self, incarnation: Incarnation) -> None:
         await incarnation.reported.wait()
@@ -353,14 +355,14 @@ class Manager:
     ) -> Incarnation:
         enforcer = LimitEnforcer(EndpointId.parse(id_).tag, control_group, self._settings)
         incarnation = Incarnation(id_, folder, handle, enforcer, self._context, isolated=isolated)
-        self._incarnations[incarnation.mark] = incarnation
+        self._incarnations[incarnation.incarnation_id] = incarnation
         self._tasks.create_task(self._run_incarnation(incarnation), name=f"container {id_}")
         return incarnation
 
     async def _run_incarnation(self, incarnation: Incarnation) -> None:
         await incarnation.run()
-        del self._incarnations[incarnation.mark]
-        self._feed(events.Removed(incarnation.id, incarnation.mark))
+        del self._incarnations[incarnation.incarnation_id]
+        self._feed(events.Removed(incarnation.id, incarnation.incarnation_id))
         if not self._incarnations:
             self._empty.set()
 
@@ -378,9 +380,9 @@ class Manager:
 
     def _read_log(self, message: ReadLog) -> LogChunk:
         container = self._core.containers.get(message.id)
-        mark = container.mark if container is not None else ""
+        incarnation_id = container.incarnation_id if container is not None else ""
         try:
-            return read_for(self._state.archive, message, mark)
+            return read_for(self._state.archive, message, incarnation_id)
         except (OSError, ValueError) as error:
             return LogChunk(request=message.request, offset=message.offset, error=str(error))
 

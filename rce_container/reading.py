@@ -1,4 +1,4 @@
-"""Answers requests to read logs: finds the life of the container that is meant, and the log in it."""
+"""Answers requests to read logs: finds the incarnation of the container that is meant, and the log in it."""
 
 from __future__ import annotations
 
@@ -26,28 +26,34 @@ def read_for(archive: LogArchive, message: ReadLog, living: str) -> LogChunk:
         raise FileNotFoundError(f"there is no log of {message.node!r}")
     kept = _find(archive, message, living)
     chunk = _read(kept, message)
-    life = kept.life
+    record = kept.record
     return LogChunk(
         request=message.request,
         offset=chunk.offset,
         text=chunk.text,
-        life=life.mark,
-        ended=life.ended,
-        reason=life.reason,
+        incarnation=record.incarnation_id,
+        ended=record.ended,
+        reason=record.reason,
     )
 
 
 def _find(archive: LogArchive, message: ReadLog, living: str) -> Kept:
     current = archive.get(message.id, living) if living else None
     tag = EndpointId.parse(message.id).tag
-    if message.query.life:
-        ended = [kept for kept in archive.ended(message.id) if kept.life.mark == message.query.life]
-        found = current if living == message.query.life else next(iter(ended), None)
-        missing = f"the logs of that life of container {tag} are not kept any more"
+    if message.query.incarnation:
+        ended = [
+            kept
+            for kept in archive.ended(message.id)
+            if kept.record.incarnation_id == message.query.incarnation
+        ]
+        found = current if living == message.query.incarnation else next(iter(ended), None)
+        missing = f"the logs of that incarnation of container {tag} are not kept any more"
     elif current is not None and not message.query.previous and _is_owners(current, message):
         return current
     else:
-        found = next((kept for kept in archive.ended(message.id) if kept.life.mark != living), None)
+        found = next(
+            (kept for kept in archive.ended(message.id) if kept.record.incarnation_id != living), None
+        )
         missing = f"no logs of an earlier life of container {tag} are kept here"
     if found is None or not _is_owners(found, message):
         raise FileNotFoundError(missing)
@@ -55,8 +61,8 @@ def _find(archive: LogArchive, message: ReadLog, living: str) -> Kept:
 
 
 def _is_owners(kept: Kept, message: ReadLog) -> bool:
-    """Whether a life is of the user who is meant, and not of one of the same name before."""
-    return kept.life.began >= message.query.since
+    """Whether an incarnation is of the user who is meant, and not of one of the same name before."""
+    return kept.record.began >= message.query.since
 
 
 def _read(kept: Kept, message: ReadLog) -> Chunk:

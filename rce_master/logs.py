@@ -44,7 +44,7 @@ class LogRequest(NamedTuple):
 
 
 async def read_log(tables: Tables, peers: Mapping[str, LogReader], request: LogRequest) -> LogChunk:
-    """Read a log of a container that lives, or of an earlier life of it that some machine still knows.
+    """Read a log of a container that is there, or of an earlier incarnation that a machine still knows.
 
     Args:
         tables: The state.
@@ -65,7 +65,7 @@ async def read_log(tables: Tables, peers: Mapping[str, LogReader], request: LogR
     query = request.query
     if container is None:
         return await _read_anywhere(tables, peers, request)
-    if query.previous or query.life:
+    if query.previous or query.incarnation:
         return await _read_earlier(tables, peers, request, container)
     if request.node and request.node not in container.nodes:
         raise NotFound(f"container {container.tag!r} has no node {request.node!r}")
@@ -78,7 +78,7 @@ async def read_log(tables: Tables, peers: Mapping[str, LogReader], request: LogR
 async def _read_earlier(
     tables: Tables, peers: Mapping[str, LogReader], request: LogRequest, container: Container
 ) -> LogChunk:
-    """Read of an earlier life: where the container is, or else where it was before."""
+    """Read of an earlier incarnation: where the container is, or else where it was before."""
     if container.task_set in peers:
         chunk = await _ask(peers[container.task_set], request)
         if not chunk.error:
@@ -87,7 +87,7 @@ async def _read_earlier(
 
 
 async def _read_anywhere(tables: Tables, peers: Mapping[str, LogReader], request: LogRequest) -> LogChunk:
-    """Ask all machines; of several answers that of the life that ended last counts."""
+    """Ask all machines; of several answers that of the incarnation that ended last counts."""
     asked = [
         peer
         for process, peer in peers.items()
@@ -127,10 +127,10 @@ async def _ask(peer: LogReader | None, request: LogRequest) -> LogChunk:
 
 
 def _is_present(tables: Tables, request: LogRequest) -> bool:
-    """Whether the present life is meant, which is its owner's whatever its machine's clock says."""
+    """Whether the present incarnation is meant, which is its owner's whatever its machine's clock says."""
     status = tables.container_live(request.id).status
     query = request.query
-    return not query.previous and query.life in ("", status.incarnation if status is not None else "")
+    return not query.previous and query.incarnation in ("", status.incarnation if status is not None else "")
 
 
 def _owner_since(tables: Tables, id_: str) -> float:

@@ -50,7 +50,7 @@ NO_RATES = Rates()
 
 
 def rates_between(before: Sample, now: Sample) -> Rates:
-    """Tell what happened in a second between two samples of one life of a container."""
+    """Tell what happened in a second between two samples of one incarnation of a container."""
     elapsed = now.time - before.time
     if elapsed < _LEAST_S:
         return NO_RATES
@@ -70,7 +70,7 @@ def rates_between(before: Sample, now: Sample) -> Rates:
 
 @dataclass(slots=True)
 class History:
-    """One life of a container."""
+    """One incarnation of a container."""
 
     before: Sample
     now: Sample

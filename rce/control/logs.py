@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-from msgspec import Struct
+from msgspec import Struct, field
 
 
 class LogStream(Enum):
@@ -35,9 +35,9 @@ class LogQuery(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Only these; all if empty. The environment's log knows ``rosout`` only, which is another log there."""
     level: LogLevel = LogLevel.DEBUG
     """Of log records in ROS only those that are at least as serious."""
-    life: str = ""
-    """Of which life of the container, as an answer said; empty: of the one it lives, or else the last."""
+    incarnation: str = field(default="", name="life")
+    """Of which incarnation of the container, as an answer said; empty: of the present or last one."""
     previous: bool = False
-    """Of the last life that ended, though the container may live another one; goes without ``life``."""
+    """Of the last incarnation that ended, though there may be a newer one; goes without ``incarnation``."""
     since: float = 0.0
-    """Not of lives that began before this time (seconds since the epoch): they were another user's."""
+    """Not of incarnations that began before this time (seconds since the epoch): they were another user's."""

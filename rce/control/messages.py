@@ -172,10 +172,10 @@ class LogChunk(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """Where the next read continues."""
     text: str = ""
     error: str = ""
-    life: str = ""
-    """The container's life (its incarnation) of which this is the log."""
+    incarnation: str = field(default="", name="life")
+    """The container's incarnation of which this is the log."""
     ended: float = 0.0
-    """When that life ended, in seconds since the epoch; 0 if it has not."""
+    """When that incarnation ended, in seconds since the epoch; 0 if it has not."""
     reason: str = ""
     """Why it ended."""
 

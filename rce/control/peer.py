@@ -82,7 +82,7 @@ class Peer:
             node: Node tag; empty for the environment's own log.
             offset: Where to start, in bytes; negative: that many before the end.
             limit: At most so many bytes.
-            query: Of which life of the container, and what of it.
+            query: Of which incarnation of the container, and what of it.
 
         Raises:
             PeerGoneError: The task set left.

@@ -158,15 +158,15 @@ class Limiter(ABC):
         """What of ``cpu``, ``memory``, ``processes`` and ``io`` it cannot limit or count here."""
 
     @abstractmethod
-    def create(self, mark: str, limits: Limits) -> ControlGroup:
-        """Make the control group of one life of a container.
+    def create(self, incarnation_id: str, limits: Limits) -> ControlGroup:
+        """Make the control group of one incarnation of a container.
 
         Raises:
             LimitError: It cannot be made with these limits; nothing is left of it.
         """
 
     @abstractmethod
-    def adopt(self, mark: str) -> ControlGroup:
+    def adopt(self, incarnation_id: str) -> ControlGroup:
         """The control group of a container that an earlier manager started; an empty shell if it has none."""
 
     @abstractmethod

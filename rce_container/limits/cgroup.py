@@ -191,9 +191,9 @@ class CgroupLimiter(Limiter):
         """What no controller is there for."""
         return self._missing
 
-    def create(self, mark: str, limits: Limits) -> ControlGroup:
+    def create(self, incarnation_id: str, limits: Limits) -> ControlGroup:
         """Make its folders and write its limits."""
-        folders = [parent / mark for parent in self._parents]
+        folders = [parent / incarnation_id for parent in self._parents]
         try:
             self._make(folders)
         except OSError as error:
@@ -209,17 +209,17 @@ class CgroupLimiter(Limiter):
             raise
         return control_group
 
-    def adopt(self, mark: str) -> ControlGroup:
+    def adopt(self, incarnation_id: str) -> ControlGroup:
         """Find its folders, also where an earlier manager made them."""
-        folders = [parent / mark for parent in self._all_parents()]
+        folders = [parent / incarnation_id for parent in self._all_parents()]
         return self.control_group([folder for folder in folders if folder.is_dir()])
 
     def sweep(self, keep: Collection[str]) -> None:
         """Look where this and earlier managers made cells."""
         parents = self._all_parents()
-        marks = {child.name for parent in parents for child in files.children(parent)}
-        for mark in sorted(marks - set(keep)):
-            control_group = self.adopt(mark)
+        incarnation_ids = {child.name for parent in parents for child in files.children(parent)}
+        for incarnation_id in sorted(incarnation_ids - set(keep)):
+            control_group = self.adopt(incarnation_id)
             control_group.kill()
             control_group.remove()
         for parent in parents:

@@ -1,4 +1,4 @@
-"""Keeps the limits of one life of one container, and tells of deaths in its control group."""
+"""Keeps the limits of one incarnation of one container, and tells of deaths in its control group."""
 
 from __future__ import annotations
 

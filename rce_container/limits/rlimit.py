@@ -97,11 +97,11 @@ class RlimitLimiter(Limiter):
         """It counts nothing."""
         return frozenset({"cpu", "memory", "processes", "io"})
 
-    def create(self, mark: str, limits: Limits) -> RlimitControlGroup:  # noqa: ARG002
+    def create(self, incarnation_id: str, limits: Limits) -> RlimitControlGroup:  # noqa: ARG002
         """Note the limits."""
         return RlimitControlGroup(limits)
 
-    def adopt(self, mark: str) -> RlimitControlGroup:  # noqa: ARG002
+    def adopt(self, incarnation_id: str) -> RlimitControlGroup:  # noqa: ARG002
         """Take the next limits that are asked for as those that it has."""
         return RlimitControlGroup(None)
 

@@ -52,7 +52,7 @@ class _Member:
 
 @dataclass(slots=True)
 class _Group:
-    """The containers of one group, by mark; never empty. The one who changes the switch has the lock."""
+    """The containers of one group, by id; never empty. The one who changes the switch has the lock."""
 
     switch: int
     has_bridge: bool
@@ -70,7 +70,7 @@ class Networks:
     def __init__(self) -> None:
         self._groups: dict[tuple[str, str], _Group] = {}
         self._of: dict[str, tuple[str, str]] = {}
-        """The group that a container is in, by mark."""
+        """The group that a container is in, by id."""
 
     def probe(self) -> None:
         """Find out whether groups work on this machine. Blocks.
@@ -84,14 +84,16 @@ class Networks:
             stack.callback(os.close, inside)
             _plug_in(switch, inside, "probe", IPv4Interface("10.77.0.1/24"), bridge=True)
 
-    def enroll(self, container: EndpointId, group: str, group_ip: str, mark: str, hosts: Path) -> Membership:
+    def enroll(
+        self, container: EndpointId, group: str, group_ip: str, incarnation_id: str, hosts: Path
+    ) -> Membership:
         """Give a container that is to be started its place.
 
         Args:
             container: Who it is.
             group: Its group.
             group_ip: The address that it is to have there; empty for any.
-            mark: Names this life of it.
+            incarnation_id: Names this incarnation of it.
             hosts: Its ``/etc/hosts``, which is kept up to date from now on.
 
         Raises:
@@ -105,8 +107,8 @@ class Networks:
         address = choose(group_ip, taken)
         if found is None:
             found = self._groups[key] = _Group(make_namespace(), has_bridge=False)
-        found.members[mark] = _Member(container.tag, address, hosts, plugged=False)
-        self._of[mark] = key
+        found.members[incarnation_id] = _Member(container.tag, address, hosts, plugged=False)
+        self._of[incarnation_id] = key
         return Membership(address, found.switch)
 
     def adopt(self, container: EndpointId, record: Record, hosts: Path) -> None:
@@ -125,50 +127,50 @@ class Networks:
         if found is None:
             found = self._groups[key] = _Group(_held_by(record.pid), has_bridge=True)
         address = IPv4Interface(record.address)
-        found.members[record.mark] = _Member(container.tag, address, hosts, plugged=True)
-        self._of[record.mark] = key
+        found.members[record.incarnation_id] = _Member(container.tag, address, hosts, plugged=True)
+        self._of[record.incarnation_id] = key
 
-    async def attach(self, mark: str, pid: int) -> None:
+    async def attach(self, incarnation_id: str, pid: int) -> None:
         """Plug a container in that is enrolled, and tell all members' ``/etc/hosts`` of it.
 
         Args:
-            mark: The life of the container.
+            incarnation_id: The incarnation of the container.
             pid: A process in its network namespace.
 
         Raises:
             NetworkError: It cannot be done.
         """
-        key = self._of.get(mark)
+        key = self._of.get(incarnation_id)
         if key is None:
             return
         group = self._groups[key]
-        member = group.members[mark]
+        member = group.members[incarnation_id]
         async with group.lock:
             bridge = not group.has_bridge
             inside = open_namespace(pid)
             try:
                 await asyncio.to_thread(
-                    _plug_in, group.switch, inside, _port(mark), member.address, bridge=bridge
+                    _plug_in, group.switch, inside, _port(incarnation_id), member.address, bridge=bridge
                 )
             finally:
                 os.close(inside)
             group.has_bridge = member.plugged = True
             await asyncio.to_thread(_write_hosts, list(group.members.values()))
 
-    async def detach(self, mark: str) -> None:
+    async def detach(self, incarnation_id: str) -> None:
         """Take a container whose processes have ended out of its group, if it is in one."""
-        key = self._of.pop(mark, None)
+        key = self._of.pop(incarnation_id, None)
         if key is None:
             return
         group = self._groups[key]
         async with group.lock:
-            member = group.members[mark]
+            member = group.members[incarnation_id]
             if member.plugged and len(group.members) > 1:
                 try:
-                    await asyncio.to_thread(configure, group.switch, [f"link delete {_port(mark)}"])
+                    await asyncio.to_thread(configure, group.switch, [f"link delete {_port(incarnation_id)}"])
                 except NetworkError as error:
-                    log.debug("the kernel has removed the port of %s already: %s", mark, error)
-            del group.members[mark]
+                    log.debug("the kernel has removed the port of %s already: %s", incarnation_id, error)
+            del group.members[incarnation_id]
             if group.members:
                 await asyncio.to_thread(_write_hosts, list(group.members.values()))
         if not group.members and self._groups.get(key) is group:
@@ -183,9 +185,9 @@ class Networks:
         self._of.clear()
 
 
-def _port(mark: str) -> str:
+def _port(incarnation_id: str) -> str:
     """The interface in the switch that a container is plugged into; at most 15 characters."""
-    return f"v{mark}"
+    return f"v{incarnation_id}"
 
 
 def _plug_in(switch: int, inside: int, port: str, address: IPv4Interface, *, bridge: bool) -> None:

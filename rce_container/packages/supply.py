@@ -50,10 +50,10 @@ class Library:
 
 
 class Supply:
-    """The packages of one life of a container. Several come at once; one that fails holds up no other.
+    """The packages of one incarnation of a container. Several come at once; one that fails holds up no other.
 
     Args:
-        holder: Names this life.
+        holder: Names this incarnation.
         user: Whose container it is.
         library: Where packages come from.
         shelf: Where they go.

@@ -59,19 +59,19 @@ class Handle:
 
     Args:
         process: The shim.
-        mark: What the container's processes carry, where a kill must look for it; else empty.
+        incarnation_id: What the container's processes carry, where a kill must look for it; else empty.
         popen: The shim as a child, if it is one.
     """
 
     def __init__(
-        self, process: proc.Process, mark: str, popen: subprocess.Popen[bytes] | None = None
+        self, process: proc.Process, incarnation_id: str, popen: subprocess.Popen[bytes] | None = None
     ) -> None:
         self.process = process
         self.namespaces_pid = 0
         """A process that lives as long as the container's namespaces, and in them; 0 if there are none."""
         self.environment: proc.Process | None = None
         """The environment, if it does not descend from :attr:`process`."""
-        self._mark = mark
+        self._mark = incarnation_id
         self._popen = popen
 
     @property
@@ -200,7 +200,7 @@ class Runtime(ABC):
             process: The shim, which was found alive.
             record: What the earlier manager noted.
         """
-        handle = Handle(process, "" if self.isolated else record.mark)
+        handle = Handle(process, "" if self.isolated else record.incarnation_id)
         handle.namespaces_pid = record.namespaces_pid
         environment = proc.read(record.environment) if record.environment else None
         if environment is not None and environment.start == record.environment_start:
@@ -228,9 +228,9 @@ class ExecRuntime(Runtime):
         home, logs = self.paths(order.folder)
         boot = encode_boot(order.boot, home, logs)
         argv, env = self.command(order, [sys.executable, "-P", "-m", "rce_container.environment", boot])
-        mark = "" if self.isolated else order.folder.mark
+        incarnation_id = "" if self.isolated else order.folder.incarnation_id
         popen, process = spawn_shim(order, argv, env, (order.control, order.links), sweep=not self.isolated)
-        return Handle(process, mark, popen)
+        return Handle(process, incarnation_id, popen)
 
 
 def encode_boot(boot: Boot, home: str, logs: str) -> str:

@@ -182,7 +182,7 @@ class NamespaceRuntime(Runtime):
             folder.make()
             boot = Boot(
                 id="probe/probe",
-                mark=folder.mark,
+                mark=folder.incarnation_id,
                 machine="",
                 home="",
                 logs="",

@@ -166,7 +166,7 @@ class PodmanRuntime(NamespaceRuntime):
             "--storage-opt": f"additionalimagestore={self._store}",
         }
         run = {
-            "--name": order.folder.mark,
+            "--name": order.folder.incarnation_id,
             "--hostname": hostname(order.tag),
             "--network": "host" if order.host_network else "none",
         }

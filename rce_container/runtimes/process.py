@@ -29,4 +29,4 @@ class ProcessRuntime(ExecRuntime):
 
         The shim itself carries no mark: it is the one that looks for them.
         """
-        return [_ENV, f"{MARK}={order.folder.mark}", *argv], clean_environ(str(order.folder.home))
+        return [_ENV, f"{MARK}={order.folder.incarnation_id}", *argv], clean_environ(str(order.folder.home))

@@ -79,7 +79,7 @@ def spawn_shim(
         f"{order.boot.grace:g}",
         sys.executable,
         proc.__file__ if sweep else "",
-        folder.mark,
+        folder.incarnation_id,
         order.switch,
     ]
     shim += [*order.join, "--", *argv]

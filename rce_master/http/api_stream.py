@@ -36,8 +36,8 @@ _LOG_QUERY = (
     Query(name="limit", description=f"At most so many bytes, up to {MAX_LOG}.", type="integer"),
     Query(name="stream", description=f"Only these, with commas: {_words(LogStream)}."),
     Query(name="level", description=f"Only log records in ROS from this level on: {_words(LogLevel)}."),
-    Query(name="previous", description="true: of the last life of the container that ended."),
-    Query(name="life", description="Of that life of the container, as an answer named it."),
+    Query(name="previous", description="true: of the last incarnation of the container that ended."),
+    Query(name="life", description="Of that incarnation of the container, as an answer named it."),
 )
 
 
@@ -78,7 +78,7 @@ async def _read_log(call: Call, node: str) -> models.LogOut:
     return models.LogOut(
         text=chunk.text,
         offset=chunk.offset,
-        life=chunk.life,
+        life=chunk.incarnation,
         ended=chunk.ended or None,
         reason=chunk.reason,
     )
@@ -90,7 +90,7 @@ def _log_query(query: Mapping[str, str]) -> LogQuery:
         streams=tuple(_one_of(LogStream, "stream", word) for word in streams),
         level=_one_of(LogLevel, "level", query.get("level", LogLevel.DEBUG.value)),
         previous=query.get("previous") == "true",
-        life=query.get("life", ""),
+        incarnation=query.get("life", ""),
     )
 
 

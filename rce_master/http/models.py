@@ -495,9 +495,9 @@ class LogOut(Model):
     text: str
     offset: int
     """Where the next read continues."""
-    life: str = ""
-    """The container's life of which this is the log; reads of the same log name it."""
+    incarnation: str = Field(default="", alias="life")
+    """The container's incarnation of which this is the log; reads of the same log name it."""
     ended: float | None = None
-    """When that life ended, in seconds since 1970; null if it continues."""
+    """When that incarnation ended, in seconds since 1970; null if it continues."""
     reason: str = ""
     """Why it ended."""

@@ -272,7 +272,7 @@ class Tables:
             "moves", type_=Any, key=lambda m: m.id, persistent=False, to=lambda m: [m.to]
         )
         self.first_revision = 0
-        """Revisions that this life of the master gives are above this."""
+        """Revisions that this run of the master gives are above this."""
 
     @property
     def all(self) -> tuple[Table[Any], ...]:

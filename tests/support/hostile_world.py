@@ -213,7 +213,7 @@ def _write_facts(world: World, bait: Bait) -> list[str]:
         },
     }
     world.facts.write_text(json.dumps(facts))
-    return [*NEIGHBOUR.split("/"), incarnation.mark]
+    return [*NEIGHBOUR.split("/"), incarnation.incarnation_id]
 
 
 def _try_outside(world: World) -> dict[str, str]:

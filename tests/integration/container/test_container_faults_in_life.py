@@ -135,14 +135,17 @@ async def test_what_is_wanted_comes_to_life_again(stage: Stage, step: str, part:
     machine = stage.machine
     async with machine.engine(interrupt_timeout=0.2, terminate_timeout=0.2):
         await stage.reach(step)
-        mark = stage.incarnation.mark
+        incarnation_id = stage.incarnation.incarnation_id
         old = dict(machine.pids)
         os.kill(stage.pid_of(part), signal.SIGKILL)
         stage.go_on()
         if part != "fork server":
-            await until(lambda: machine.status(BOX).incarnation not in ("", mark), what="another life")  # type: ignore[union-attr]
+            await until(
+                lambda: machine.status(BOX).incarnation not in ("", incarnation_id),
+                what="another incarnation",
+            )  # type: ignore[union-attr]
             assert [pid for pid, start in old.items() if proc.alive(pid, start)] == []
-            assert not [path for path in machine.containers if path.name == mark]
+            assert not [path for path in machine.containers if path.name == incarnation_id]
         await until(lambda: machine.status(BOX).state is EndpointState.RUNNING)  # type: ignore[union-attr]
         assert len(machine.containers) == 1
 
@@ -197,8 +200,8 @@ async def test_nodes_and_their_fork_server_may_die_while_a_container_is_resized(
     machine = stage.machine
     async with machine.engine(interrupt_timeout=0.2, terminate_timeout=0.2):
         await stage.reach("resizing")
-        mark = stage.incarnation.mark
+        incarnation_id = stage.incarnation.incarnation_id
         os.kill(stage.pid_of("node fork server"), signal.SIGKILL)
         os.kill(stage.pid_of("node"), signal.SIGKILL)
         await machine.node_is(BOX, "node", NodeState.FAILED)
-        assert stage.incarnation.mark == mark
+        assert stage.incarnation.incarnation_id == incarnation_id

@@ -281,13 +281,13 @@ async def test_logs_outlive_their_container(machine: Machine) -> None:
         await until(lambda: machine.status(BOX).incarnation not in ("", first))
         await machine.log_holds(BOX, "node", "hello one")
         before = await read(machine, "node", previous=True)
-        assert (before.life, "hello one" in before.text) == (first, True)
+        assert (before.incarnation, "hello one" in before.text) == (first, True)
         assert before.ended > 0
         assert "its environment died" in before.reason
         machine.told.clear()
         await machine.drop(BOX)
         after = await read(machine, "node")
-        assert after.life not in ("", first)
+        assert after.incarnation not in ("", first)
         assert "hello one" in after.text
         assert after.text.endswith("-- ended: it was told to by SIGINT --\n")
         assert (await read(machine, "node", life=first)).text == before.text

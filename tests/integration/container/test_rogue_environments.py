@@ -34,10 +34,10 @@ def report(id_: str, *nodes: NodeStatus, revision: int = 1) -> bytes:
 class Rogue:
     """Plays the environment of a container whose manager is dead, for the manager that comes next."""
 
-    def __init__(self, machine: Machine, mark: str) -> None:
-        (path,) = (machine.folder / "run").glob(f"*/{mark}/control.sock")
+    def __init__(self, machine: Machine, incarnation_id: str) -> None:
+        (path,) = (machine.folder / "run").glob(f"*/{incarnation_id}/control.sock")
         path.rename(path.with_name("former.sock"))
-        self._mark = mark
+        self._mark = incarnation_id
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._listener.setblocking(False)
         self._listener.bind(str(path))
@@ -73,8 +73,8 @@ async def taken_over(machine: Machine, first: bytes) -> AsyncIterator[tuple[Rogu
     async with machine.managed():
         await machine.put(BOX)
         await machine.put(VICTIM)
-        mark, victim = [await mark_of(machine, id_) for id_ in (BOX, VICTIM)]
-    rogue = Rogue(machine, mark)
+        incarnation_id, victim = [await mark_of(machine, id_) for id_ in (BOX, VICTIM)]
+    rogue = Rogue(machine, incarnation_id)
     greeting = asyncio.create_task(rogue.greet(first))
     async with machine.engine():
         await greeting

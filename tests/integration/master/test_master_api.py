@@ -175,7 +175,7 @@ async def test_logs_are_followed_by_offset(site: Site) -> None:
         assert containers.asked[-1].query == LogQuery(
             streams=(LogStream.ROSOUT, LogStream.STDERR),
             level=LogLevel.WARN,
-            life="abc",
+            incarnation="abc",
             since=containers.asked[-1].query.since,
         )
         assert containers.asked[-1].query.since > 0

@@ -139,8 +139,8 @@ def test_a_cell_with_a_process_is_not_removed(tree: Tree2, monkeypatch: pytest.M
 def test_the_next_manager_adopts_and_sweeps_wherever_it_is_started(tree: Tree2) -> None:
     first = limiter(tree)
     first.sweep(())
-    for mark in ("m1", "m2"):
-        first.create(mark, LIMITS)
+    for incarnation_id in ("m1", "m2"):
+        first.create(incarnation_id, LIMITS)
     tree.make(tree.own / "rce-other")
     tree.make(tree.own / "rce-other" / "m3")
     before = tree.own
@@ -170,7 +170,7 @@ def test_a_container_without_a_cgroup_cannot_be_resized(tree: Tree2) -> None:
 
 def test_the_task_set_s_folder_is_there_while_it_has_containers(tree: Tree2) -> None:
     made = limiter(tree)
-    control_groups = [made.create(mark, LIMITS) for mark in ("m1", "m2")]
+    control_groups = [made.create(incarnation_id, LIMITS) for incarnation_id in ("m1", "m2")]
     for control_group in control_groups:
         assert (tree.own / "rce-t0").is_dir()
         control_group.remove()

@@ -24,11 +24,11 @@ def status(revision: int = 1, id_: str = ID) -> EndpointStatus:
     return EndpointStatus(id=id_, revision=revision, state=EndpointState.RUNNING)
 
 
-def running(mark: str = "one", revision: int = 1) -> ManagerCore:
+def running(incarnation_id: str = "one", revision: int = 1) -> ManagerCore:
     manager = ManagerCore()
     manager.handle(events.Put(spec(revision)), 0.0)
-    manager.handle(events.Made(ID, mark, ADDRESS), 0.0)
-    manager.handle(events.Reported(ID, mark, status(revision)), 0.0)
+    manager.handle(events.Made(ID, incarnation_id, ADDRESS), 0.0)
+    manager.handle(events.Reported(ID, incarnation_id, status(revision)), 0.0)
     return manager
 
 
@@ -82,11 +82,11 @@ def test_an_unexpected_end_is_told_and_mended_with_growing_pauses() -> None:
     manager = running()
     pauses = []
     faults = []
-    for number, mark in enumerate(("one", "two", "three", "four")):
-        out = manager.handle(events.Lost(ID, mark, "killed"), number + 1.0)
+    for number, incarnation_id in enumerate(("one", "two", "three", "four")):
+        out = manager.handle(events.Lost(ID, incarnation_id, "killed"), number + 1.0)
         faults += told(out, Fault)
         assert told(out, Status)[-1].status.state is EndpointState.FAILED
-        out = manager.handle(events.Removed(ID, mark), number + 1.0)
+        out = manager.handle(events.Removed(ID, incarnation_id), number + 1.0)
         (wait,) = (one for one in out if isinstance(one, events.Wait))
         pauses.append(wait.delay)
         assert manager.handle(events.Due(ID, wait.ticket - 1), 2.0) == []
@@ -101,9 +101,9 @@ def test_an_unexpected_end_is_told_and_mended_with_growing_pauses() -> None:
 
 def test_a_stable_container_is_mended_at_once_again() -> None:
     manager = running()
-    for mark, now in (("one", 1.0), ("two", 2.0 + core.STABLE_S)):
-        manager.handle(events.Lost(ID, mark, "killed"), now)
-        out = manager.handle(events.Removed(ID, mark), now)
+    for incarnation_id, now in (("one", 1.0), ("two", 2.0 + core.STABLE_S)):
+        manager.handle(events.Lost(ID, incarnation_id, "killed"), now)
+        out = manager.handle(events.Removed(ID, incarnation_id), now)
         (wait,) = (one for one in out if isinstance(one, events.Wait))
         assert wait.delay == 0.0
         manager.handle(events.Due(ID, wait.ticket), now)

@@ -1,4 +1,4 @@
-"""``rce logs``: what it asks for, and what it does when a container's life ends."""
+"""``rce logs``: what it asks for, and what it does when a container ends."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ async def test_an_earlier_life_says_how_it_ended(server: Server, capsys: pytest.
     captured = capsys.readouterr()
     assert captured.out == "first life"
     assert captured.err.count("out of memory") == 1
-    assert "life one ended" in captured.err
+    assert "incarnation one ended" in captured.err
 
 
 async def test_following_goes_on_with_the_next_life(
@@ -79,7 +79,7 @@ async def test_following_goes_on_with_the_next_life(
         await follow._logs("c/n", follow=True, offset=0, query={"stream": "stdout"})
     captured = capsys.readouterr()
     assert captured.out == "second lifethird life"
-    assert captured.err.count("-- the container's life two ended") == 1
+    assert captured.err.count("-- the container's incarnation two ended") == 1
 
 
 def test_options_become_a_query(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -68,12 +68,12 @@ async def test_a_container_is_read_where_it_is() -> None:
     cloud = Cloud(at="a", a=Machine("here"), b=Machine("there"))
     assert await cloud.read() == "here"
     assert not cloud.machines["b"].queries
-    await cloud.read(query=LogQuery(life="now"))
-    await cloud.read(query=LogQuery(life="former"))
+    await cloud.read(query=LogQuery(incarnation="now"))
+    await cloud.read(query=LogQuery(incarnation="former"))
     assert cloud.machines["a"].queries == [
         LogQuery(),
-        LogQuery(life="now"),
-        LogQuery(life="former", since=17.0),
+        LogQuery(incarnation="now"),
+        LogQuery(incarnation="former", since=17.0),
     ], "not what was there before its user"
     with pytest.raises(NotFound, match="has no node 'x'"):
         await cloud.read("x")
