@@ -3,7 +3,7 @@
 The library collects a frame in one buffer that grows, and copies it as a whole to take the mask off. At 60 MB
 each of the two holds the event loop for tens of milliseconds. Here the payload of a large frame is unmasked
 piece by piece, as it comes in, right into memory of its size. The parser gets an empty payload in its place;
-whoever handles the frame takes the real one from :meth:`Steps.take`.
+what handles the frame takes the real one from :meth:`Steps.take`.
 """
 
 from __future__ import annotations

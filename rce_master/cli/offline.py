@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from rce_master.store import Store
 
 OFFLINE = "offline"
-"""The address of whoever changed something here, in the audit log."""
+"""The address in the audit log for changes made on this machine."""
 
 StateDir = Annotated[
     Path | None,

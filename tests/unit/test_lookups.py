@@ -81,7 +81,7 @@ async def test_name_that_cannot_be_encoded_is_refused() -> None:
 
 
 async def test_names_without_an_answer_take_few_threads() -> None:
-    """Those that wait for a thread are looked up in order, and not at all if whoever asked went away."""
+    """Those that wait for a thread are looked up in order, and not at all if the asker went away."""
     names = Names()
     lookups = Lookups(2, names)
     tasks = await asking(lookups, names, "a", "b", "c", "d")
