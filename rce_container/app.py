@@ -45,7 +45,7 @@ from rce_container.runtimes.process import ProcessRuntime
 from rce_container.settings import ContainerSettings
 from rce_container.uids import UidPool
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 AUTO = "auto"
 RUNTIMES = (NamespaceRuntime.name, PodmanRuntime.name, ProcessRuntime.name)
@@ -122,7 +122,7 @@ class App:
         runtimes: dict[str, Runtime] = {one.name: one for one in (namespace, podman, ProcessRuntime())}
         runtime, detail = await asyncio.to_thread(choose_runtime, self.runtime, runtimes)
         if review := runtime.review(self.settings.packages):
-            log.warning("%s", review)
+            _log.warning("%s", review)
         detail = "; ".join(filter(None, (detail, review)))
         offers = await asyncio.to_thread(find_offers, runtime, runtimes.values())
         await asyncio.to_thread(_compile_engine)
@@ -219,7 +219,7 @@ def choose_runtime(requested: str, runtimes: dict[str, Runtime]) -> tuple[Runtim
             requested, f"there is no such runtime; use one of {', '.join((AUTO, *runtimes))}"
         )
     detail += _NOT_ISOLATED
-    log.warning("%s", detail)
+    _log.warning("%s", detail)
     return runtimes[ProcessRuntime.name], detail
 
 
@@ -267,7 +267,7 @@ class Quitting:
     def _on_renewal(self) -> None:
         if self.told.is_set() or self.renewal:  # an end that has begun continues
             return
-        log.info("starting anew; containers stay")
+        _log.info("starting anew; containers stay")
         self.renewal = True
         self._let_go()
 

@@ -23,7 +23,7 @@ from rce_container.logs import last_line
 from rce_container.trees import remove, size_of
 from rce_container.writing import write_whole
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 LOG_DAYS = 3.0
 LOG_SPACE = 1 << 30
@@ -95,7 +95,7 @@ class LogArchive:
         try:
             _write(folder, msgspec.structs.replace(record, ended=now, reason=reason))
         except OSError as error:
-            log.warning("how container %s ended cannot be noted: %s", id_, error)
+            _log.warning("how container %s ended cannot be noted: %s", id_, error)
 
     def find(self, incarnation_id: str) -> Kept | None:
         """The incarnation with an id, whosever it is. Looks at every container; see :meth:`get`."""

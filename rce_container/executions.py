@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rce.control.dialing import RunDialer
     from rce.control.messages import Execute
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 Start = Callable[[str, Command, socket.socket], None]
 """Hands a command and a socket to a container (by its endpoint id); raises ExecutionError."""
@@ -45,7 +45,7 @@ class Executions:
             async with self._dialer.dial(message.run) as master:
                 await self._join(message, master)
         except (OSError, TimeoutError, WebSocketException) as error:
-            log.warning("a command in %s is ended: %s", message.id, error)
+            _log.warning("a command in %s is ended: %s", message.id, error)
 
     async def _join(self, message: Execute, master: ClientConnection) -> None:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

@@ -44,7 +44,7 @@ from rce_container.packages.supply import Library, Supply
 from rce_container.runtimes.base import Handle
 from rce_container.settings import ContainerSettings
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _SHIM_TIMEOUT_S = 5.0
 """What the shim gets to remove the folders of a container that ended properly."""
@@ -133,7 +133,7 @@ class Incarnation:
         try:
             self.folder.note_revision(spec.revision)
         except StateError as error:
-            log.warning("container %s: %s", self.id, error)
+            _log.warning("container %s: %s", self.id, error)
         self._supply.want(spec.packages)
         if self._channel is not None:
             self._channel.send(m.encode(m.Apply(spec=spec)))
@@ -195,7 +195,7 @@ class Incarnation:
             if not self._stopping:
                 reason = self.enforcer.claim_all() or reason
                 reason += await asyncio.to_thread(self._last_words)
-                log.warning("container %s: %s", self.id, reason)
+                _log.warning("container %s: %s", self.id, reason)
             self._context.feed(events.Lost(self.id, self.incarnation_id, reason))
             await asyncio.to_thread(self._note_end, reason)
             await self._clean(_SHIM_TIMEOUT_S if self._stopping and not self._hurry else 0.0)
@@ -287,7 +287,7 @@ class Incarnation:
                 case m.Dial() as request:
                     self._errands.spawn(self._dial(channel, request), name=f"dial for {self.id}")
                 case Unknown(name=name):
-                    log.debug("%s: its environment sent a %s", self.id, intake.sanitize_text(name))
+                    _log.debug("%s: its environment sent a %s", self.id, intake.sanitize_text(name))
                 case message:
                     assert_never(message)
             if pause := pace.pause:
@@ -378,10 +378,10 @@ class Incarnation:
             await self.enforcer.end()
             await self.handle.kill()
         except KillError as error:
-            log.error("container %s: %s", self.id, error)  # noqa: TRY400 - its text says it all
+            _log.error("container %s: %s", self.id, error)
         await self._context.networks.detach(self.incarnation_id)
         await asyncio.to_thread(self.folder.remove)
         try:
             await self.enforcer.remove()
         except LimitError as error:
-            log.error("container %s: %s", self.id, error)  # noqa: TRY400 - its text says it all
+            _log.error("container %s: %s", self.id, error)

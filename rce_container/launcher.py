@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rce_container.runtimes.base import Runtime
     from rce_container.settings import ContainerSettings
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 ROS_PORT = 11311
 LOOPBACK = "127.0.0.1"
@@ -119,7 +119,7 @@ class Launcher:
             await asyncio.to_thread(control_group.kill)
             await asyncio.to_thread(control_group.remove)
         except ContainerError as error:
-            log.error("a container that did not start: %s", error)  # noqa: TRY400 - its text says it all
+            _log.error("a container that did not start: %s", error)
         await self._networks.detach(incarnation_id)
 
     def _runtime_for(self, resources: Resources) -> Runtime:

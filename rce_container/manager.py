@@ -66,7 +66,7 @@ if TYPE_CHECKING:
     from rce_container.runtimes.base import Runtime
     from rce_container.settings import ContainerSettings
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class Manager:
@@ -169,7 +169,7 @@ class Manager:
             case Execute(id=id_) if self._executions is not None:
                 self._tasks.create_task(self._executions.execute(message), name=f"command in {id_}")
             case Execute() | Notify() | Probe() | Welcome() | Refused() | LoginReply() | ClientReply():
-                log.debug("not for a container task set: %s", type(message).__name__)
+                _log.debug("not for a container task set: %s", type(message).__name__)
             case _:
                 assert_never(message)
 
@@ -236,7 +236,7 @@ class Manager:
             try:
                 self._networks.adopt(EndpointId.parse(record.id), record, folder.hosts)
             except NetworkError as error:
-                log.warning("container %s has lost its group: %s", record.id, error)
+                _log.warning("container %s has lost its group: %s", record.id, error)
         handle = runtime.adopt(process, record)
         control_group = self._limiter.adopt(folder.incarnation_id)
         incarnation = self._own(record.id, folder, handle, control_group, isolated=runtime.isolated)
@@ -248,10 +248,10 @@ class Manager:
             or incarnation.incarnation_id not in self._incarnations
             or record.id in self._core.containers
         ):
-            log.warning("container %s of an earlier manager does not answer; it is removed", record.id)
+            _log.warning("container %s of an earlier manager does not answer; it is removed", record.id)
             incarnation.kill()
             return
-        log.info("adopted container %s", record.id)
+        _log.info("adopted container %s", record.id)
         self._feed(events.Adopted(incarnation.incarnation_id, incarnation.status, self._address(folder)))
 
     async def _prune(self, folder: ContainerFolder) -> None:
@@ -282,7 +282,7 @@ class Manager:
         try:
             await asyncio.to_thread(self._limiter.sweep, keep)
         except (ContainerError, OSError) as error:
-            log.error("what earlier containers left cannot be removed: %s", error)  # noqa: TRY400
+            _log.error("what earlier containers left cannot be removed: %s", error)
 
     # What the core decides
 

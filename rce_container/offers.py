@@ -12,7 +12,7 @@ from rce_container.network import Networks
 from rce_container.runtimes.base import Runtime
 from rce_container.runtimes.podman import PodmanRuntime
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class Offers(NamedTuple):
@@ -41,7 +41,7 @@ def find_offers(runtime: Runtime, others: Iterable[Runtime]) -> Offers:
         try:
             other.probe()
         except RuntimeUnavailableError as error:
-            log.info("containers with an image cannot be made here: %s", error)
+            _log.info("containers with an image cannot be made here: %s", error)
             if other.is_installed:
                 details.append(str(error))
         else:

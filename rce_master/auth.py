@@ -15,7 +15,7 @@ from argon2 import PasswordHasher
 from argon2.exceptions import InvalidHashError, VerificationError
 
 from rce.guard.turns import CrowdedError, Turns
-from rce_master.exceptions import TooManyFailures, TooManyLogins, WrongCredentials
+from rce_master.exceptions import TooManyFailuresError, TooManyLoginsError, WrongCredentialsError
 from rce_master.state.records import KnownLogin
 from rce_master.throttle import MAX_DELAY_S, FailureThrottle
 
@@ -45,7 +45,7 @@ class _Check:
     """A password that is being looked at; all who come with the same one meanwhile wait for it together."""
 
     put_off: bool
-    result: asyncio.Task[bool | TooManyLogins]
+    result: asyncio.Task[bool | TooManyLoginsError]
     joined: int = 0
 
 
@@ -104,9 +104,9 @@ class Authenticator:
             address: Where it comes from.
 
         Raises:
-            WrongCredentials: The user is unknown or the password wrong.
-            TooManyFailures: Too many from this address were wrong lately.
-            TooManyLogins: Too many wait to be checked.
+            WrongCredentialsError: The user is unknown or the password wrong.
+            TooManyFailuresError: Too many from this address were wrong lately.
+            TooManyLoginsError: Too many wait to be checked.
         """
         user = self._tables.users.get(name)
         stored = user.password if user else self._nobody
@@ -114,10 +114,10 @@ class Authenticator:
         if not self._is_known(name, mark):
             right = await self._check(name, stored, digest, mark, address)
             if not right or user is None:
-                raise WrongCredentials("unknown user or wrong password")
+                raise WrongCredentialsError("unknown user or wrong password")
             await self._know(name, mark)
         if user is None or self._tables.users.get(name) != user:
-            raise WrongCredentials("unknown user or wrong password")
+            raise WrongCredentialsError("unknown user or wrong password")
         return user
 
     async def hash(self, digest: str, asker: str = "") -> str:
@@ -128,13 +128,13 @@ class Authenticator:
             asker: The user on whose behalf it is done.
 
         Raises:
-            TooManyLogins: Too many wait for the same.
+            TooManyLoginsError: Too many wait for the same.
         """
         try:
             async with self._turns.turn("", asker):
                 return await self._in_worker(self._hasher.hash, digest)
         except CrowdedError:
-            raise TooManyLogins from None
+            raise TooManyLoginsError from None
 
     async def know(self, name: str, stored: str, digest: str) -> None:
         """Know a password from now on that was just set: its first use waits for no turn.
@@ -159,7 +159,7 @@ class Authenticator:
             if check is None:
                 check = self._begin(name, stored, digest, mark, address)
             elif check.put_off and check.joined >= MAX_JOINED:
-                raise TooManyFailures(MAX_DELAY_S)
+                raise TooManyFailuresError(MAX_DELAY_S)
             own = not check.joined
             check.joined += 1
             # Not cancelled with the login that began it: others may wait for it.
@@ -178,7 +178,7 @@ class Authenticator:
 
     async def _look(
         self, name: str, stored: str, digest: str, address: str, delay: float
-    ) -> bool | TooManyLogins:
+    ) -> bool | TooManyLoginsError:
         if delay:
             with self._throttle.delaying(address, name):
                 await asyncio.sleep(delay)
@@ -190,7 +190,7 @@ class Authenticator:
                 right = await self._in_worker(self._compare, stored, digest)
         except CrowdedError:
             self._throttle.passed(address, name, self._clock())
-            return TooManyLogins()
+            return TooManyLoginsError()
         if right:
             self._throttle.passed(address, name, self._clock())
         return right

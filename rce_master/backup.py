@@ -104,7 +104,7 @@ def restore(file: Path, folders: Mapping[str, Path], *, replace: bool = False) -
         What the copy held, and the folders in which former state is now.
 
     Raises:
-        StoreBusy: A master runs on the folder.
+        StoreBusyError: A master runs on the folder.
         BackupError: It is not a whole copy, a newer program made it, or there is state already.
     """
     master = folders[MASTER]

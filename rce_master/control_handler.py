@@ -23,13 +23,13 @@ from rce.control.messages import (
 from rce_master import requests
 from rce_master.audit_words import describe
 from rce_master.exceptions import (
-    Forbidden,
+    ForbiddenError,
     MasterError,
-    Refused,
-    TooManyFailures,
-    TooManyLogins,
-    TooMuch,
-    WrongCredentials,
+    RefusedError,
+    TooManyFailuresError,
+    TooManyLoginsError,
+    TooMuchError,
+    WrongCredentialsError,
 )
 from rce_master.quotas import Quotas
 from rce_master.state import commands
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from rce_master.reconciler import Peer, Reconciler
     from rce_master.state_service import Outcome, StateService
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 MAX_PENDING = 1000
 """Requests in work at the same time; beyond it, the channels they come by wait."""
@@ -127,15 +127,15 @@ class ControlHandler:
     async def _guard(self, work: Coroutine[None, None, None]) -> None:
         try:
             await work
-        except Exception:
+        except Exception:  # noqa: BLE001 - logged
             # A fault of ours in one answer; its asker runs into a timeout, everybody else continues.
-            logger.exception("could not answer")
+            _log.exception("could not answer")
 
     # Logins
 
     def _take_login(self, peer: Peer, login: Login) -> None:
         if len(self._logins) >= MAX_LOGINS:
-            reason = str(TooManyLogins())
+            reason = str(TooManyLoginsError())
             peer.send(LoginReply(request=login.request, status=_UNAVAILABLE, reason=reason))
             return
         pending_login = _PendingLogin(peer.process, f"{login.user}/{login.robot}")
@@ -170,13 +170,13 @@ class ControlHandler:
         try:
             await self._state_service.submit(await self._admission(process, id_, login))
             return LoginReply(request=login.request, endpoint=self._state_service.spec(id_))
-        except WrongCredentials as error:
+        except WrongCredentialsError as error:
             status, reason = _UNAUTHORIZED, str(error)
-        except TooManyFailures as error:
+        except TooManyFailuresError as error:
             status, reason = _TOO_MANY, str(error)
-        except Forbidden as error:
+        except ForbiddenError as error:
             status, reason = _FORBIDDEN, str(error)
-        except Refused as error:
+        except RefusedError as error:
             status, reason = _CONFLICT, str(error)
             self._probe_previous(process, id_)
         except MasterError as error:
@@ -190,16 +190,18 @@ class ControlHandler:
 
         Raises:
             AuthError: It is not right, or cannot be checked now.
-            Forbidden: It is right, and not for this.
+            ForbiddenError: It is right, and not for this.
         """
         if not login.token:
             user = await self._authenticator.verify(login.user, login.password, login.address)
             return commands.RobotLogin(process=process, id=id_, password=user.password)
         user, token = self._tokens.find(login.token)
         if not token.robot:
-            raise Forbidden("this token is not for robots; make one for this robot: rce robot add ROBOT")
+            raise ForbiddenError("this token is not for robots; make one for this robot: rce robot add ROBOT")
         if (user.name, token.robot) != (login.user, login.robot):
-            raise Forbidden("this token is good for another robot; make one for this: rce robot add ROBOT")
+            raise ForbiddenError(
+                "this token is good for another robot; make one for this: rce robot add ROBOT"
+            )
         return commands.RobotLogin(process=process, id=id_, credential=token.digest)
 
     def _probe_previous(self, process: str, id_: str) -> None:
@@ -232,7 +234,7 @@ class ControlHandler:
             self._quotas.robot_request(
                 self._state_service.tables.users[user], requests.count_items(request.data)
             )
-        except TooMuch as error:
+        except TooMuchError as error:
             peer.send(ClientReply(request=request.request, errors=(f"{request.type}: {error}",)))
             return
         wanted, faults = requests.read(user, request.type, request.data)

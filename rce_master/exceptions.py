@@ -3,23 +3,23 @@
 ::
 
     MasterError
-    +-- Refused                 a request was not done; the text says what was wrong and how to mend it
-    |   +-- Invalid             it can never be done like this
-    |   +-- NotFound            it names something that is not there
-    |   +-- Conflict            it contradicts what is there
-    |   +-- LimitReached        there are too many already
-    |   +-- NoRoom              no machine, or not its own, has enough of what a container asks for
-    |   +-- Forbidden           this user may not do it
-    |   +-- Busy                too much of the kind is done just now
-    |   +-- TooMuch             this user asks too much at a time; wait
+    +-- RefusedError               a request was not done; the text says what was wrong and how to mend it
+    |   +-- InvalidRequestError    it can never be done like this
+    |   +-- NotFoundError          it names something that is not there
+    |   +-- ConflictError          it contradicts what is there
+    |   +-- LimitReachedError      there are too many already
+    |   +-- NoRoomError            no machine, or not its own, has enough of what a container asks for
+    |   +-- ForbiddenError         this user may not do it
+    |   +-- BusyError              too much of the kind is done just now
+    |   +-- TooMuchError           this user asks too much at a time; wait
     +-- AuthError
-    |   +-- WrongCredentials    unknown user, wrong password, unknown or expired token
-    |   +-- TooManyFailures     too many wrong passwords; wait
-    |   +-- TooManyLogins       too many people log in just now; wait
-    +-- TransitionError         an event that a life cycle does not allow in the present state
-    +-- StoreError              the store cannot be read or written
-    |   +-- StoreBusy           another process owns the state folder
-    +-- TaskSetAway             the task set that is to be asked is not there
+    |   +-- WrongCredentialsError  unknown user, wrong password, unknown or expired token
+    |   +-- TooManyFailuresError   too many wrong passwords; wait
+    |   +-- TooManyLoginsError     too many people log in just now; wait
+    +-- TransitionError            an event that a life cycle does not allow in the present state
+    +-- StoreError                 the store cannot be read or written
+    |   +-- StoreBusyError         another process owns the state folder
+    +-- TaskSetAwayError           the task set that is to be asked is not there
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class MasterError(Exception):
     """Base of all errors of the master."""
 
 
-class Refused(MasterError):  # noqa: N818
+class RefusedError(MasterError):
     """A request was not done and nothing was changed by it.
 
     Attributes:
@@ -43,49 +43,49 @@ class Refused(MasterError):  # noqa: N818
     status = 400
 
 
-class Invalid(Refused):
+class InvalidRequestError(RefusedError):
     """The request can never be done like this."""
 
     status = 422
 
 
-class NotFound(Refused):
+class NotFoundError(RefusedError):
     """The request names something that is not there."""
 
     status = 404
 
 
-class Conflict(Refused):
+class ConflictError(RefusedError):
     """The request contradicts what is there."""
 
     status = 409
 
 
-class LimitReached(Refused):
+class LimitReachedError(RefusedError):
     """There are too many of the kind already."""
 
     status = 409
 
 
-class NoRoom(Refused):
+class NoRoomError(RefusedError):
     """No machine, or not its own, has enough of what a container asks for."""
 
     status = 409
 
 
-class Forbidden(Refused):
+class ForbiddenError(RefusedError):
     """The user may not do it."""
 
     status = 403
 
 
-class Busy(Refused):
+class BusyError(RefusedError):
     """Too much of the kind is done just now."""
 
     status = 503
 
 
-class TooMuch(Refused):
+class TooMuchError(RefusedError):
     """A user asks too much at a time.
 
     Attributes:
@@ -103,11 +103,11 @@ class AuthError(MasterError):
     """Somebody could not prove who they are."""
 
 
-class WrongCredentials(AuthError):  # noqa: N818
+class WrongCredentialsError(AuthError):
     """Unknown user, wrong password, unknown or expired token: deliberately not told apart."""
 
 
-class TooManyFailures(AuthError):  # noqa: N818
+class TooManyFailuresError(AuthError):
     """Too many wrong passwords for this user from this address.
 
     Attributes:
@@ -125,7 +125,7 @@ class TooManyFailures(AuthError):  # noqa: N818
         )
 
 
-class TooManyLogins(AuthError):  # noqa: N818
+class TooManyLoginsError(AuthError):
     """Too many logins from this address wait to be checked."""
 
     def __str__(self) -> str:
@@ -140,9 +140,9 @@ class StoreError(MasterError):
     """The store cannot be read or written."""
 
 
-class StoreBusy(StoreError):  # noqa: N818
+class StoreBusyError(StoreError):
     """Another process owns the state folder."""
 
 
-class TaskSetAway(MasterError):  # noqa: N818
+class TaskSetAwayError(MasterError):
     """The task set that is to be asked is not connected, or did not answer in time."""

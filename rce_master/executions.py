@@ -12,7 +12,7 @@ from websockets.exceptions import ConnectionClosed
 
 from rce.control.execution import FEATURE
 from rce.control.messages import Execute
-from rce_master.exceptions import LimitReached, TaskSetAway
+from rce_master.exceptions import LimitReachedError, TaskSetAwayError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -53,17 +53,17 @@ class Executions:
             command: What to run.
 
         Raises:
-            LimitReached: The container's user runs too many commands already.
-            TaskSetAway: The task set cannot do it, or did not dial in time.
+            LimitReachedError: The container's user runs too many commands already.
+            TaskSetAwayError: The task set cannot do it, or did not dial in time.
         """
         tag = id_.partition("/")[2]
         if FEATURE not in peer.features:
-            raise TaskSetAway(
+            raise TaskSetAwayError(
                 f"the machine of container {tag!r} runs an earlier release, which runs no commands"
             )
         user = id_.partition("/")[0]
         if self._running[user] >= PER_USER:
-            raise LimitReached(f"user {user!r} runs {PER_USER} commands already; end one of them")
+            raise LimitReachedError(f"user {user!r} runs {PER_USER} commands already; end one of them")
         run = secrets.token_hex(16)
         waiting = self._waiting[run] = _Waiting()
         self._running[user] += 1
@@ -73,7 +73,7 @@ class Executions:
                 async with asyncio.timeout(DIAL_S):
                     socket = await waiting.arrived
             except TimeoutError as error:
-                raise TaskSetAway(f"the machine of container {tag!r} does not answer") from error
+                raise TaskSetAwayError(f"the machine of container {tag!r} does not answer") from error
             yield socket
         finally:
             waiting.finished.set()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rce.model.quantities import read_cores, read_memory
-from rce_master.exceptions import Invalid
+from rce_master.exceptions import InvalidRequestError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,7 +23,7 @@ def read_limit(kind: str, value: object) -> float | None:
         value: A number, or a text such as ``8G``.
 
     Raises:
-        Invalid: It is not an amount of this kind.
+        InvalidRequestError: It is not an amount of this kind.
 
     Example:
         >>> read_limit("containers", "16"), read_limit("memory", "default")
@@ -34,7 +34,7 @@ def read_limit(kind: str, value: object) -> float | None:
     try:
         return _READERS.get(kind, _count)(value)
     except ValueError as error:
-        raise Invalid(f"{kind}: {error}") from None
+        raise InvalidRequestError(f"{kind}: {error}") from None
 
 
 def _count(value: object) -> float:

@@ -12,7 +12,7 @@ from rce.control.exceptions import ControlError
 from rce.control.logs import LogQuery
 from rce.control.messages import LogChunk, TaskSetKind
 from rce.model.names import EndpointId, is_name
-from rce_master.exceptions import NotFound, TaskSetAway
+from rce_master.exceptions import NotFoundError, TaskSetAwayError
 from rce_master.state.records import Container
 from rce_master.state.tables import Tables
 
@@ -52,12 +52,14 @@ async def read_log(tables: Tables, peers: Mapping[str, LogReader], request: LogR
         request: What is to be read.
 
     Raises:
-        NotFound: There is no such container, node or log.
-        TaskSetAway: Its task set is not connected or does not answer.
+        NotFoundError: There is no such container, node or log.
+        TaskSetAwayError: Its task set is not connected or does not answer.
     """
     user, _, tag = request.id.partition("/")
     if not is_name(user) or not is_name(tag):
-        raise NotFound(f"there is no container {tag!r}: a name has letters, digits and '_', a letter first")
+        raise NotFoundError(
+            f"there is no container {tag!r}: a name has letters, digits and '_', a letter first"
+        )
     container = tables.container(request.id)
     if container is None or not _is_present(tables, request):
         query = msgspec.structs.replace(request.query, since=_owner_since(tables, request.id))
@@ -68,10 +70,10 @@ async def read_log(tables: Tables, peers: Mapping[str, LogReader], request: LogR
     if query.previous or query.incarnation:
         return await _read_earlier(tables, peers, request, container)
     if request.node and request.node not in container.nodes:
-        raise NotFound(f"container {container.tag!r} has no node {request.node!r}")
+        raise NotFoundError(f"container {container.tag!r} has no node {request.node!r}")
     chunk = await _ask(peers.get(container.task_set), request)
     if chunk.error:
-        raise NotFound(chunk.error)
+        raise NotFoundError(chunk.error)
     return chunk
 
 
@@ -99,7 +101,9 @@ async def _read_anywhere(tables: Tables, peers: Mapping[str, LogReader], request
         tag = EndpointId.parse(request.id).tag
         reasons = {answer.error for answer in answers if isinstance(answer, LogChunk)}
         text = next(iter(sorted(reasons)), "no machine is connected that could have its logs")
-        raise NotFound(f"there is no container {tag!r}" if tables.container(request.id) is None else text)
+        raise NotFoundError(
+            f"there is no container {tag!r}" if tables.container(request.id) is None else text
+        )
     return max(found, key=lambda chunk: chunk.ended or float("inf"))
 
 
@@ -109,7 +113,7 @@ def _chunks(answers: Iterable[LogChunk | BaseException]) -> list[LogChunk]:
         if isinstance(answer, LogChunk):
             if not answer.error:
                 found.append(answer)
-        elif not isinstance(answer, TaskSetAway):
+        elif not isinstance(answer, TaskSetAwayError):
             raise answer
     return found
 
@@ -117,13 +121,13 @@ def _chunks(answers: Iterable[LogChunk | BaseException]) -> list[LogChunk]:
 async def _ask(peer: LogReader | None, request: LogRequest) -> LogChunk:
     tag = EndpointId.parse(request.id).tag
     if peer is None:
-        raise TaskSetAway(f"container {tag!r} cannot be reached now")
+        raise TaskSetAwayError(f"container {tag!r} cannot be reached now")
     try:
         return await peer.read_log(
             request.id, request.node, offset=request.offset, limit=request.limit, query=request.query
         )
     except ControlError as error:
-        raise TaskSetAway(f"container {tag!r} cannot be reached: {error}") from error
+        raise TaskSetAwayError(f"container {tag!r} cannot be reached: {error}") from error
 
 
 def _is_present(tables: Tables, request: LogRequest) -> bool:

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from rce_master.state.changes import Changes
     from rce_master.store import Store
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 TICK_S = 0.5
 _ACCESS = ("users", "tokens")
@@ -96,7 +96,7 @@ class Master:
         """
         state_service = await StateService.open(self._store, self._settings.state)
         if not self._settings.dev and not len(state_service.tables.users):
-            logger.warning(
+            _log.warning(
                 "there are no users, so no one can log in: stop this program and run"
                 " `rce user add NAME --admin --state-dir %s`",
                 self._settings.state_dir,
@@ -180,7 +180,7 @@ class Master:
         if for_clients is None or for_task_sets is None:
             what = "passwords travel" if for_clients is None else "what task sets tell each other travels"
             if text := plain_warning(what, settings.bind):
-                logger.warning("%s", text)
+                _log.warning("%s", text)
         async with AsyncExitStack() as stack:
             try:
                 await stack.enter_async_context(control)
@@ -210,7 +210,7 @@ async def _tick(state_service: StateService, audit: AuditLog) -> None:
         audit.flush()
         (outcome,) = await state_service.submit_all([commands.Tick()])
         if outcome is not None:
-            logger.error("grace times were not looked at: %s", outcome)
+            _log.error("grace times were not looked at: %s", outcome)
 
 
 def _log_events(events: EventLog, changes: Changes) -> None:
@@ -219,4 +219,4 @@ def _log_events(events: EventLog, changes: Changes) -> None:
         events.wake()
     for state_event in changes.events:
         events.add(state_event, now)
-        logger.info("%s %s %s", state_event.kind, state_event.subject, state_event.text)
+        _log.info("%s %s %s", state_event.kind, state_event.subject, state_event.text)

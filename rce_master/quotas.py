@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from rce.guard.rates import Rates
 from rce.guard.turns import CrowdedError, Turns
-from rce_master.exceptions import TooMuch
+from rce_master.exceptions import TooMuchError
 from rce_master.state.records import UserRole
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ class Quotas:
         """Count a request over REST.
 
         Raises:
-            TooMuch: There were too many.
+            TooMuchError: There were too many.
         """
         self._take(self._rest, user, 1)
 
@@ -77,7 +77,7 @@ class Quotas:
             items: How many nodes, interfaces, ... it is about.
 
         Raises:
-            TooMuch: There were too many.
+            TooMuchError: There were too many.
         """
         self._take(self._robots, user, 1 + items // ITEMS_PER_REQUEST)
 
@@ -86,11 +86,11 @@ class Quotas:
         """Count a stream for as long as the context lasts.
 
         Raises:
-            TooMuch: There are too many.
+            TooMuchError: There are too many.
         """
         most = self._settings.streams
         if most and user.role is not UserRole.ADMIN and self._streams[user.name] >= most:
-            raise TooMuch(
+            raise TooMuchError(
                 f"you follow {most} streams of events or usage already, and may not follow more; end one", 1
             )
         self._streams[user.name] += 1
@@ -106,13 +106,13 @@ class Quotas:
         """Wait until a user may read of a log.
 
         Raises:
-            TooMuch: Too many of the user's reads wait.
+            TooMuchError: Too many of the user's reads wait.
         """
         turn = self._reads.turn(user.name)
         try:
             await turn.__aenter__()
         except CrowdedError:
-            raise TooMuch(
+            raise TooMuchError(
                 "too many of your reads of logs wait already; read one after the other", 1
             ) from None
         try:
@@ -131,7 +131,7 @@ class Quotas:
             return
         wait = rates.take(user.name, self._clock(), cost)
         if wait:
-            raise TooMuch(
+            raise TooMuchError(
                 f"too many requests: you may make {self._settings.requests:g} a second; "
                 f"try again in {math.ceil(wait)} s",
                 wait,

@@ -25,7 +25,7 @@ from rce.control.messages import (
     ToTaskSet,
     Usage,
 )
-from rce_master.exceptions import NotFound, Refused, TaskSetAway
+from rce_master.exceptions import NotFoundError, RefusedError, TaskSetAwayError
 from rce_master.logs import LogReader, LogRequest, read_log
 from rce_master.state import commands
 from rce_master.state.lifecycle import RobotSession
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from rce_master.state.changes import Changes, Notice
     from rce_master.state_service import StateService
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class Peer(LogReader, Protocol):
@@ -84,7 +84,7 @@ class Reconciler:
         self._arriving[peer.process] = peer
         try:
             await self._state_service.submit(commands.TaskSetArrived(hello=hello))
-        except Refused as error:
+        except RefusedError as error:
             raise PeerRefusedError(str(error)) from error
         finally:
             self._arriving.pop(peer.process, None)
@@ -106,7 +106,7 @@ class Reconciler:
                 self.book.note(process, message, placed)
                 return
             case Hello() | Login() | ClientRequest() | LogChunk():
-                logger.warning("%s sent a %s, which means nothing here", process, type(message).__name__)
+                _log.warning("%s sent a %s, which means nothing here", process, type(message).__name__)
                 return
             case _:
                 assert_never(message)
@@ -130,8 +130,8 @@ class Reconciler:
         """Read the log of a container's node where it is (:func:`rce_master.logs.read_log`).
 
         Raises:
-            NotFound: There is no such container, node or log.
-            TaskSetAway: Its task set is not connected or does not answer.
+            NotFoundError: There is no such container, node or log.
+            TaskSetAwayError: Its task set is not connected or does not answer.
         """
         request = LogRequest(id_, node, offset, limit, query)
         return await read_log(self._state_service.tables, self._peers, request)
@@ -140,16 +140,16 @@ class Reconciler:
         """Return the connected task set of a container.
 
         Raises:
-            NotFound: There is no such container.
-            TaskSetAway: Its task set is not connected, or it waits for a machine.
+            NotFoundError: There is no such container.
+            TaskSetAwayError: Its task set is not connected, or it waits for a machine.
         """
         container = self._state_service.tables.container(id_)
         tag = id_.partition("/")[2]
         if container is None:
-            raise NotFound(f"there is no container {tag!r}")
+            raise NotFoundError(f"there is no container {tag!r}")
         peer = self._peers.get(container.task_set)
         if peer is None:
-            raise TaskSetAway(f"container {tag!r} cannot be reached now")
+            raise TaskSetAwayError(f"container {tag!r} cannot be reached now")
         return peer
 
     @property

@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rce_master.exceptions import MasterError, Refused, StoreError
+from rce_master.exceptions import MasterError, RefusedError, StoreError
 from rce_master.state.changes import make_row
 from rce_master.state.core import State
 from rce_master.state.migration import conversion
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rce_master.state.tables import Tables
     from rce_master.store import Snapshot, Store
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 MAX_WAITING = 10_000
 MAX_BATCH = 256
@@ -119,7 +119,7 @@ class StateService:
         """Do a command; returns when it is stored and everybody was told.
 
         Raises:
-            Refused: It cannot be done; nothing changed.
+            RefusedError: It cannot be done; nothing changed.
             StoreError: It cannot be stored; nothing changed.
         """
         (outcome,) = await self.submit_all([command])
@@ -186,7 +186,7 @@ class StateService:
     async def _stand_alone(self, jobs: list[_Job], error: StoreError) -> None:
         """Do jobs one by one after their common transaction failed: reports need no store."""
         if len(jobs) == 1:
-            logger.error("%s", error)
+            _log.error("%s", error)
             self._answer(jobs, error)
             return
         for job in jobs:
@@ -195,11 +195,11 @@ class StateService:
     def _apply(self, command: Command, done: list[Changes]) -> Outcome:
         try:
             done.append(self.state.apply(command, self._clock()))
-        except Refused as error:
+        except RefusedError as error:
             return error
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001 - logged
             # A fault of ours in one command must not take the whole cloud down; nothing of it was applied.
-            logger.exception("could not apply %r", command)
+            _log.exception("could not apply %r", command)
             return MasterError(f"internal error: {error!r}")
         return None
 
@@ -220,7 +220,7 @@ async def load_converted(store: Store) -> Snapshot:
     rows = conversion(snapshot)
     if not rows:
         return snapshot
-    logger.info("converting the store of an earlier release: %d records", len(rows))
+    _log.info("converting the store of an earlier release: %d records", len(rows))
     await store.save(rows)
     return await store.load()
 

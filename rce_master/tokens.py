@@ -8,7 +8,7 @@ import secrets
 import time
 from typing import TYPE_CHECKING, Protocol
 
-from rce_master.exceptions import WrongCredentials
+from rce_master.exceptions import WrongCredentialsError
 from rce_master.state import commands
 from rce_master.state.records import Token
 
@@ -78,13 +78,13 @@ class Tokens:
         """Return whose token it is, and what is kept of it.
 
         Raises:
-            WrongCredentials: It is unknown, expired or was revoked.
+            WrongCredentialsError: It is unknown, expired or was revoked.
         """
         now = self._clock()
         record = self._tables.tokens.get(token_digest(token))
         user = self._tables.users.get(record.user) if record else None
         if record is None or user is None or record.is_expired(now):
-            raise WrongCredentials("unknown or expired token; log in again")
+            raise WrongCredentialsError("unknown or expired token; log in again")
         self._used[record.digest] = now
         return user, record
 

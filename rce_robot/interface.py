@@ -74,7 +74,7 @@ class RobotSide(Protocol):
         """Count bytes that are held outside all queues; see :class:`rce.guard.holdings.Holdings`."""
 
     async def convert(self, job: Job, parts: Sequence[Buffer]) -> tuple[Result, list[memoryview]]:
-        """Have a conversion done in another process; raises :class:`ConversionFailed`."""
+        """Have a conversion done in another process; raises :class:`ConversionFailedError`."""
 
     def await_binaries(self, large: LargeData, ids: Sequence[str]) -> None:
         """Have a large message come again when the binary values that it refers to are there."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
-from rce_robot.conversion import ConversionFailed, ReadText, ReadValue, Show
+from rce_robot.conversion import ConversionFailedError, ReadText, ReadValue, Show
 from rce_robot.exceptions import UnreadableError
 from rce_robot.outgoing import Outgoing
 
@@ -73,7 +73,7 @@ class Offload:
         job = Show(i_tag=spec.tag, message_type=spec.message_type, interface_type=spec.type, msg_id=msg_id)
         try:
             result, parts = await self._robot.convert(job, (payload,))
-        except ConversionFailed as error:
+        except ConversionFailedError as error:
             raise UnreadableError(str(error)) from error
         if result.fault:
             raise UnreadableError(result.fault)
@@ -83,7 +83,7 @@ class Offload:
     async def _read(self, job: ReadText | ReadValue, parts: Sequence[Buffer]) -> Read:
         try:
             result, payload = await self._robot.convert(job, parts)
-        except ConversionFailed as error:
+        except ConversionFailedError as error:
             return Read(fault=str(error))
         return _understood(result, payload)
 

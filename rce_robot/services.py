@@ -7,7 +7,7 @@ import contextlib
 import logging
 from typing import TYPE_CHECKING, Any
 
-from rce.link import CallError, CallTimeout, Overloaded, PeerFault, PeerLost
+from rce.link import CallError, CallTimeoutError, OverloadedError, PeerFaultError, PeerLostError
 from rce_robot.exceptions import BusyError, MisdirectedError, UnreadableError
 from rce_robot.interface import RobotInterface
 from rce_robot.offload import Read, pack_value
@@ -118,19 +118,19 @@ class AnsweredByRobot(RobotInterface):
             CallError: It is away, leaves, is busy, answers with a fault or not in time.
         """
         if not self.robot.connected:
-            raise PeerLost("the robot is not connected")
+            raise PeerLostError("the robot is not connected")
         msg_id = fresh_id()
         answer: asyncio.Future[Buffer] = asyncio.get_running_loop().create_future()
         self._calls[msg_id] = answer
         try:
             async with asyncio.timeout(self._timeout):
                 if not await self._send_service(payload, msg_id):
-                    raise Overloaded("too much waits to be sent to the robot")
+                    raise OverloadedError("too much waits to be sent to the robot")
                 return await answer
         except UnreadableError as error:
-            raise PeerFault(str(error)) from error
+            raise PeerFaultError(str(error)) from error
         except TimeoutError as error:
-            raise CallTimeout(f"the robot did not answer within {self._timeout:g} s") from error
+            raise CallTimeoutError(f"the robot did not answer within {self._timeout:g} s") from error
         finally:
             del self._calls[msg_id]
             del answer  # its error refers to this frame, and so to the request, until the collector comes
@@ -141,7 +141,7 @@ class AnsweredByRobot(RobotInterface):
         if answer is None or answer.done():
             raise MisdirectedError(f"{self._name(message.msg_id)}: no call waits for this answer")
         if isinstance(message.msg, str):
-            answer.set_exception(PeerFault(message.msg))
+            answer.set_exception(PeerFaultError(message.msg))
             return
         if self.form_in.costly:
             packed = pack_value(message.msg)
@@ -150,7 +150,7 @@ class AnsweredByRobot(RobotInterface):
         try:
             answer.set_result(self._read(message, self._warn))
         except UnreadableError as error:
-            answer.set_exception(PeerFault(f"the robot's answer cannot be read: {error}"))
+            answer.set_exception(PeerFaultError(f"the robot's answer cannot be read: {error}"))
             raise
 
     def take_large(self, large: LargeData) -> None:
@@ -179,9 +179,9 @@ class AnsweredByRobot(RobotInterface):
         if read.payload is not None:
             answer.set_result(read.payload)
         elif read.text is not None:
-            answer.set_exception(PeerFault(read.text))
+            answer.set_exception(PeerFaultError(read.text))
         else:
-            answer.set_exception(PeerFault(f"the robot's answer cannot be read: {read.fault}"))
+            answer.set_exception(PeerFaultError(f"the robot's answer cannot be read: {read.fault}"))
             self.robot.report(f"{self._name(msg_id)}: {read.fault}")
 
     def refused(self, msg_id: str, problem: str) -> None:
@@ -190,13 +190,13 @@ class AnsweredByRobot(RobotInterface):
 
     def robot_left(self) -> None:
         """Fail the calls that wait."""
-        self._fail_all(PeerLost("the robot's connection ended before it answered"))
+        self._fail_all(PeerLostError("the robot's connection ended before it answered"))
 
     def not_rendered(self, msg_id: str, problem: str) -> None:
         """Fail the call; the robot did not ask for it and need not know."""
         answer = self._calls.get(msg_id)
         if answer is not None and not answer.done():
-            answer.set_exception(PeerFault(problem))
+            answer.set_exception(PeerFaultError(problem))
 
     def _fail_all(self, error: CallError) -> None:
         for answer in self._calls.values():

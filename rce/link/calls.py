@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from rce.aio.tasks import BackgroundTasks
 from rce.guard.holdings import Holdings
-from rce.link.exceptions import NotConnected, Overloaded
+from rce.link.exceptions import NotConnectedError, OverloadedError
 from rce.link.frames import MAX_ID
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rce.link.interface import Buffer
     from rce.link.settings import LinkLimits
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class PendingCalls:
@@ -41,10 +41,10 @@ class PendingCalls:
             Its id and its answer.
 
         Raises:
-            Overloaded: Too many calls have no answer.
+            OverloadedError: Too many calls have no answer.
         """
         if len(self._answers) >= self._max_calls:
-            raise Overloaded(f"{len(self._answers)} calls have no answer yet")
+            raise OverloadedError(f"{len(self._answers)} calls have no answer yet")
         self._last = self._last % MAX_ID + 1
         while self._last in self._answers:
             self._last = self._last % MAX_ID + 1
@@ -104,17 +104,17 @@ class CallServer:
         """Serve a request, now or when its turn comes.
 
         Raises:
-            NotConnected: The interface is closed.
-            Overloaded: Too many requests wait.
+            NotConnectedError: The interface is closed.
+            OverloadedError: Too many requests wait.
         """
         if self._closed:
-            raise NotConnected
+            raise NotConnectedError
         if len(self._scope) < self._limits.serving:
             self._begin(channel, call_id, payload)
         elif len(self._waiting) < self._limits.waiting:
             self._waiting.append((channel, call_id, payload))
         else:
-            raise Overloaded(f"{len(self._waiting)} requests wait to be served")
+            raise OverloadedError(f"{len(self._waiting)} requests wait to be served")
         key = channel, call_id
         holding = self._holdings.hold(len(payload), lambda: self._give_up(*key))
         if self.has(*key):
@@ -158,8 +158,8 @@ class CallServer:
     async def _run(self, channel: Channel, call_id: int, payload: bytes) -> None:
         try:
             answer = await self._serve(payload)
-        except Exception as error:
-            log.debug("%s: request failed", self._name, exc_info=True)
+        except Exception as error:  # noqa: BLE001 - logged
+            _log.debug("%s: request failed", self._name, exc_info=True)
             if self._finish(channel, call_id):
                 channel.fault(call_id, error)
         else:
@@ -180,7 +180,7 @@ class CallServer:
         """Answer a request with a fault, because memory is short."""
         if self.has(channel, call_id):
             self.cancel(channel, call_id)
-            channel.fault(call_id, Overloaded("memory is short; the request was given up"))
+            channel.fault(call_id, OverloadedError("memory is short; the request was given up"))
 
     def _next(self, _ended: asyncio.Task[None]) -> None:
         while self._waiting and len(self._scope) < self._limits.serving and not self._closed:

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from typing import TYPE_CHECKING, Protocol
 
-from rce.link.exceptions import LinkLost, ProtocolError
+from rce.link.exceptions import LinkLostError, ProtocolError
 from rce.link.handshake import FEATURES
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ class Carrier(ABC):
         """Send a message of a channel, after those that wait in its queue. Ignored when the carrier ended.
 
         Raises:
-            Overloaded: The queue is full and its policy is to refuse.
+            OverloadedError: The queue is full and its policy is to refuse.
         """
 
     @abstractmethod
@@ -203,7 +203,7 @@ class LocalCarrier(Carrier):
 
     def _lose(self) -> None:
         if self._end() is not None and self._handler is not None:
-            self._handler.carrier_lost(self, LinkLost("the peer ended the link"))
+            self._handler.carrier_lost(self, LinkLostError("the peer ended the link"))
 
     def _take(self, frame: Frame) -> None:
         if not self._closed.done():

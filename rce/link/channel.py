@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, assert_never
 from rce.aio.queues import OverflowPolicy
 from rce.link.calls import PendingCalls
 from rce.link.exceptions import (
-    CallTimeout,
-    MessageTooLarge,
-    NotConnected,
-    Overloaded,
-    PeerFault,
-    PeerLost,
+    CallTimeoutError,
+    MessageTooLargeError,
+    NotConnectedError,
+    OverloadedError,
+    PeerFaultError,
+    PeerLostError,
     ProtocolError,
 )
 from rce.link.frames import LATCHED, OVERLOADED, Frame, FrameType, encode_sources, parse_sources
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from rce.link.queues import Backlog
     from rce.link.slot import InterfaceSlot
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _MAX_FAULT = 4096
 """Longest fault text that is sent, in bytes."""
@@ -105,7 +105,7 @@ class Channel:
                 self.link.carrier.clear(self._queue)
             self._queue.clear()
             self._queue = self._new_queue()
-            self._calls.fail_all(lambda: PeerLost("the connection was lost"))
+            self._calls.fail_all(lambda: PeerLostError("the connection was lost"))
         self.slot.channel_changed(self)
 
     def _new_queue(self) -> OutgoingQueue:
@@ -144,19 +144,19 @@ class Channel:
         """Send a request and wait ``deadline`` seconds for its answer. Raises as :meth:`Port.call`."""
         carrier = self.link.carrier
         if not self.established or carrier is None:
-            raise NotConnected
+            raise NotConnectedError
         call_id, answer = self._calls.add()
         queue = self._queue
         try:
             carrier.send(queue, Frame(FrameType.CALL, self.number, call_id, 0, payload))
-        except Overloaded:
+        except OverloadedError:
             self._calls.drop(call_id)
             raise
         try:
             async with asyncio.timeout(deadline):
                 return await answer
         except TimeoutError as error:
-            raise CallTimeout(f"no answer in {deadline:g} s") from error
+            raise CallTimeoutError(f"no answer in {deadline:g} s") from error
         finally:
             if self._calls.drop(call_id) and not carrier.withdraw(queue, call_id):
                 carrier.control(Frame(FrameType.CANCEL, self.number, call_id))
@@ -170,7 +170,7 @@ class Channel:
         try:
             payload = as_payload(answer, self._limits.max_message)
             carrier.send(self._queue, Frame(FrameType.REPLY, self.number, call_id, 0, payload))
-        except (TypeError, MessageTooLarge, Overloaded) as error:
+        except (TypeError, MessageTooLargeError, OverloadedError) as error:
             self.fault(call_id, error)
 
     def fault(self, call_id: int, error: Exception) -> None:
@@ -178,7 +178,7 @@ class Channel:
         carrier = self.link.carrier
         if carrier is not None:
             text = (str(error) or type(error).__name__).encode(errors="replace")[:_MAX_FAULT]
-            flags = OVERLOADED if isinstance(error, Overloaded) else 0
+            flags = OVERLOADED if isinstance(error, OverloadedError) else 0
             carrier.control(Frame(FrameType.FAULT, self.number, call_id, flags, text))
 
     # Receiving
@@ -205,7 +205,7 @@ class Channel:
             case FrameType.FAULT:
                 text = payload.decode(errors="replace")
                 overloaded = frame.flags & OVERLOADED
-                self._calls.fail(frame.id, Overloaded(text) if overloaded else PeerFault(text))
+                self._calls.fail(frame.id, OverloadedError(text) if overloaded else PeerFaultError(text))
             case FrameType.CANCEL:
                 if self.slot.server is not None:
                     self.slot.server.cancel(self, frame.id)
@@ -236,9 +236,9 @@ class Channel:
             case FrameType.DATA:
                 self.slot.message_dropped(self, frame.id if frame.flags & LATCHED else None)
             case FrameType.CALL:
-                self.fault(frame.id, Overloaded("the request was dropped: memory is short"))
+                self.fault(frame.id, OverloadedError("the request was dropped: memory is short"))
             case FrameType.REPLY:
-                self._calls.fail(frame.id, Overloaded("the answer was dropped: memory is short"))
+                self._calls.fail(frame.id, OverloadedError("the answer was dropped: memory is short"))
             case _:
                 raise AssertionError(f"{frame.type.name} never comes in parts")
 
@@ -252,7 +252,7 @@ class Channel:
         self.slot.counters.count_in(len(payload))
         try:
             server.accept(self, call_id, payload)
-        except (Overloaded, NotConnected) as error:
+        except (OverloadedError, NotConnectedError) as error:
             self.fault(call_id, error)
 
 
@@ -260,10 +260,10 @@ def as_payload(buffer: Buffer, limit: int) -> bytes | memoryview:
     """Return a payload as the frames need it: its length in bytes, and small enough.
 
     Raises:
-        MessageTooLarge: It is larger than ``limit`` bytes.
+        MessageTooLargeError: It is larger than ``limit`` bytes.
         TypeError: It is not a buffer.
     """
     payload = buffer if isinstance(buffer, bytes) else memoryview(buffer).cast("B")
     if len(payload) > limit:
-        raise MessageTooLarge(len(payload), limit)
+        raise MessageTooLargeError(len(payload), limit)
     return payload

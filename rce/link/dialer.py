@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rce.link.hub import LinkHub
     from rce.link.link import Link
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _LONG_ENOUGH = 1.0
 """A connection that lasted so many seconds was a good one: the next pause is a short one."""
@@ -27,7 +27,7 @@ async def keep_dialed(link: Link, hub: LinkHub) -> None:
         try:
             carrier = await hub.connect(link.spec)
         except (OSError, LinkError) as error:
-            log.debug("link %s to %s: %s", link.spec.id, link.spec.peer, error)
+            _log.debug("link %s to %s: %s", link.spec.id, link.spec.peer, error)
         else:
             link.attach(carrier)
             await carrier.wait_closed()

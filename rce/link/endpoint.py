@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from rce.model.names import EndpointId
     from rce.model.specs import InterfaceSpec
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class Endpoint:
@@ -234,8 +234,8 @@ class Endpoint:
                 await slot.close()
         except TimeoutError:
             slot.fail(TimeoutError("takes too long to close"))
-        except Exception as error:
-            log.debug("endpoint %s: interface %s did not close well", self.id, slot.spec.tag, exc_info=True)
+        except Exception as error:  # noqa: BLE001 - logged
+            _log.debug("endpoint %s: interface %s did not close well", self.id, slot.spec.tag, exc_info=True)
             slot.fail(error)
 
     # Adding
@@ -291,8 +291,8 @@ class Endpoint:
                 holdings=self._holdings,
             )
             slot.make(self._factory)
-        except Exception as error:
-            log.debug("endpoint %s: interface %s cannot be made", self.id, spec.tag, exc_info=True)
+        except Exception as error:  # noqa: BLE001 - logged
+            _log.debug("endpoint %s: interface %s cannot be made", self.id, spec.tag, exc_info=True)
             self._refuse(spec, f"interface {spec.tag}: {error}")
             return
         self._slots[spec.tag] = slot

@@ -21,15 +21,15 @@ from typing import TYPE_CHECKING
 
 from rce.aio.tasks import BackgroundTasks
 from rce.guard.lobby import Lobby, address_of
-from rce.link.exceptions import LinkError, LinkRefused
+from rce.link.exceptions import LinkError, LinkRefusedError
 from rce.link.frames import HANDSHAKE_SIZE, HEADER_SIZE, Frame, FrameType, encode
-from rce.link.opening import LinkSender, PlainLinkRefused, read_hello
+from rce.link.opening import LinkSender, PlainLinkRefusedError, read_hello
 from rce.link.settings import LinkLimits, LinkTimeouts
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _BUSY_PAUSE = 0.1
 """Seconds to wait after the system refused to accept, for want of file descriptors for example."""
@@ -122,7 +122,7 @@ class HandoverReceiver:
             except BlockingIOError:
                 return
             except OSError as error:
-                log.debug("handover ended: %s", error)
+                _log.debug("handover ended: %s", error)
                 received, descriptors = b"", []
             if not received:
                 self._stop()
@@ -135,7 +135,7 @@ class HandoverReceiver:
         try:
             await self._adopt(socket.socket(fileno=descriptor), received)
         except (OSError, ValueError) as error:
-            log.info("a handed-over connection is of no use: %s", error)
+            _log.info("a handed-over connection is of no use: %s", error)
 
 
 def _resolve(ready: asyncio.Future[None]) -> None:
@@ -238,7 +238,7 @@ class LinkAcceptor:
             try:
                 connection, peer = await loop.sock_accept(sock)
             except OSError as error:
-                log.warning("cannot accept a link: %s", error)
+                _log.warning("cannot accept a link: %s", error)
                 await asyncio.sleep(_BUSY_PAUSE)
                 continue
             self._scope.spawn(self._receive(connection, address_of(peer)), name="link to hand over")
@@ -260,16 +260,18 @@ class LinkAcceptor:
             async with asyncio.timeout(self._timeouts.handshake):
                 received = await read_hello(connection, self._limits)
                 if self._tls and not received.secure:
-                    raise PlainLinkRefused(received.link)
+                    raise PlainLinkRefusedError(received.link)
                 sender = await self._find(received.link)
                 await sender.send(connection, received.data)
-        except LinkRefused as error:
-            log.warning("link refused: %s", error)
-            why = error.for_peer if isinstance(error, PlainLinkRefused) else b"unknown link or wrong token"
+        except LinkRefusedError as error:
+            _log.warning("link refused: %s", error)
+            why = (
+                error.for_peer if isinstance(error, PlainLinkRefusedError) else b"unknown link or wrong token"
+            )
             with contextlib.suppress(OSError):
                 connection.send(encode(Frame(FrameType.REFUSE, payload=why)))
         except (LinkError, OSError) as error:
-            log.info("a link was not handed over: %s", str(error) or type(error).__name__)
+            _log.info("a link was not handed over: %s", str(error) or type(error).__name__)
 
     async def _find(self, link: str) -> LinkSender:
         """Return who takes a link; the news of it may still be on its way."""
@@ -280,4 +282,4 @@ class LinkAcceptor:
                 await self._assigned.wait_for(lambda: link in self._routes)
                 return self._routes[link]
         except TimeoutError as error:
-            raise LinkRefused(f"unknown link {link!r}") from error
+            raise LinkRefusedError(f"unknown link {link!r}") from error

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from rce.link.exceptions import LinkRefused, ProtocolError
+from rce.link.exceptions import LinkRefusedError, ProtocolError
 from rce.link.frames import VERSION, Frame, FrameType, encode
 
 
@@ -90,11 +90,11 @@ def check_answer(frame: Frame) -> frozenset[str]:
         The features that it knows.
 
     Raises:
-        LinkRefused: It does not want the link.
+        LinkRefusedError: It does not want the link.
         ProtocolError: It is no answer.
     """
     if frame.type is FrameType.REFUSE:
-        raise LinkRefused(bytes(frame.payload).decode(errors="replace"))
+        raise LinkRefusedError(bytes(frame.payload).decode(errors="replace"))
     if frame.type is not FrameType.WELCOME:
         raise ProtocolError(f"HELLO was answered by {frame.type.name}")
     if not frame.payload:

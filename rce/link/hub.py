@@ -14,7 +14,7 @@ from rce.aio.tasks import BackgroundTasks
 from rce.dialing import open_socket
 from rce.guard.lobby import Lobby, address_of
 from rce.link.carrier import Carrier, LocalCarrier
-from rce.link.exceptions import LinkError, LinkLost, LinkRefused
+from rce.link.exceptions import LinkError, LinkLostError, LinkRefusedError
 from rce.link.frames import Frame, FrameType, encode
 from rce.link.handover import LinkAcceptor
 from rce.link.handshake import check_answer, encode_hello, encode_welcome, parse_hello
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rce.link.handshake import Hello
     from rce.link.link import Link
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class LinkHub:
@@ -166,7 +166,7 @@ class LinkHub:
         await asyncio.sleep(0)  # connections that were just being accepted come into view
         carriers = list(self._carriers)
         for carrier in carriers:
-            carrier.abort(LinkLost("the hub is closed"))
+            carrier.abort(LinkLostError("the hub is closed"))
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self.timeouts.flush):
                 for carrier in carriers:
@@ -237,7 +237,7 @@ class LinkHub:
             except OSError as error:
                 if not address.port:
                     raise
-                log.debug("link %s: %s does not answer (%s), trying TCP", spec.id, address.unix, error)
+                _log.debug("link %s: %s does not answer (%s), trying TCP", spec.id, address.unix, error)
         return await self._dial_tcp(spec)
 
     def _is_near(self, address: LinkAddress) -> bool:
@@ -275,7 +275,7 @@ class LinkHub:
             async with asyncio.timeout(self.timeouts.handshake):
                 carrier.features = check_answer(await carrier.handshake_frame())
         except BaseException as error:
-            carrier.abort(LinkLost(f"no handshake: {error}"))
+            carrier.abort(LinkLostError(f"no handshake: {error}"))
             raise
         return carrier
 
@@ -301,7 +301,7 @@ class LinkHub:
 
     def _let_in(self, carrier: SocketCarrier) -> None:
         """Wait for the HELLO of an accepted connection, if there is room."""
-        crowded = LinkLost("too many connections come at once")
+        crowded = LinkLostError("too many connections come at once")
         guest = self.lobby.enter(address_of(carrier.peer), lambda: carrier.abort(crowded))
         if self._closed or guest is None:
             carrier.abort(crowded)
@@ -314,15 +314,15 @@ class LinkHub:
             async with asyncio.timeout(self.timeouts.handshake):
                 hello = parse_hello(await carrier.handshake_frame())
                 link = await self._find(hello)
-        except LinkRefused as error:
-            log.warning("link refused: %s", error)
+        except LinkRefusedError as error:
+            _log.warning("link refused: %s", error)
             carrier.greet(encode(Frame(FrameType.REFUSE, payload=b"unknown link or wrong token")))
             carrier.close()
         except (LinkError, TimeoutError) as error:
-            log.info("no handshake: %s", str(error) or "it took too long")
-            carrier.abort(LinkLost("no handshake"))
+            _log.info("no handshake: %s", str(error) or "it took too long")
+            carrier.abort(LinkLostError("no handshake"))
         except BaseException:
-            carrier.abort(LinkLost("the hub is closed"))
+            carrier.abort(LinkLostError("the hub is closed"))
             raise
         else:
             carrier.features = frozenset(hello.features)
@@ -336,9 +336,9 @@ class LinkHub:
         try:
             async with asyncio.timeout(self.timeouts.handshake):
                 await accept_secure(sock, (await self._wait_for(link_id)).spec, self._accept)
-        except (LinkRefused, OSError) as error:
+        except (LinkRefusedError, OSError) as error:
             sock.close()
-            log.warning("link refused: no TLS with the peer: %s", str(error) or "it took too long")
+            _log.warning("link refused: no TLS with the peer: %s", str(error) or "it took too long")
 
     async def _find(self, hello: Hello) -> Link:
         """Return the link that a peer asks for."""
@@ -352,10 +352,10 @@ class LinkHub:
             await self.wait_registered(link_id, self.timeouts.unknown_link)
         link = self._accepting.get(link_id)
         if link is None:
-            raise LinkRefused(f"unknown link {link_id!r}")
+            raise LinkRefusedError(f"unknown link {link_id!r}")
         return link
 
 
 def _check_token(link: Link, token: str) -> None:
     if not hmac.compare_digest(link.spec.token.encode(), token.encode()):
-        raise LinkRefused(f"wrong token for link {link.spec.id!r}")
+        raise LinkRefusedError(f"wrong token for link {link.spec.id!r}")

@@ -53,12 +53,12 @@ class Port(Protocol):
 
         Raises:
             TypeError: The interface is not a service provider.
-            NotConnected: There is no peer.
-            PeerFault: The peer answered with a fault.
-            PeerLost: The connection ended before the answer came.
-            CallTimeout: No answer in time.
-            Overloaded: Too many calls wait, here or at the peer.
-            MessageTooLarge: The request is larger than a link carries.
+            NotConnectedError: There is no peer.
+            PeerFaultError: The peer answered with a fault.
+            PeerLostError: The connection ended before the answer came.
+            CallTimeoutError: No answer in time.
+            OverloadedError: Too many calls wait, here or at the peer.
+            MessageTooLargeError: The request is larger than a link carries.
         """
         ...
 

@@ -73,7 +73,7 @@ class Lanes:
         """Append a message of a channel.
 
         Raises:
-            Overloaded: As :meth:`OutgoingQueue.push`.
+            OverloadedError: As :meth:`OutgoingQueue.push`.
         """
         queue.push(frame)
         if queue.lane is Lane.NONE:

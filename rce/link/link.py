@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rce.link.pacing import Pacer
     from rce.link.settings import LinkLimits
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class Link:
@@ -88,7 +88,7 @@ class Link:
     def attach(self, carrier: Carrier) -> None:
         """Go on over a new carrier; a former one is closed, as its peer has given it up."""
         self.detach()
-        log.debug("link %s to %s is up (%s)", self.spec.id, self.spec.peer, carrier.kind)
+        _log.debug("link %s to %s is up (%s)", self.spec.id, self.spec.peer, carrier.kind)
         self.carrier = carrier
         carrier.pace(self._pacer)
         for channel in list(self._channels.values()):
@@ -129,7 +129,7 @@ class Link:
     def carrier_lost(self, carrier: Carrier, reason: Exception) -> None:
         """Close all channels."""
         if carrier is self.carrier:
-            log.debug("link %s to %s is down: %s", self.spec.id, self.spec.peer, reason)
+            _log.debug("link %s to %s is down: %s", self.spec.id, self.spec.peer, reason)
             self._lose()
 
     def _lose(self) -> None:

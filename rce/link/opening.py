@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Protocol
 
-from rce.link.exceptions import LinkLost, LinkRefused, ProtocolError
+from rce.link.exceptions import LinkLostError, LinkRefusedError, ProtocolError
 from rce.link.frames import HANDSHAKE_SIZE, HEADER_SIZE, FrameReader, FrameType
 from rce.link.handshake import parse_opening
 
@@ -26,7 +26,7 @@ class LinkSender(Protocol):
         """
 
 
-class PlainLinkRefused(LinkRefused):
+class PlainLinkRefusedError(LinkRefusedError):
     """A link came without TLS where it is demanded."""
 
     for_peer = b"links are taken in TLS only here; start the peer's program with --tls too"
@@ -55,7 +55,7 @@ async def read_hello(connection: socket.socket, limits: LinkLimits) -> ReceivedH
 
     Raises:
         ProtocolError: It begins no link.
-        LinkLost: The connection ended.
+        LinkLostError: The connection ended.
         OSError: The connection failed.
     """
     loop = asyncio.get_running_loop()
@@ -66,7 +66,7 @@ async def read_hello(connection: socket.socket, limits: LinkLimits) -> ReceivedH
     while True:
         part = await loop.sock_recv(connection, missing)
         if not part:
-            raise LinkLost("the peer hung up")
+            raise LinkLostError("the peer hung up")
         data += part
         frames = reader.feed(part)
         if frames:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from rce.aio.queues import BoundedQueue, OverflowPolicy
 from rce.control.model import InterfaceUsage
-from rce.link.exceptions import Overloaded
+from rce.link.exceptions import OverloadedError
 from rce.link.frames import FRAGMENT_SIZE, LATCHED, FrameType
 from rce.link.settings import KIB
 
@@ -130,12 +130,12 @@ class OutgoingQueue:
         """Append a message.
 
         Raises:
-            Overloaded: The queue is full and its policy is to refuse.
+            OverloadedError: The queue is full and its policy is to refuse.
         """
         waiting, backlog = self._waiting, self._backlog
         before = waiting.bytes
         if not waiting.put(frame, len(frame.payload), _key(frame)):
-            raise Overloaded(f"{len(self)} messages wait to be sent")
+            raise OverloadedError(f"{len(self)} messages wait to be sent")
         change = waiting.bytes - before
         self._bytes += change
         backlog.bytes += change

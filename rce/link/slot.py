@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from rce.guard.holdings import Holdings
 from rce.link.calls import CallServer
 from rce.link.channel import as_payload
-from rce.link.exceptions import MessageTooLarge, NotConnected
+from rce.link.exceptions import MessageTooLargeError, NotConnectedError
 from rce.link.latch import HeardSources, LatchedMessages
 from rce.link.queues import Counters
 from rce.model.names import InterfaceType, Role
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rce.link.settings import LinkLimits, LinkTimeouts
     from rce.model.specs import InterfaceSpec
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class InterfaceSlot:
@@ -75,7 +75,7 @@ class InterfaceSlot:
             raise TypeError(f"{self._spec.tag} is a {self._spec.type}: only a subscriber sends messages")
         try:
             data = as_payload(payload, self._limits.max_message)
-        except MessageTooLarge as error:
+        except MessageTooLargeError as error:
             self.counters.dropped += 1
             self._fault_once(str(error))
             return
@@ -96,7 +96,7 @@ class InterfaceSlot:
         for channel in self._channels.values():
             if channel.established:
                 return await channel.call(data, self._timeouts.call if timeout is None else timeout)
-        raise NotConnected
+        raise NotConnectedError
 
     # The life of the interface
 
@@ -111,8 +111,8 @@ class InterfaceSlot:
         assert self._interface is not None
         try:
             await self._interface.start()
-        except Exception as error:
-            log.debug("interface %s did not start", self._spec.tag, exc_info=True)
+        except Exception as error:  # noqa: BLE001 - logged
+            _log.debug("interface %s did not start", self._spec.tag, exc_info=True)
             self._fault(str(error) or type(error).__name__)
             return
         self.started = True
@@ -167,8 +167,8 @@ class InterfaceSlot:
                 name, ended = self._heard.hear(channel.number, source)
                 self._unlatch(ended)
                 self._interface.receive_latched(payload, name)
-        except Exception as error:
-            log.debug("interface %s refused a message", self._spec.tag, exc_info=True)
+        except Exception as error:  # noqa: BLE001 - logged
+            _log.debug("interface %s refused a message", self._spec.tag, exc_info=True)
             self._fault_once(str(error) or type(error).__name__)
 
     def message_dropped(self, channel: Channel, source: int | None) -> None:
@@ -187,8 +187,8 @@ class InterfaceSlot:
         if sources and self._interface is not None:
             try:
                 self._interface.unlatch(sources)
-            except Exception as error:
-                log.debug("interface %s: unlatch failed", self._spec.tag, exc_info=True)
+            except Exception as error:  # noqa: BLE001 - logged
+                _log.debug("interface %s: unlatch failed", self._spec.tag, exc_info=True)
                 self._fault_once(str(error) or type(error).__name__)
 
     def _send_sources(self) -> None:
@@ -204,8 +204,8 @@ class InterfaceSlot:
         assert self._interface is not None
         try:
             self._interface.on_active(active)
-        except Exception as error:
-            log.debug("interface %s: on_active failed", self._spec.tag, exc_info=True)
+        except Exception as error:  # noqa: BLE001 - logged
+            _log.debug("interface %s: on_active failed", self._spec.tag, exc_info=True)
             self._fault_once(str(error) or type(error).__name__)
 
     def _fault_once(self, text: str) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeVar, cast
 
 from rce.buffers import write_together
 from rce.link.carrier import Carrier, CarrierHandler
-from rce.link.exceptions import LinkLost, ProtocolError
+from rce.link.exceptions import LinkLostError, ProtocolError
 from rce.link.flow_control import FlowControl
 from rce.link.frames import (
     FRAGMENT_SIZE,
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rce.link.settings import LinkLimits, LinkTimeouts
 
 T = TypeVar("T")
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _HIGH_WATER = 64 * KIB
 _LOW_WATER = 16 * KIB
@@ -96,11 +96,11 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
 
         Raises:
             ProtocolError: The peer sent something else than frames.
-            LinkLost: The connection ended first.
+            LinkLostError: The connection ended first.
         """
         await asyncio.shield(self._first)
         if not self._early:
-            raise self._reason or LinkLost("the connection ended before the handshake")
+            raise self._reason or LinkLostError("the connection ended before the handshake")
         return self._early.pop(0)
 
     @property
@@ -128,7 +128,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
             self._heartbeat()
         early, self._early = self._early, []
         if self._ending:
-            reason = self._reason or LinkLost("the connection ended")
+            reason = self._reason or LinkLostError("the connection ended")
             self._loop.call_soon(handler.carrier_lost, self, reason)
         else:
             self._dispatch(early)
@@ -192,12 +192,12 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
     def close(self) -> None:
         """Hang up after what lies in the socket's buffer was sent, or after the flush time."""
         self._handler = None
-        self._end(LinkLost("closed"), flush=True)
+        self._end(LinkLostError("closed"), flush=True)
 
     def abort(self, reason: Exception) -> None:
         """End at once; whoever handles the frames is told the reason."""
         if isinstance(reason, ProtocolError):
-            log.warning("link dropped: %s", reason)
+            _log.warning("link dropped: %s", reason)
         self._end(reason, flush=False)
 
     async def wait_closed(self) -> None:
@@ -250,7 +250,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Give everything up."""
-        self._end(exc or LinkLost("the peer hung up"), flush=False)
+        self._end(exc or LinkLostError("the peer hung up"), flush=False)
         if self._timer is not None:
             self._timer.cancel()
         self._transport = None
@@ -376,7 +376,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         self._beat = now
         silent = now - self._heard
         if silent >= self._timeouts.silence:
-            self.abort(LinkLost(f"the peer was silent for {silent:.1f} s"))
+            self.abort(LinkLostError(f"the peer was silent for {silent:.1f} s"))
             return
         if silent >= self._timeouts.heartbeat / 2 or paused:
             self.control(Frame(FrameType.PING))

@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator
 from typing import BinaryIO, Self
 
-from rce.packages.exceptions import BadArchive
+from rce.packages.exceptions import BadArchiveError
 from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
 from rce.packages.tree import Entry, Kind, Tree
 
@@ -46,7 +46,7 @@ class ArchiveWriter:
         """Add an entry.
 
         Raises:
-            BadArchive: Its path does not fit into a header, or its data are not of its size.
+            BadArchiveError: Its path does not fit into a header, or its data are not of its size.
         """
         self._gzip.write(make_header(entry))
         left = entry.size
@@ -54,7 +54,7 @@ class ArchiveWriter:
             left -= len(chunk)
             self._gzip.write(chunk)
         if left:
-            raise BadArchive(f"{entry.path!r} changed while it was read")
+            raise BadArchiveError(f"{entry.path!r} changed while it was read")
         self._gzip.write(bytes(-entry.size % _BLOCK))
 
 
@@ -62,7 +62,7 @@ def make_header(entry: Entry) -> bytes:
     """Write an entry's header.
 
     Raises:
-        BadArchive: Its path, or a link's target, does not fit in.
+        BadArchiveError: Its path, or a link's target, does not fit in.
     """
     info = tarfile.TarInfo(entry.path)
     info.type = _LETTERS[entry.kind]
@@ -72,7 +72,9 @@ def make_header(entry: Entry) -> bytes:
     try:
         return info.tobuf(tarfile.USTAR_FORMAT, "utf-8", "strict")
     except ValueError as error:
-        raise BadArchive(f"{entry.path!r}: its path, or where it links to, is too long or no text") from error
+        raise BadArchiveError(
+            f"{entry.path!r}: its path, or where it links to, is too long or no text"
+        ) from error
 
 
 def read_archive(
@@ -93,7 +95,7 @@ def read_archive(
         trees have the same one.
 
     Raises:
-        BadArchive: It is not of the form, breaks a rule, or is too large; the text names the place.
+        BadArchiveError: It is not of the form, breaks a rule, or is too large; the text names the place.
     """
     stream = _Inflated(file, limits)
     tree = Tree(limits)
@@ -115,10 +117,10 @@ def _next(stream: _Inflated) -> Entry | None:
     try:
         info = tarfile.TarInfo.frombuf(header, "utf-8", "strict")
     except (tarfile.HeaderError, ValueError) as error:
-        raise BadArchive(f"it is not an archive of a package: {error}") from error
+        raise BadArchiveError(f"it is not an archive of a package: {error}") from error
     kind = _TYPES.get(info.type)
     if kind is None:
-        raise BadArchive(f"{info.name!r}: only files, folders and symbolic links may be in a package")
+        raise BadArchiveError(f"{info.name!r}: only files, folders and symbolic links may be in a package")
     entry = Entry(
         path=info.name,
         kind=kind,
@@ -128,7 +130,9 @@ def _next(stream: _Inflated) -> Entry | None:
     )
     told = (info.mode, info.uid, info.gid, info.uname, info.gname, info.mtime, bool(info.linkname))
     if told != (_mode(entry), 0, 0, "", "", 0, kind is Kind.LINK) or info.size != max(0, entry.size):
-        raise BadArchive(f"{info.name!r}: it has an owner, a time, a mode or a size that rce gives to none")
+        raise BadArchiveError(
+            f"{info.name!r}: it has an owner, a time, a mode or a size that rce gives to none"
+        )
     return entry
 
 
@@ -144,7 +148,7 @@ class _Inflated:
     def __init__(self, file: BinaryIO, limits: ArchiveLimits) -> None:
         packed = os.fstat(file.fileno()).st_size
         if packed > limits.archive:
-            raise BadArchive(f"the archive has more than {limits.archive} bytes")
+            raise BadArchiveError(f"the archive has more than {limits.archive} bytes")
         headers = (limits.entries + 2) * 2 * _BLOCK
         self._most = min(limits.unpacked + headers, max(limits.free, packed * limits.ratio))
         self._gzip = gzip.GzipFile(fileobj=file, mode="rb")
@@ -155,7 +159,7 @@ class _Inflated:
         """Take exactly so many bytes."""
         data = self._read(count)
         if len(data) != count:
-            raise BadArchive("the archive ends too early")
+            raise BadArchiveError("the archive ends too early")
         return data
 
     def data(self, size: int) -> Iterator[bytes]:
@@ -166,20 +170,20 @@ class _Inflated:
             left -= len(chunk)
             yield chunk
         if any(self.take(-size % _BLOCK)):
-            raise BadArchive("there is something between two entries")
+            raise BadArchiveError("there is something between two entries")
 
     def finish(self) -> None:
         """Take the end."""
         if any(self.take(_BLOCK)) or self._read(1):
-            raise BadArchive("there is something behind the last entry")
+            raise BadArchiveError("there is something behind the last entry")
 
     def _read(self, count: int) -> bytes:
         try:
             data = self._gzip.read(count)
         except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-            raise BadArchive(f"the archive is damaged: {error}") from error
+            raise BadArchiveError(f"the archive is damaged: {error}") from error
         self._taken += len(data)
         if self._taken > self._most:
-            raise BadArchive(f"it unpacks to more than {self._most} bytes")
+            raise BadArchiveError(f"it unpacks to more than {self._most} bytes")
         self.digest.update(data)
         return data

@@ -11,10 +11,10 @@ from msgspec import Struct
 from rce.model.names import is_name
 from rce.packages import requirements
 from rce.packages.archive import read_archive
-from rce.packages.exceptions import BadArchive
+from rce.packages.exceptions import BadArchiveError
 from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
 from rce.packages.tree import Entry, Kind, Tree
-from rce.ros.packages import FOLDERS, MANIFESTS, BadPackage, Package, parse_manifest
+from rce.ros.packages import FOLDERS, MANIFESTS, BadPackageError, Package, parse_manifest
 
 _DEFINITIONS = ("msg", "srv", "action")
 _SHOWN = 100
@@ -49,7 +49,7 @@ def inspect(file: BinaryIO, limits: ArchiveLimits = DEFAULT_LIMITS) -> Contents:
     """Read an archive and tell what it holds. Blocks; unpacks nothing to a disk.
 
     Raises:
-        BadArchive: It is not a package's archive.
+        BadArchiveError: It is not a package's archive.
     """
     texts: dict[str, bytes] = {}
 
@@ -57,7 +57,7 @@ def inspect(file: BinaryIO, limits: ArchiveLimits = DEFAULT_LIMITS) -> Contents:
         inner = entry.parts[1:]
         if entry.kind is Kind.FILE and len(inner) == 1 and inner[0] in _TEXTS:
             if entry.size > limits.manifest:
-                raise BadArchive(f"{entry.path!r}: it has more than {limits.manifest} bytes")
+                raise BadArchiveError(f"{entry.path!r}: it has more than {limits.manifest} bytes")
             texts[inner[0]] = b"".join(data)
 
     tree, digest = read_archive(file, visit, limits)
@@ -76,7 +76,7 @@ def describe(tree: Tree, texts: dict[str, bytes], digest: str = "") -> Contents:
         digest: See :attr:`Contents.digest`.
 
     Raises:
-        BadArchive: There is no manifest, it cannot be read, or it names another package.
+        BadArchiveError: There is no manifest, it cannot be read, or it names another package.
     """
     package = _package(tree, texts)
     executables = tuple(_executables(tree, package))
@@ -99,18 +99,18 @@ def _package(tree: Tree, texts: dict[str, bytes]) -> Package:
         if manifest in texts:
             break
     else:
-        raise BadArchive(f"there is no {' or '.join(MANIFESTS)} at the top of the folder")
+        raise BadArchiveError(f"there is no {' or '.join(MANIFESTS)} at the top of the folder")
     try:
         package = parse_manifest(Path(manifest), texts[manifest], tree.name)
-    except BadPackage as error:
-        raise BadArchive(str(error)) from error
+    except BadPackageError as error:
+        raise BadArchiveError(str(error)) from error
     if not is_name(package.name):
-        raise BadArchive(
+        raise BadArchiveError(
             f"{manifest}: {package.name!r} cannot be named by a node: use letters, digits and '_', a letter"
             " first"
         )
     if package.name != tree.name:
-        raise BadArchive(
+        raise BadArchiveError(
             f"{manifest}: it names the package {package.name!r}, but its folder is {tree.name!r}"
         )
     return package

@@ -3,9 +3,9 @@
 ::
 
     ArchiveError
-    +-- BadArchive        a folder or an archive cannot be one; each fault is told
-    +-- BadSignature     it is not what its owner signed
-    +-- BadKey           a key cannot be read
+    +-- BadArchiveError    a folder or an archive cannot be one; each fault is told
+    +-- BadSignatureError  it is not what its owner signed
+    +-- BadKeyError        a key cannot be read
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ class ArchiveError(Exception):
     """Base of all that can be wrong with a package."""
 
 
-class BadArchive(ArchiveError):  # noqa: N818
+class BadArchiveError(ArchiveError):
     """A folder or an archive cannot be a package.
 
     Attributes:
@@ -35,9 +35,9 @@ class BadArchive(ArchiveError):  # noqa: N818
         return "; ".join(self.faults[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
 
 
-class BadSignature(ArchiveError):  # noqa: N818
+class BadSignatureError(ArchiveError):
     """A package is not what the owner of a key signed."""
 
 
-class BadKey(ArchiveError):  # noqa: N818
+class BadKeyError(ArchiveError):
     """A key cannot be read."""

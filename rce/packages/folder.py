@@ -12,11 +12,11 @@ from rce.model.names import is_version
 from rce.packages import ignore
 from rce.packages.archive import ArchiveWriter, make_header
 from rce.packages.contents import Contents, describe
-from rce.packages.exceptions import BadArchive
+from rce.packages.exceptions import BadArchiveError
 from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
 from rce.packages.requirements import FILE_NAME as REQUIREMENTS
 from rce.packages.tree import Entry, Kind, Tree, path_fault
-from rce.ros.packages import MANIFESTS, BadPackage, parse_manifest
+from rce.ros.packages import MANIFESTS, BadPackageError, parse_manifest
 
 _CHUNK = 1 << 16
 _READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
@@ -34,7 +34,7 @@ class Source(NamedTuple):
         """Write the archive. Blocks.
 
         Raises:
-            BadArchive: A file changed meanwhile, or cannot be read.
+            BadArchiveError: A file changed meanwhile, or cannot be read.
         """
         with ArchiveWriter(file) as archive:
             for entry in self.tree.entries.values():
@@ -47,7 +47,7 @@ class Source(NamedTuple):
                 while chunk := file.read(_CHUNK):
                     yield chunk
         except OSError as error:
-            raise BadArchive(f"{path}: {error.strerror}") from error
+            raise BadArchiveError(f"{path}: {error.strerror}") from error
 
 
 def look_into(folder: Path, version: str = "", limits: ArchiveLimits = DEFAULT_LIMITS) -> Source:
@@ -59,7 +59,7 @@ def look_into(folder: Path, version: str = "", limits: ArchiveLimits = DEFAULT_L
         limits: How large a package may be.
 
     Raises:
-        BadArchive: It cannot be one; all faults are told.
+        BadArchiveError: It cannot be one; all faults are told.
     """
     folder = folder.absolute()
     texts = _texts(folder, limits)
@@ -70,12 +70,12 @@ def look_into(folder: Path, version: str = "", limits: ArchiveLimits = DEFAULT_L
         try:
             make_header(entry)
             tree.add(entry)
-        except BadArchive as error:
+        except BadArchiveError as error:
             faults += error.faults
             if len(tree.entries) > limits.entries or tree.size > limits.unpacked:
                 break
     if faults:
-        raise BadArchive(faults)
+        raise BadArchiveError(faults)
     tree.finish()
     contents = describe(tree, {key: text for key, text in texts.items() if f"{name}/{key}" in tree.entries})
     return Source(folder, tree, contents, _version(version, contents))
@@ -83,7 +83,7 @@ def look_into(folder: Path, version: str = "", limits: ArchiveLimits = DEFAULT_L
 
 def _texts(folder: Path, limits: ArchiveLimits) -> dict[str, bytes]:
     if not folder.is_dir():
-        raise BadArchive(f"{folder} is not a folder")
+        raise BadArchiveError(f"{folder} is not a folder")
     texts = {}
     for name in (*MANIFESTS, REQUIREMENTS):
         file = folder / name
@@ -92,34 +92,34 @@ def _texts(folder: Path, limits: ArchiveLimits) -> dict[str, bytes]:
                 with file.open("rb") as opened:
                     texts[name] = opened.read(limits.manifest + 1)
             except OSError as error:
-                raise BadArchive(f"{file}: {error.strerror}") from error
+                raise BadArchiveError(f"{file}: {error.strerror}") from error
             if len(texts[name]) > limits.manifest:
-                raise BadArchive(f"{file} has more than {limits.manifest} bytes")
+                raise BadArchiveError(f"{file} has more than {limits.manifest} bytes")
     return texts
 
 
 def _name(folder: Path, texts: dict[str, bytes]) -> str:
     manifest = next((name for name in MANIFESTS if name in texts), None)
     if manifest is None:
-        raise BadArchive(
+        raise BadArchiveError(
             f"{folder} is not a package: it has no {' or '.join(MANIFESTS)}; write a package.yaml with the"
             " lines 'name: ...' and 'version: ...'"
         )
     try:
         return parse_manifest(folder / manifest, texts[manifest], folder.resolve().name).name
-    except BadPackage as error:
-        raise BadArchive(str(error)) from error
+    except BadPackageError as error:
+        raise BadArchiveError(str(error)) from error
 
 
 def _version(requested: str, contents: Contents) -> str:
     version = requested or contents.version
     if not version:
-        raise BadArchive(
+        raise BadArchiveError(
             "the package has no version: give --version, or write one into the manifest (in package.yaml in"
             " quotes, version: '1.2.0')"
         )
     if not is_version(version):
-        raise BadArchive(
+        raise BadArchiveError(
             f"{version!r} is not a version: use up to four numbers, such as 1.2.0, and a label if it is not a"
             " release yet, such as 1.3-rc1"
         )
@@ -187,4 +187,4 @@ def _ignore_text(folder: Path) -> str:
     except FileNotFoundError:
         return ""
     except (OSError, UnicodeDecodeError) as error:
-        raise BadArchive(f"{folder / ignore.FILE_NAME}: {error}") from error
+        raise BadArchiveError(f"{folder / ignore.FILE_NAME}: {error}") from error

@@ -9,7 +9,7 @@ from __future__ import annotations
 from fnmatch import fnmatchcase
 from typing import NamedTuple
 
-from rce.packages.exceptions import BadArchive
+from rce.packages.exceptions import BadArchiveError
 
 FILE_NAME = ".rceignore"
 ALWAYS = (".git", ".hg", ".svn", "__pycache__", "*.pyc", FILE_NAME)
@@ -39,7 +39,7 @@ class Ignore:
         """Read a ``.rceignore``.
 
         Raises:
-            BadArchive: A line says something that is not understood.
+            BadArchiveError: A line says something that is not understood.
         """
         patterns = [_Pattern((name,), anchored=False, folders_only=False) for name in ALWAYS]
         faults = []
@@ -55,7 +55,7 @@ class Ignore:
                 anchored = "/" in words.rstrip("/")
                 patterns.append(_Pattern(parts, anchored, words.endswith("/")))
         if faults:
-            raise BadArchive(faults)
+            raise BadArchiveError(faults)
         return cls(patterns)
 
     def matches(self, parts: tuple[str, ...], *, is_folder: bool) -> bool:

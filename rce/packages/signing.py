@@ -9,7 +9,7 @@ import hashlib
 from binascii import unhexlify
 from typing import TYPE_CHECKING
 
-from rce.packages.exceptions import BadKey, BadSignature
+from rce.packages.exceptions import BadKeyError, BadSignatureError
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -37,7 +37,7 @@ class SigningKey:
         """Read a key file.
 
         Raises:
-            BadKey: It holds no Ed25519 key, or one that is locked by a password.
+            BadKeyError: It holds no Ed25519 key, or one that is locked by a password.
         """
         from cryptography.exceptions import UnsupportedAlgorithm
         from cryptography.hazmat.primitives import serialization
@@ -46,9 +46,9 @@ class SigningKey:
         try:
             key = serialization.load_pem_private_key(text, password=None)
         except (ValueError, TypeError, UnsupportedAlgorithm) as error:
-            raise BadKey(f"it holds no key in PEM form without a password: {error}") from error
+            raise BadKeyError(f"it holds no key in PEM form without a password: {error}") from error
         if not isinstance(key, Ed25519PrivateKey):
-            raise BadKey("its key is not an Ed25519 key")
+            raise BadKeyError("its key is not an Ed25519 key")
         return cls(key)
 
     def to_pem(self) -> bytes:
@@ -88,8 +88,8 @@ def verify(key: str, signature: str, signed: bytes) -> None:
         signed: The statement.
 
     Raises:
-        BadKey: It is not a public key.
-        BadSignature: The key's owner did not sign this.
+        BadKeyError: It is not a public key.
+        BadSignatureError: The key's owner did not sign this.
     """
     from cryptography.exceptions import InvalidSignature
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
@@ -98,14 +98,14 @@ def verify(key: str, signature: str, signed: bytes) -> None:
     try:
         public.verify(unhexlify(signature), signed)
     except (InvalidSignature, ValueError) as error:
-        raise BadSignature(f"the signature does not fit the key {key_id(key)}") from error
+        raise BadSignatureError(f"the signature does not fit the key {key_id(key)}") from error
 
 
 def key_id(key: str) -> str:
     """Tell the short name of a public key.
 
     Raises:
-        BadKey: It is not a public key.
+        BadKeyError: It is not a public key.
     """
     return hashlib.sha256(_key_bytes(key)).hexdigest()[:_ID_LENGTH]
 
@@ -114,7 +114,7 @@ def _key_bytes(key: str) -> bytes:
     try:
         found = unhexlify(key)
     except ValueError as error:
-        raise BadKey(f"a public key is {2 * KEY_BYTES} hexadecimal digits") from error
+        raise BadKeyError(f"a public key is {2 * KEY_BYTES} hexadecimal digits") from error
     if len(found) != KEY_BYTES:
-        raise BadKey(f"a public key is {2 * KEY_BYTES} hexadecimal digits")
+        raise BadKeyError(f"a public key is {2 * KEY_BYTES} hexadecimal digits")
     return found

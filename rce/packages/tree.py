@@ -6,7 +6,7 @@ import posixpath
 from dataclasses import dataclass
 from enum import Enum
 
-from rce.packages.exceptions import BadArchive
+from rce.packages.exceptions import BadArchiveError
 from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
 
 _MAX_PART = 255
@@ -66,34 +66,34 @@ class Tree:
         """Take the next entry.
 
         Raises:
-            BadArchive: It breaks a rule.
+            BadArchiveError: It breaks a rule.
         """
         fault = path_fault(entry.path) or self._place_fault(entry)
         if fault:
-            raise BadArchive(f"{entry.path!r}: {fault}")
+            raise BadArchiveError(f"{entry.path!r}: {fault}")
         self.entries[entry.path] = entry
         self._last = entry.parts
         self.size += entry.size
         if len(self.entries) > self._limits.entries:
-            raise BadArchive(f"it has more than {self._limits.entries} files, folders and links")
+            raise BadArchiveError(f"it has more than {self._limits.entries} files, folders and links")
         if self.size > self._limits.unpacked:
-            raise BadArchive(f"its files have more than {self._limits.unpacked} bytes")
+            raise BadArchiveError(f"its files have more than {self._limits.unpacked} bytes")
 
     def finish(self) -> None:
         """Check what can only be checked of the whole.
 
         Raises:
-            BadArchive: It is empty, or a link leads nowhere or out of it.
+            BadArchiveError: It is empty, or a link leads nowhere or out of it.
         """
         if not self.entries:
-            raise BadArchive("it is empty")
+            raise BadArchiveError("it is empty")
         faults = [
             f"{path!r}: {fault}"
             for path, entry in self.entries.items()
             if entry.kind is Kind.LINK and (fault := self._link_fault(entry))
         ]
         if faults:
-            raise BadArchive(faults)
+            raise BadArchiveError(faults)
 
     def _place_fault(self, entry: Entry) -> str:
         parts = entry.parts

@@ -30,7 +30,7 @@ def unpack(file: BinaryIO, into: Path, limits: ArchiveLimits = DEFAULT_LIMITS) -
         As :func:`rce.packages.archive.read_archive`.
 
     Raises:
-        BadArchive: It is not a package's archive. What was unpacked until then is left behind.
+        BadArchiveError: It is not a package's archive. What was unpacked until then is left behind.
         OSError: It cannot be written.
     """
 

@@ -20,7 +20,7 @@ _told: dict[str, None] = {}
 """Names that were told of and have not been resolved since, the oldest first."""
 
 
-class UnresolvedHost(OSError):  # noqa: N818 - named as the errors of rce.ros are
+class UnresolvedHostError(OSError):
     """A host name that nodes or masters gave cannot be resolved here.
 
     Attributes:
@@ -38,7 +38,7 @@ async def open_peer_socket(host: str, port: int) -> socket.socket:
     A name that cannot be resolved is told of in the log, once until it can be.
 
     Raises:
-        UnresolvedHost: The name cannot be resolved.
+        UnresolvedHostError: The name cannot be resolved.
         OSError: Nobody answers.
     """
     slow = asyncio.get_running_loop().call_later(SLOW, _tell, host, f"no answer within {SLOW:g} s")
@@ -47,7 +47,7 @@ async def open_peer_socket(host: str, port: int) -> socket.socket:
     except (socket.gaierror, UnicodeError) as error:
         reason = error.strerror if isinstance(error, socket.gaierror) else str(error)
         _tell(host, reason or "no reason given")
-        raise UnresolvedHost(host, reason or "no reason given") from error
+        raise UnresolvedHostError(host, reason or "no reason given") from error
     finally:
         slow.cancel()
     _told.pop(host, None)

@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from rce.ros.errors import InvalidName
+from rce.ros.errors import InvalidNameError
 
 SEPARATOR = "/"
 PRIVATE = "~"
@@ -134,12 +134,14 @@ class Resolver:
             remappings: ``{from: to}``, as given on a command line.
 
         Raises:
-            InvalidName: One of the names is not legal.
+            InvalidNameError: One of the names is not legal.
         """
         if not is_base_name(base_name):
-            raise InvalidName(f"{base_name!r} cannot name a node: letters, digits and _ only, a letter first")
+            raise InvalidNameError(
+                f"{base_name!r} cannot name a node: letters, digits and _ only, a letter first"
+            )
         if namespace and not is_graph_name(namespace):
-            raise InvalidName(f"{namespace!r} is not a legal namespace")
+            raise InvalidNameError(f"{namespace!r} is not a legal namespace")
         root = canonical(SEPARATOR + namespace)
         self.namespace = root if root == SEPARATOR else root + SEPARATOR
         self.node_name = self.namespace + base_name
@@ -151,12 +153,12 @@ class Resolver:
         """Make ``name`` global and apply the remappings.
 
         Raises:
-            InvalidName: ``name`` is not a legal graph name.
+            InvalidNameError: ``name`` is not a legal graph name.
         """
         globally = self._globally(name)
         return self._remappings.get(globally, globally)
 
     def _globally(self, name: str) -> str:
         if not is_graph_name(name):
-            raise InvalidName(f"{name!r} is not a legal graph name")
+            raise InvalidNameError(f"{name!r} is not a legal graph name")
         return resolve(name, self.node_name)

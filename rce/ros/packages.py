@@ -63,15 +63,15 @@ class PackageError(Exception):
     """Base of what can go wrong with packages."""
 
 
-class PackageNotFound(PackageError, LookupError):  # noqa: N818
+class PackageNotFoundError(PackageError, LookupError):
     """There is no package of a name on the path."""
 
 
-class ExecutableNotFound(PackageError, LookupError):  # noqa: N818
+class ExecutableNotFoundError(PackageError, LookupError):
     """A package has no such executable, or it may not be executed."""
 
 
-class BadPackage(PackageError, ValueError):  # noqa: N818
+class BadPackageError(PackageError, ValueError):
     """A package's manifest cannot be read."""
 
 
@@ -93,11 +93,11 @@ class Package(NamedTuple):
             exe: Name of the file, with or without the folder below the package.
 
         Raises:
-            ExecutableNotFound: There is no such file, it may not be executed, or the name leads out of the
-            package.
+            ExecutableNotFoundError: There is no such file, it may not be executed, or the name leads out of
+                the package.
         """
         if not exe or exe.startswith("/") or "\0" in exe or ".." in PurePosixPath(exe).parts:
-            raise ExecutableNotFound(f"{exe!r} is not a file inside package {self.name}")
+            raise ExecutableNotFoundError(f"{exe!r} is not a file inside package {self.name}")
         files = [folder / exe for folder in self._folders()]
         meant = [file for file in files if os.path.isfile(file)]  # noqa: PTH113 - pathlib's question may raise
         for file in meant:
@@ -106,12 +106,12 @@ class Package(NamedTuple):
         if "/" not in exe and (found := _finder.find(self.path, exe)) is not None:
             return [str(found)]
         if meant:
-            raise ExecutableNotFound(f"{meant[0]} may not be executed (chmod +x makes it so)")
+            raise ExecutableNotFoundError(f"{meant[0]} may not be executed (chmod +x makes it so)")
         for name, target in _scripts(self.name):  # last, because all that is installed must be looked through
             if name == exe:
                 return [sys.executable, *_arguments_of(target)]
         where = ", ".join(str(folder) for folder in self._folders() if folder.is_dir())
-        raise ExecutableNotFound(
+        raise ExecutableNotFoundError(
             f"package {self.name} has no executable {exe!r} (looked in {where or self.path}, and below"
             f" {self.path} for one that may be executed)"
         )
@@ -153,8 +153,8 @@ class PackageIndex:
         """Return the package of a name.
 
         Raises:
-            PackageNotFound: There is none on the path, and no distribution adds nodes under its name.
-            BadPackage: Its manifest cannot be read.
+            PackageNotFoundError: There is none on the path, and no distribution adds nodes under its name.
+            BadPackageError: Its manifest cannot be read.
         """
         folder = self.locate(name)
         if folder is not None:
@@ -164,13 +164,13 @@ class PackageIndex:
             return Package(name, _folder_of(scripts[0][1]), python="engine")
         closed = [str(root) for root in self.path if root.exists() and not os.access(root, os.R_OK | os.X_OK)]
         hint = f"; {os.pathsep.join(closed)} may not be read here" if closed else ""
-        raise PackageNotFound(f"no package {name!r} on the package path ({self.describe_path()}){hint}")
+        raise PackageNotFoundError(f"no package {name!r} on the package path ({self.describe_path()}){hint}")
 
     def locate(self, name: str) -> Path | None:
         """Return the folder of a package, None if there is none on the path and no distribution has it.
 
         Raises:
-            BadPackage: A distribution names a folder that does not exist.
+            BadPackageError: A distribution names a folder that does not exist.
         """
         if _NAME.fullmatch(name) is None:
             return None
@@ -260,7 +260,7 @@ def _declared_name(folder: Path) -> str:
     """Return the name in a manifest; empty if it gives none or cannot be read."""
     try:
         return _read_package(folder, "").name
-    except BadPackage:
+    except BadPackageError:
         return ""
 
 
@@ -271,7 +271,7 @@ def _read_package(folder: Path, name: str) -> Package:
     try:
         text = manifest.read_bytes()
     except OSError as error:
-        raise BadPackage(f"{manifest}: {error}") from error
+        raise BadPackageError(f"{manifest}: {error}") from error
     return parse_manifest(manifest, text, name)
 
 
@@ -284,7 +284,7 @@ def parse_manifest(manifest: Path, text: bytes, name: str) -> Package:
         name: The package's name if the manifest gives none.
 
     Raises:
-        BadPackage: It cannot be read.
+        BadPackageError: It cannot be read.
     """
     return (_parse_xml if manifest.suffix == ".xml" else _parse_yaml)(manifest, text, name)
 
@@ -295,17 +295,17 @@ def _parse_yaml(manifest: Path, text: bytes, name: str) -> Package:
     try:
         data = yaml.safe_load(text) or {}
     except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise BadPackage(f"{manifest}: {error}") from error
+        raise BadPackageError(f"{manifest}: {error}") from error
     if not isinstance(data, dict):
-        raise BadPackage(f"{manifest}: must hold 'key: value' lines")
+        raise BadPackageError(f"{manifest}: must hold 'key: value' lines")
     python = data.get("python", "engine")
     if python not in _PYTHONS:
-        raise BadPackage(
+        raise BadPackageError(
             f"{manifest}: python is {reprlib.repr(python)}, must be one of {', '.join(_PYTHONS)}"
         )
     declared = data.get("name", name)
     if declared != "" and (not isinstance(declared, str) or _NAME.fullmatch(declared) is None):
-        raise BadPackage(f"{manifest}: {reprlib.repr(declared)} is not a package name")
+        raise BadPackageError(f"{manifest}: {reprlib.repr(declared)} is not a package name")
     return Package(declared, manifest.parent, _text(data, "description"), python, _text(data, "version"))
 
 
@@ -321,7 +321,7 @@ def _parse_xml(manifest: Path, text: bytes, name: str) -> Package:
     try:
         root = ET.fromstring(text)  # noqa: S314  # expat limits what entities may become
     except (ET.ParseError, ValueError, LookupError) as error:
-        raise BadPackage(f"{manifest}: {error}") from error
+        raise BadPackageError(f"{manifest}: {error}") from error
     declared = (root.findtext("name") or name).strip()
     description = " ".join((root.findtext("description") or "").split())
     return Package(declared, manifest.parent, description, version=(root.findtext("version") or "").strip())
@@ -365,7 +365,7 @@ def _file_of(target: str) -> Path:
     try:
         spec = find_spec(module)
     except ImportError as error:
-        raise BadPackage(f"entry point {target}: {error}") from error
+        raise BadPackageError(f"entry point {target}: {error}") from error
     if spec is None or spec.origin is None or not spec.has_location:
-        raise BadPackage(f"entry point {target}: there is no file of a module {module}")
+        raise BadPackageError(f"entry point {target}: there is no file of a module {module}")
     return Path(spec.origin)

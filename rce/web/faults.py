@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
 
-logger = logging.getLogger("rce.web.requests")
+request_log = logging.getLogger("rce.web.requests")
 
 
 _CONTINUE = "100-continue"
@@ -31,7 +31,7 @@ def _shorten(record: logging.LogRecord) -> bool:
     return True
 
 
-logger.addFilter(_shorten)
+request_log.addFilter(_shorten)
 
 
 def refuse_expectations(handler: Handler) -> Handler:

@@ -11,7 +11,7 @@ from yarl import URL
 from rce.guard.lobby import Guest, Lobby, address_of
 from rce.guard.plain import PlainPort
 from rce.tls.gate import TlsGate
-from rce.web.faults import logger, refuse_expectations
+from rce.web.faults import refuse_expectations, request_log
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -66,7 +66,11 @@ class HttpServer:
         app.middlewares.insert(0, self._track)
         app.on_response_prepare.append(self._grant)
         self._runner = web.AppRunner(
-            app, access_log=None, logger=logger, shutdown_timeout=SHUTDOWN_S, keepalive_timeout=idle_timeout
+            app,
+            access_log=None,
+            logger=request_log,
+            shutdown_timeout=SHUTDOWN_S,
+            keepalive_timeout=idle_timeout,
         )
         self._host = host
         self._port = port

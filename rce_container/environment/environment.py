@@ -48,7 +48,7 @@ from rce_container.environment.process import kill_marked
 from rce_container.environment.reach import DialProxy
 from rce_container.environment.user_packages import UserPackages
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _MAX_UNTOLD = 100
 _GET_PID_TIMEOUT_S = 5.0
@@ -136,7 +136,7 @@ class Environment:
                 await self._close()
                 serving.cancel()
                 watching.cancel()
-        log.info("ended: %s", self._end_reason)
+        _log.info("ended: %s", self._end_reason)
 
     def _make_core(self) -> Core:
         """The container's core, at its loopback and, if it has one, at its address in its group."""
@@ -146,7 +146,7 @@ class Environment:
 
     def end(self, reason: str) -> None:
         """Begin to end the container, whole."""
-        log.info("ending: %s", reason)
+        _log.info("ending: %s", reason)
         self._end_reason = self._end_reason or reason
         self._ending.set()
 
@@ -266,7 +266,7 @@ class Environment:
         return EndpointState.DEGRADED if self._nodes.is_degraded else EndpointState.RUNNING
 
     def _fault(self, text: str) -> None:
-        log.warning("%s", text)
+        _log.warning("%s", text)
         if self._channel is not None:
             self._channel.send(m.encode(m.Fault(text=text)))
         else:
@@ -294,7 +294,7 @@ class Environment:
             if self._nodes.registered_process(name, int(pid)):
                 self._rosout.known(name)
         except (RosError, TypeError, ValueError) as error:
-            log.info("node %s does not tell its process: %s", name, error)
+            _log.info("node %s does not tell its process: %s", name, error)
 
     # Managers
 
@@ -324,7 +324,7 @@ class Environment:
             while (line := await channel.receive()) is not None:
                 await self._handle(channel, m.decode_to_environment(line))
         except (ChannelError, msgspec.DecodeError) as error:
-            log.error("the manager is not understood: %s", error)  # noqa: TRY400 - its text says it all
+            _log.error("the manager is not understood: %s", error)
         finally:
             channel.close()
             if self._channel is channel:
@@ -361,7 +361,7 @@ class Environment:
             case m.Stop():
                 self.end("the manager says so")
             case Unknown(name=name):
-                log.info("the manager sent a %s, which this release does not know", name)
+                _log.info("the manager sent a %s, which this release does not know", name)
             case _:
                 assert_never(message)
 

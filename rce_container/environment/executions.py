@@ -19,7 +19,7 @@ from rce_container.environment.nodes.launch import NODE_MARK
 from rce_container.environment.nodes.reaper import Child, Reaper
 from rce_container.environment.process import kill_marked
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 MAX_EXECUTIONS = 16
 """Commands that run at the same time in one container."""
@@ -80,7 +80,7 @@ class Executions:
                 await loop.sock_sendall(sock, last.encode())
                 await _part(sock)
             except OSError as error:  # the user is gone
-                log.info("command %d: %s", number, error)
+                _log.info("command %d: %s", number, error)
 
     async def _execute(self, command: Command, sock: socket.socket, mark: str) -> Frame:
         argv = list(command.argv) or [next(filter(os.path.exists, SHELLS), SHELLS[-1])]
@@ -235,7 +235,7 @@ class _Conversation:
                 frame = decode(received)
                 await self._obey(frame)
             except ValueError as error:
-                log.warning("a command is ended: %s", error)
+                _log.warning("a command is ended: %s", error)
                 return
             except OSError:  # the command does not read, or has closed its input
                 self._streams.close_input()

@@ -24,7 +24,7 @@ from rce_container.forkserver.messages import (
     encode,
 )
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _ATTEMPTS = 3
 _CREDENTIALS = struct.Struct("iII")
@@ -68,7 +68,7 @@ class ForkServer:
                 theirs.close()
                 answer, pid = await _hear(ours)
             if answer is None:
-                log.warning("a container's environment died as it was made; it is tried again")
+                _log.warning("a container's environment died as it was made; it is tried again")
                 continue
             if answer.error:
                 raise StartError(f"its environment cannot be confined: {answer.error}")

@@ -12,7 +12,7 @@ from rce_container.limits.cgroup2 import Cgroup2
 from rce_container.limits.hierarchy import PROC
 from rce_container.limits.rlimit import RlimitLimiter
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _ESSENTIAL = frozenset({"cpu", "memory", "processes"})
 
@@ -42,5 +42,5 @@ def choose_limiter(token: str, ledger: Path, proc: Path = PROC) -> Limiter:
         if limiter is not chosen:
             limiter.close()
     if chosen.detail:
-        log.warning("%s", chosen.detail)
+        _log.warning("%s", chosen.detail)
     return chosen

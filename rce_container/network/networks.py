@@ -19,7 +19,7 @@ from rce_container.network.addresses import choose
 from rce_container.network.hosts import hosts_text
 from rce_container.network.namespaces import configure, make_namespace, open_namespace
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 INTERFACE = "eth0"
 """A member's interface to its group, as seen from inside."""
@@ -169,7 +169,7 @@ class Networks:
                 try:
                     await asyncio.to_thread(configure, group.switch, [f"link delete {_port(incarnation_id)}"])
                 except NetworkError as error:
-                    log.debug("the kernel has removed the port of %s already: %s", incarnation_id, error)
+                    _log.debug("the kernel has removed the port of %s already: %s", incarnation_id, error)
             del group.members[incarnation_id]
             if group.members:
                 await asyncio.to_thread(_write_hosts, list(group.members.values()))
@@ -231,4 +231,4 @@ def _write_hosts(members: Iterable[_Member]) -> None:
                 file.write(text)
                 file.truncate()
         except OSError as error:
-            log.debug("%s is gone: %s", member.hosts, error)
+            _log.debug("%s is gone: %s", member.hosts, error)

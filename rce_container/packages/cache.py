@@ -23,7 +23,7 @@ from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
 from rce.packages.signing import statement, verify
 from rce.packages.unpacking import unpack
 from rce_container.packages.disk import forget_before_boot, in_thread, scratch_aside
-from rce_container.packages.exceptions import NoSpace, PackageTrouble, Unfetched, Unverified
+from rce_container.packages.exceptions import FetchError, NoSpaceError, PackageTroubleError, VerificationError
 from rce_container.packages.locks import Locks
 from rce_container.trees import remove, size_of
 
@@ -93,7 +93,7 @@ class PackageCache:
             The folder that holds the package's folder.
 
         Raises:
-            PackageTrouble: It cannot be had now.
+            PackageTroubleError: It cannot be had now.
             OSError: Somebody else changed the folder.
         """
         _check_signature(user, package)
@@ -119,7 +119,7 @@ class PackageCache:
             async with self._turns.turn(user):
                 yield
         except CrowdedError:
-            raise Unfetched("too many packages are fetched to its machine just now") from None
+            raise FetchError("too many packages are fetched to its machine just now") from None
 
     async def _bring(self, package: PackageSpec, path: Path) -> None:
         self._sizes.pop(package.sha256, None)
@@ -143,15 +143,15 @@ class PackageCache:
                     piece = await self._fetch(package.sha256, offset)
                 except ContentError as error:
                     advice = "; push it again: rce package push" if error.missing else ""
-                    raise Unfetched(f"it cannot be fetched: {error}{advice}") from error
+                    raise FetchError(f"it cannot be fetched: {error}{advice}") from error
                 size = piece.size
                 offset += len(piece.data)
                 if max(size, offset) > self._limits.archive:
-                    raise Unverified(f"it has more than {self._limits.archive} bytes")
+                    raise VerificationError(f"it has more than {self._limits.archive} bytes")
                 digest.update(piece.data)
                 await in_thread(file.write, piece.data)
         if digest.hexdigest() != package.sha256:
-            raise Unverified(
+            raise VerificationError(
                 "what the master handed out is not what was signed; push it again: rce package push"
             )
 
@@ -161,9 +161,9 @@ class PackageCache:
             try:
                 found, _ = unpack(file, tree, self._limits)
             except ArchiveError as error:
-                raise Unverified(f"its archive cannot be unpacked: {error}") from error
+                raise VerificationError(f"its archive cannot be unpacked: {error}") from error
         if found.name != package.name:
-            raise Unverified(f"its archive holds the package {found.name!r}")
+            raise VerificationError(f"its archive holds the package {found.name!r}")
         return found.size
 
     async def _make_room(self) -> None:
@@ -176,11 +176,13 @@ class PackageCache:
                 await in_thread(remove, self._folder / sha256)
 
 
-def trouble_of(error: OSError) -> PackageTrouble:
+def trouble_of(error: OSError) -> PackageTroubleError:
     """Say in words for the owner what a disk's error means."""
     if error.errno in _FULL:
-        return NoSpace("the disk of the container's machine is full; tell its operator")
-    return NoSpace(f"the container's machine cannot keep it: {error.strerror or error}; tell its operator")
+        return NoSpaceError("the disk of the container's machine is full; tell its operator")
+    return NoSpaceError(
+        f"the container's machine cannot keep it: {error.strerror or error}; tell its operator"
+    )
 
 
 def _check_signature(user: str, package: PackageSpec) -> None:
@@ -188,7 +190,7 @@ def _check_signature(user: str, package: PackageSpec) -> None:
     try:
         verify(package.key, package.signature, signed)
     except ArchiveError as error:
-        raise Unverified(f"{error}; push it again: rce package push") from error
+        raise VerificationError(f"{error}; push it again: rce package push") from error
 
 
 def _replace(tree: Path, path: Path) -> None:

@@ -1,10 +1,10 @@
 """What keeps a package from coming into a container.
 
-PackageTrouble              told to the owner as it is; it is tried again
-├── Unfetched              the master is away, or does not have it
-├── Unverified             it is not what its owner signed, or not a package at all
-├── NoSpace                the machine's disk cannot take it
-└── RequirementsTrouble    what it needs of Python cannot be installed
+PackageTroubleError              told to the owner as it is; it is tried again
+├── FetchError                   the master is away, or does not have it
+├── VerificationError            it is not what its owner signed, or not a package at all
+├── NoSpaceError                 the machine's disk cannot take it
+└── RequirementsTroubleError     what it needs of Python cannot be installed
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 
-class PackageTrouble(Exception):  # noqa: N818 - base of what is told to a package's owner
+class PackageTroubleError(Exception):
     """A package cannot come into a container now; the text says why and what to do.
 
     Attributes:
@@ -22,19 +22,19 @@ class PackageTrouble(Exception):  # noqa: N818 - base of what is told to a packa
     delay_factor: ClassVar[float] = 1.0
 
 
-class Unfetched(PackageTrouble):
+class FetchError(PackageTroubleError):
     """The master is away, or does not have it."""
 
 
-class Unverified(PackageTrouble):
+class VerificationError(PackageTroubleError):
     """It is not what its owner signed, or not a package at all."""
 
 
-class NoSpace(PackageTrouble):
+class NoSpaceError(PackageTroubleError):
     """The machine's disk cannot take it."""
 
 
-class RequirementsTrouble(PackageTrouble):
+class RequirementsTroubleError(PackageTroubleError):
     """What it needs of Python cannot be installed."""
 
     delay_factor = 10.0  # each attempt costs the machine, and whoever serves the distributions, a lot

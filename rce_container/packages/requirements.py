@@ -19,10 +19,10 @@ from pathlib import Path
 
 from rce.guard.turns import CrowdedError, Turns
 from rce.packages.requirements import FILE_NAME, read_requirements
-from rce.ros.packages import MANIFESTS, BadPackage, parse_manifest
+from rce.ros.packages import MANIFESTS, BadPackageError, parse_manifest
 from rce_container.exceptions import RuntimeUnavailableError
 from rce_container.packages.disk import forget_before_boot, in_thread, scratch_aside
-from rce_container.packages.exceptions import RequirementsTrouble
+from rce_container.packages.exceptions import RequirementsTroubleError
 from rce_container.packages.locks import Locks
 from rce_container.runtimes.namespace import interpreter_paths, read_only_mounts, system_mounts
 from rce_container.trees import remove, size_of
@@ -103,12 +103,12 @@ class Installer:
             A folder with Python modules.
 
         Raises:
-            RequirementsTrouble: They cannot be installed.
+            RequirementsTroubleError: They cannot be installed.
             OSError: They cannot be kept.
         """
         wanted = read_requirements((package / FILE_NAME).read_text("utf-8", "replace"))
         if wanted.faults:
-            raise RequirementsTrouble("; ".join(wanted.faults))
+            raise RequirementsTroubleError("; ".join(wanted.faults))
         python = await in_thread(_python_of, package)
         tag = await _tag_of(python)
         text = "\n".join(wanted.lines) + "\n"
@@ -119,7 +119,7 @@ class Installer:
                 async with self._turns.turn(user):
                     await self._have(path, text, python)
             except CrowdedError:
-                raise RequirementsTrouble("too many requirements wait to be installed here") from None
+                raise RequirementsTroubleError("too many requirements wait to be installed here") from None
         await in_thread(os.utime, path)
         async with self._tidying:
             await in_thread(self._make_room, path)
@@ -142,12 +142,12 @@ class Installer:
             try:
                 code = await self._run_pip(build, log, python)
             except TimeoutError:
-                raise RequirementsTrouble(
+                raise RequirementsTroubleError(
                     f"its {FILE_NAME} was not installed within {self._settings.timeout:.0f} s"
                 ) from None
             if code or not (build / SITE).is_dir():
                 words = "; ".join(log.read_text(errors="replace").strip().splitlines()[-_LAST_LINES:])
-                raise RequirementsTrouble(f"pip could not install its {FILE_NAME}: {words}")
+                raise RequirementsTroubleError(f"pip could not install its {FILE_NAME}: {words}")
             await in_thread(_seal, build / SITE)
             (build / SITE).rename(path)
 
@@ -178,7 +178,7 @@ class Installer:
                 async with asyncio.timeout(_POLL_S):
                     return await process.wait()
             if await in_thread(size_of, build) > self._settings.size:
-                raise RequirementsTrouble(
+                raise RequirementsTroubleError(
                     f"what its {FILE_NAME} asks for takes more than {self._settings.size} bytes"
                 )
 
@@ -239,14 +239,14 @@ def _python_of(package: Path) -> str:
         if manifest.is_file():
             try:
                 kind = parse_manifest(manifest, manifest.read_bytes(), package.name).python
-            except BadPackage as error:
-                raise RequirementsTrouble(str(error)) from error
+            except BadPackageError as error:
+                raise RequirementsTroubleError(str(error)) from error
             if kind == "engine":
                 return sys.executable
             break
     found = shutil.which("python3", path=_SYSTEM_PATH)
     if found is None:
-        raise RequirementsTrouble("the machine has no python3 for it")
+        raise RequirementsTroubleError("the machine has no python3 for it")
     return found
 
 

@@ -14,11 +14,11 @@ from rce.control.model import PackageSpec
 from rce.packages.requirements import FILE_NAME as REQUIREMENTS_FILE
 from rce_container.packages.cache import PackageCache, trouble_of
 from rce_container.packages.disk import in_thread
-from rce_container.packages.exceptions import PackageTrouble
+from rce_container.packages.exceptions import PackageTroubleError
 from rce_container.packages.requirements import Installer
 from rce_container.packages.shelf import Shelf
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 RETRY = Backoff(first=0.5, longest=30.0)
 """Pauses before it is tried again."""
@@ -106,11 +106,11 @@ class Supply:
         while True:
             try:
                 await self._bring(package)
-            except PackageTrouble as trouble:
+            except PackageTroubleError as trouble:
                 what = f"package {package.name} {package.version}"
                 text = f"{what} is not there yet: {trouble}; it is tried again"
                 if text != told:
-                    log.warning("%s: %s", self._holder, text)
+                    _log.warning("%s: %s", self._holder, text)
                     self._tell(text)
                 told = text
                 await asyncio.sleep(pauses.next() * trouble.delay_factor)

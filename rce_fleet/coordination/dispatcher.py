@@ -131,7 +131,7 @@ class Dispatcher:
             if ledger.grant(robot, self.settings.ahead):
                 self.send(record, tuple(ledger.granted(robot)))
 
-    # -- plans ----------------------------------------------------------------------------------------
+    # Plans
 
     def _awaited(self) -> bool:
         """Whether a plan has to wait for a robot that is being stopped."""
@@ -158,7 +158,7 @@ class Dispatcher:
             adopt_plan(self.state, request, result)
             self._grant()
 
-    # -- one robot ------------------------------------------------------------------------------------
+    # One robot
 
     def arrive(self, record: RobotRecord) -> bool:
         """Leave behind the cells that a robot has left; tell whether it is on its path."""

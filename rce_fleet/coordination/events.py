@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from rce_fleet.coordination.move_client import ClientReport
     from rce_fleet.coordination.replanning import PlanRequest, PlanResult
 
-# -- events -------------------------------------------------------------------------------------
+# Events
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ Event = (
     PoseSeen | ReportSeen | ObstacleSeen | GoalSet | CellBlocked | CellFreed | RobotRemoved | PlanMade | Tick
 )
 
-# -- instructions -------------------------------------------------------------------------------
+# Instructions
 
 
 @dataclass(frozen=True, slots=True)

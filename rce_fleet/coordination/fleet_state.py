@@ -55,7 +55,7 @@ class FleetState:
         """Whether a cell is a wall or blocked already."""
         return cell in self.grid.blocked or cell in self.blocked
 
-    # -- changes ------------------------------------------------------------------------------------
+    # Changes
 
     def touch(self, record: RobotRecord) -> None:
         """Note that a record was changed."""
@@ -110,7 +110,7 @@ class FleetState:
         record = self.robots.get(robot)
         return record.held_at if record else 0.0
 
-    # -- the outside --------------------------------------------------------------------------------
+    # The outside
 
     def take_changes(self) -> FleetChanges | None:
         """Return what the outside has not been told yet; None if it knows everything."""

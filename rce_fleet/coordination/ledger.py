@@ -62,7 +62,7 @@ class CellLedger:
         self._freed: set[int] = set()
         self._ripe: set[str] = set()
 
-    # -- reading --------------------------------------------------------------------------------
+    # Reading
 
     def claims(self, robot: str) -> frozenset[int]:
         """Cells that are the robot's now."""
@@ -102,7 +102,7 @@ class CellLedger:
         account = self._accounts.get(robot)
         return account.extra if account else frozenset()
 
-    # -- what became possible ----------------------------------------------------------------------
+    # What became possible
 
     def take_changed(self) -> set[str]:
         """Return the robots whose route or grant changed since the last call."""
@@ -119,7 +119,7 @@ class CellLedger:
         ripe, self._ripe = self._ripe, set()
         return ripe
 
-    # -- places ---------------------------------------------------------------------------------
+    # Places
 
     def place(self, robot: str, cell: int, overlaps: Iterable[int] = ()) -> None:
         """Put a robot in a cell; what it claimed before is free again, its route ends there.
@@ -156,7 +156,7 @@ class CellLedger:
         self._settle_owners(robot, account)
         del self._accounts[robot]
 
-    # -- plans ----------------------------------------------------------------------------------
+    # Plans
 
     def truncate(self, robot: str) -> None:
         """Drop what a robot was not yet granted."""
@@ -240,7 +240,7 @@ class CellLedger:
             self._ripe.add(robot)
         self._settle_owners(robot, account)
 
-    # -- books ----------------------------------------------------------------------------------
+    # Books
 
     def validate(self) -> None:
         """Check the invariants.

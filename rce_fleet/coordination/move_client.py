@@ -234,7 +234,7 @@ class MoveClient:
             return [SendStop(now)]
         return []
 
-    # -- lists ----------------------------------------------------------------------------------
+    # Lists
 
     def _drop(self, revision: int, now: float) -> list[Instruction]:
         self._update(revision=revision, cells=(), reached=None)
@@ -308,7 +308,7 @@ class MoveClient:
         (x, y), (to_x, to_y) = self.grid.centre(before), self.grid.centre(after)
         return atan2(to_y - y, to_x - x)
 
-    # -- goals ----------------------------------------------------------------------------------
+    # Goals
 
     def _finished(self, state: GoalState, now: float) -> list[Instruction]:
         self._goal = None
@@ -349,7 +349,7 @@ class MoveClient:
         self._advance(ClientEvent.STOPPED)
         return [*self._proceed(now), self._report]
 
-    # -- books ----------------------------------------------------------------------------------
+    # Books
 
     def _advance(self, event: ClientEvent) -> None:
         state = CLIENT_LIFE.advance(self._report.state, event, self.name, self._recent)

@@ -82,7 +82,7 @@ class FleetPlanner:
             Tick: self._take_tick,
         }
 
-    # -- the outside --------------------------------------------------------------------------------
+    # The outside
 
     def handle(self, event: Event, now: float) -> list[Instruction]:
         """Take an event that happened at ``now`` (seconds, never going back) and say what to do."""
@@ -120,7 +120,7 @@ class FleetPlanner:
             if self._deadlines[record.id] > self._due(record) + ROUNDING:
                 raise InvariantError(f"{record.id} is looked at too late, at {self._deadlines[record.id]}")
 
-    # -- what robots say ------------------------------------------------------------------------------
+    # What robots say
 
     def _take_pose(self, event: PoseSeen) -> None:
         if not (isfinite(event.x) and isfinite(event.y) and isfinite(event.yaw)) or self._gone(event.robot):
@@ -192,7 +192,7 @@ class FleetPlanner:
             if cell in self.state.ledger.granted(other.id)[1:]:
                 self._dispatcher.hold(other, f"{record.id} is in its way")
 
-    # -- requests -----------------------------------------------------------------------------
+    # Requests
 
     def _set_goal(self, event: GoalSet) -> Reply:
         record = self.state.robots.get(event.robot)
@@ -262,7 +262,7 @@ class FleetPlanner:
                 record.replans += 1
                 self._dispatcher.hold(record, f"cell {cell} on its path is blocked")
 
-    # -- time -----------------------------------------------------------------------------------------
+    # Time
 
     def _take_tick(self, _event: Tick) -> None:
         for robot in self._deadlines.take_due(self._now):
@@ -332,7 +332,7 @@ class FleetPlanner:
         elif record.phase is Phase.ACTIVE:
             self._dispatcher.send(record, tuple(self.state.ledger.granted(record.id)))
 
-    # -- small things -----------------------------------------------------------------------------------
+    # Small things
 
     def _gone(self, robot: str) -> bool:
         """Whether a robot was removed just now."""

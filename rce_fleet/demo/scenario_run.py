@@ -85,7 +85,7 @@ class ScenarioRun:
             await asyncio.sleep(POLL_S)
         self._ended = time.monotonic()
 
-    # -- state ----------------------------------------------------------------------------------------
+    # State
 
     async def _read_fleet(self) -> FleetModel | None:
         try:
@@ -118,7 +118,7 @@ class ScenarioRun:
             self._say(f"{robot} is at its goal, cell {self.goals[robot]}")
         self.reached = there
 
-    # -- requests -------------------------------------------------------------------------------------
+    # Requests
 
     async def _send_missing(self, fleet: FleetModel) -> None:
         for robot in fleet.robots:

@@ -115,7 +115,7 @@ class RobotDriver:
             self._listed_at = now
             self._list(self._topics, stamp)
 
-    # -- what comes in ------------------------------------------------------------------------------
+    # What comes in
 
     def _take_goal(self, message: Message) -> None:
         place = message.goal.target_pose.pose.position
@@ -125,7 +125,7 @@ class RobotDriver:
     def _take_cancel(self, message: Message) -> None:
         self._base.cancel(message.id, message.stamp.to_sec())
 
-    # -- what goes out ------------------------------------------------------------------------------
+    # What goes out
 
     def _sense(self, topics: _Topics, stamp: Time) -> None:
         robot, spec = self._robot, self._world.spec.lidar

@@ -104,7 +104,7 @@ class PlannerNode:
             await self._keep_time()
             planning.cancel()
 
-    # -- what comes in ------------------------------------------------------------------------------
+    # What comes in
 
     async def _look_around(self) -> None:
         """Take in every robot whose pose is published."""
@@ -190,7 +190,7 @@ class PlannerNode:
     def _remove_robot(self, request: Message) -> dict[str, Any]:
         return self._ask(RobotRemoved(request.robot))
 
-    # -- what goes out ------------------------------------------------------------------------------
+    # What goes out
 
     def _ask(self, event: Event) -> dict[str, Any]:
         """Give a request to the planner; the fields of the response."""

@@ -80,7 +80,7 @@ class MoveClientNode:
             if now - self._reported_at >= REPORT_EVERY:
                 self._do([self._client.report])
 
-    # -- what comes in ------------------------------------------------------------------------------
+    # What comes in
 
     def _take_map(self, message: Message) -> None:
         """Learn size and place of the cells: one pixel of the map is one cell."""
@@ -125,7 +125,7 @@ class MoveClientNode:
             status = message.status
             self._do(self._client.take_result(status.goal_id.id, GoalState(status.status), time.time()))
 
-    # -- what goes out ------------------------------------------------------------------------------
+    # What goes out
 
     def _do(self, instructions: list[Instruction]) -> None:
         for instruction in instructions:

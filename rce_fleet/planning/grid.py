@@ -61,7 +61,7 @@ class GridMap:
         """The same map with exactly these cells blocked."""
         return replace(self, blocked=frozenset(cells))
 
-    # -- numbers, places, metres ----------------------------------------------------------------
+    # Numbers, places, metres
 
     def cell(self, row: int, column: int) -> int:
         """Number of the cell at ``row`` and ``column``."""
@@ -104,7 +104,7 @@ class GridMap:
                     touched.add(cell)
         return touched
 
-    # -- neighbours ----------------------------------------------------------------------------
+    # Neighbours
 
     def around(self, cell: int) -> Iterator[int]:
         """Cells of the map that share an edge with ``cell``, blocked or not, ascending."""
@@ -135,7 +135,7 @@ class GridMap:
         """Whether every cell shares an edge with the one before it."""
         return all(self.adjacent(a, b) for a, b in pairwise(cells))
 
-    # -- connectivity -----------------------------------------------------------------------------
+    # Connectivity
 
     def reachable(self, start: int) -> set[int]:
         """Free cells that can be reached from ``start``, with ``start`` itself."""

@@ -45,7 +45,7 @@ class SimulatedRobot:
         self._estimate = PoseEstimate(noise, rng)
         self._odometry = Odometry(noise, rng)
 
-    # -- senses -----------------------------------------------------------------------------------
+    # Senses
 
     @property
     def pose(self) -> Pose:
@@ -75,7 +75,7 @@ class SimulatedRobot:
         yaw = self.body.angle
         return Twist(vx * cos(yaw) + vy * sin(yaw), self.body.angular_velocity)
 
-    # -- motion -----------------------------------------------------------------------------------
+    # Motion
 
     def drive(self, twist: Twist) -> None:
         """Set the speeds that the wheels keep from now on."""

@@ -92,7 +92,7 @@ class World:
         self._wall_edges = self._build_walls()
         self._edges = self._wall_edges
 
-    # -- things in it -------------------------------------------------------------------------------
+    # Things in it
 
     @property
     def robots(self) -> dict[str, SimulatedRobot]:
@@ -159,7 +159,7 @@ class World:
             self._space.remove(box)
             self._rebuild_edges()
 
-    # -- time ---------------------------------------------------------------------------------------
+    # Time
 
     def step(self, dt: float | None = None) -> None:
         """Let time go on by ``dt`` seconds, one time step by default.
@@ -212,7 +212,7 @@ class World:
             nearest = float(apart[np.triu_indices(len(places), 1)].min())
             self.min_separation = min(self.min_separation, nearest - 2 * self.spec.robot_radius)
 
-    # -- making it ----------------------------------------------------------------------------------
+    # Making it
 
     def _watch_contacts(self) -> None:
         def count_robot(_arbiter: pymunk.Arbiter, _space: pymunk.Space, _data: object) -> None:

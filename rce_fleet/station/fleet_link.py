@@ -175,7 +175,7 @@ class FleetLink:
                     case _:
                         assert_never(desired)
 
-    # -- what comes in ------------------------------------------------------------------------------
+    # What comes in
 
     def take_state(self, message: dict[str, Any]) -> None:
         """Take a ``fleet/FleetState``."""

@@ -9,7 +9,7 @@ import msgspec
 import platformdirs
 from msgspec import Struct
 
-from rce_master.cli.exceptions import CliError, NotLoggedIn
+from rce_master.cli.exceptions import CliError, NotLoggedInError
 
 FILE_VARIABLE = "RCE_LOGIN_FILE"
 
@@ -40,14 +40,14 @@ def load() -> Credentials:
     """Read the login.
 
     Raises:
-        NotLoggedIn: There is none.
+        NotLoggedInError: There is none.
         CliError: It cannot be read.
     """
     file = login_file()
     try:
         return msgspec.json.decode(file.read_bytes(), type=Credentials)
     except FileNotFoundError:
-        raise NotLoggedIn from None
+        raise NotLoggedInError from None
     except (OSError, msgspec.MsgspecError) as error:
         raise CliError(f"cannot read the login in {file}: {error}; run: rce login") from error
 

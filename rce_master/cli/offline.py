@@ -20,8 +20,8 @@ from rce.config.folders import default_state_dir
 from rce.config.loading import load_settings
 from rce_master.audit import AuditLog
 from rce_master.cli import credentials
-from rce_master.cli.exceptions import CliError, NotLoggedIn
-from rce_master.exceptions import StoreBusy
+from rce_master.cli.exceptions import CliError, NotLoggedInError
+from rce_master.exceptions import StoreBusyError
 from rce_master.settings import state_settings
 from rce_master.state.core import State
 from rce_master.state_service import load_converted
@@ -49,7 +49,7 @@ def choose(state_dir: Path | None) -> Path | Credentials:
         return state_dir
     try:
         return credentials.load()
-    except NotLoggedIn:
+    except NotLoggedInError:
         return default_state_dir()
 
 
@@ -97,7 +97,7 @@ async def open_state(state_dir: Path) -> AsyncIterator[OfflineState]:
         raise CliError(str(error)) from error
     try:
         store = await SqliteStore.open(folder)
-    except StoreBusy as error:
+    except StoreBusyError as error:
         raise CliError(f"{error}; to work over its API, log in there: rce login") from error
     audit = AuditLog(folder / "audit", time.time)
     try:

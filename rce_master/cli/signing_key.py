@@ -6,7 +6,7 @@ import os
 import stat
 from pathlib import Path
 
-from rce.packages.exceptions import BadKey
+from rce.packages.exceptions import BadKeyError
 from rce.packages.signing import SigningKey
 from rce_master.cli.credentials import login_file
 from rce_master.cli.exceptions import CliError
@@ -39,7 +39,7 @@ def load() -> SigningKey | None:
         raise CliError(f"the key {file} can be read by others; if it was not copied, run: chmod 600 {file}")
     try:
         return SigningKey.from_pem(text)
-    except BadKey as error:
+    except BadKeyError as error:
         raise CliError(f"{file}: {error}") from error
 
 

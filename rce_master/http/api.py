@@ -15,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 
 from rce.web.bodies import read_whole
 from rce.web.openapi import PREFIX, build_document
-from rce_master.exceptions import Invalid, MasterError
+from rce_master.exceptions import InvalidRequestError, MasterError
 from rce_master.http import (
     api_account,
     api_audit,
@@ -133,13 +133,13 @@ def read_body(model: type[BaseModel], text: bytes) -> BaseModel:
     """Read a request's body.
 
     Raises:
-        Invalid: It does not fit; the text names each fault with its path.
+        InvalidRequestError: It does not fit; the text names each fault with its path.
     """
     try:
         return model.model_validate_json(text or b"{}")
     except ValidationError as error:
         faults = "; ".join(f"{_place(fault['loc'])}: {fault['msg']}" for fault in error.errors())
-        raise Invalid(faults) from None
+        raise InvalidRequestError(faults) from None
 
 
 def _place(location: tuple[int | str, ...]) -> str:

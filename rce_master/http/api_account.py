@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rce_master.auth import client_digest
-from rce_master.exceptions import Forbidden, Invalid, NotFound, WrongCredentials
+from rce_master.exceptions import ForbiddenError, InvalidRequestError, NotFoundError, WrongCredentialsError
 from rce_master.http import models
 from rce_master.http.routes import Call, RouteTable
 from rce_master.http.views import Views
@@ -91,9 +91,9 @@ async def set_password(call: Call) -> None:
     name = call.path("name")
     services = call.services
     if name != call.caller.name and not call.is_admin:
-        raise Forbidden("only an administrator changes another user's password")
+        raise ForbiddenError("only an administrator changes another user's password")
     if name not in services.state_service.tables.users:
-        raise NotFound(f"there is no user {name!r}")
+        raise NotFoundError(f"there is no user {name!r}")
     body = call.read(models.PasswordIn)
     if name == call.caller.name:
         await _check_old(call, body.old_password)
@@ -115,11 +115,13 @@ async def set_role(call: Call) -> None:
 async def _check_old(call: Call, password: str) -> None:
     """Whoever found a token must not be able to lock its owner out."""
     if not password:
-        raise Invalid("old_password: is missing; to change your own password, give the one until now")
+        raise InvalidRequestError(
+            "old_password: is missing; to change your own password, give the one until now"
+        )
     try:
         await call.services.authenticator.verify(call.caller.name, client_digest(password), call.address)
-    except WrongCredentials:
-        raise Forbidden("old_password: is wrong") from None
+    except WrongCredentialsError:
+        raise ForbiddenError("old_password: is wrong") from None
 
 
 def _views(call: Call) -> Views:

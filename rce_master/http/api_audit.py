@@ -5,7 +5,7 @@ from __future__ import annotations
 from msgspec.structs import asdict
 
 from rce.web.openapi import Query
-from rce_master.exceptions import Forbidden
+from rce_master.exceptions import ForbiddenError
 from rce_master.http import models
 from rce_master.http.routes import Call, RouteTable
 from rce_master.state.records import UserRole
@@ -49,7 +49,7 @@ async def note_action(call: Call) -> None:
     """Note what somebody steered; a station does it with the token of who steered."""
     body = call.read(models.AuditIn)
     if call.caller.role is UserRole.VIEWER and body.outcome == "done":
-        raise Forbidden("role viewer steers nothing, so there is nothing to note")
+        raise ForbiddenError("role viewer steers nothing, so there is nothing to note")
     call.services.audit.add(
         call.caller.name,
         body.action,

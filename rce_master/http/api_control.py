@@ -7,7 +7,7 @@ from typing import Any
 
 from rce.web.openapi import Query
 from rce_master import requests
-from rce_master.exceptions import Invalid
+from rce_master.exceptions import InvalidRequestError
 from rce_master.http import models
 from rce_master.http.routes import OF_USER, Call, RouteTable
 
@@ -35,7 +35,7 @@ async def _request(call: Call, kind: str, data: dict[str, Any]) -> None:
     """
     wanted, faults = requests.read(call.owner, kind, data)
     if faults:
-        raise Invalid("; ".join(_FAULT.sub(_place, fault) for fault in faults))
+        raise InvalidRequestError("; ".join(_FAULT.sub(_place, fault) for fault in faults))
     for outcome in await call.services.state_service.submit_all(wanted):
         if outcome is not None:
             raise outcome

@@ -12,7 +12,7 @@ from websockets.exceptions import ConnectionClosed
 
 from rce.aio.tasks import cancel_and_wait
 from rce.control.execution import MAX_COMMAND, NOT_RUN, ended_frame, read_command
-from rce_master.exceptions import Invalid, MasterError
+from rce_master.exceptions import InvalidRequestError, MasterError
 from rce_master.http.routes import OF_USER, Call, RouteTable
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ async def execute(call: Call) -> web.StreamResponse:
     peer = call.services.reconciler.task_set_of(id_)
     user = web.WebSocketResponse(compress=False, heartbeat=HEARTBEAT_S, max_msg_size=MAX_COMMAND + 1)
     if not user.can_prepare(call.request):
-        raise Invalid("this path is for WebSockets; 'rce exec' uses it")
+        raise InvalidRequestError("this path is for WebSockets; 'rce exec' uses it")
     await user.prepare(call.request)
     try:
         command = await _first(user)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rce_master.exceptions import Forbidden, NotFound
+from rce_master.exceptions import ForbiddenError, NotFoundError
 from rce_master.http import models
 from rce_master.http.routes import Call, RouteTable
 from rce_master.http.views import Views
@@ -22,7 +22,7 @@ async def show_user(call: Call) -> models.UserLimitsOut:
     """Show a user with their limits."""
     name = call.path("name")
     if name != call.caller.name and not call.is_admin:
-        raise Forbidden("only an administrator sees other users")
+        raise ForbiddenError("only an administrator sees other users")
     return _shown(call, name)
 
 
@@ -48,7 +48,7 @@ def _shown(call: Call, name: str) -> models.UserLimitsOut:
     tables, settings = services.state_service.tables, services.state_service.state.settings
     user = tables.users.get(name)
     if user is None:
-        raise NotFound(f"there is no user {name!r}")
+        raise NotFoundError(f"there is no user {name!r}")
     used = limits.used_of(tables, name)
     found = (limits.limit_of(tables, settings, name, kind) for kind in limits.KINDS)
     known = Views(tables, services.reconciler.usage).user(user)

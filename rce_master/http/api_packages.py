@@ -5,11 +5,11 @@ from __future__ import annotations
 from functools import cache
 from typing import TYPE_CHECKING
 
-from rce.packages.exceptions import BadKey
+from rce.packages.exceptions import BadKeyError
 from rce.packages.signing import key_id
 from rce.web.bodies import read_pieces
 from rce.web.openapi import Query
-from rce_master.exceptions import Invalid, NotFound
+from rce_master.exceptions import InvalidRequestError, NotFoundError
 from rce_master.http import package_models as models
 from rce_master.http.routes import OF_USER, Call, RouteTable
 from rce_master.packages.service import PushRequest
@@ -51,7 +51,7 @@ async def show_package(call: Call) -> models.PackageOut:
     name, version = call.path("name"), call.path("version")
     found = tables.packages.get(user_package_key(call.owner, name, version))
     if found is None:
-        raise NotFound(f"there is no package {name!r} of version {version!r}")
+        raise NotFoundError(f"there is no package {name!r} of version {version!r}")
     return _shown(tables, found)
 
 
@@ -113,8 +113,8 @@ async def register_package_key(call: Call) -> models.PackageKeyOut:
     body = call.read(models.PackageKeyIn)
     try:
         key_id(body.key)
-    except BadKey as error:
-        raise Invalid(str(error)) from error
+    except BadKeyError as error:
+        raise InvalidRequestError(str(error)) from error
     key = PackageKey(user=call.caller.name, key=body.key, label=body.label, created=call.services.clock())
     await call.services.state_service.submit(commands.AddPackageKey(key=key))
     return _key_out(key)

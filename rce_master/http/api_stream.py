@@ -14,7 +14,7 @@ from aiohttp import web
 from rce.control.logs import LogLevel, LogQuery, LogStream
 from rce.web.openapi import Query
 from rce_master.events import Event
-from rce_master.exceptions import Invalid
+from rce_master.exceptions import InvalidRequestError
 from rce_master.http import models
 from rce_master.http.routes import ENDED, OF_USER, Call, RouteTable
 
@@ -70,7 +70,7 @@ async def read_container_log(call: Call) -> models.LogOut:
 async def _read_log(call: Call, node: str) -> models.LogOut:
     offset, limit = call.number("offset", 0), call.number("limit", 65536)
     if not 0 < limit <= MAX_LOG:
-        raise Invalid(f"query parameter 'limit' must be 1 to {MAX_LOG}")
+        raise InvalidRequestError(f"query parameter 'limit' must be 1 to {MAX_LOG}")
     id_ = f"{call.owner}/{call.path('container')}"
     query = _log_query(call.request.query)
     async with call.services.quotas.log_read(call.caller):
@@ -98,7 +98,7 @@ def _one_of(words: type[E], name: str, word: str) -> E:
     try:
         return words(word)
     except ValueError:
-        raise Invalid(f"query parameter {name!r} must be one of {_words(words)}") from None
+        raise InvalidRequestError(f"query parameter {name!r} must be one of {_words(words)}") from None
 
 
 @routes.route(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rce.model.names import is_name
-from rce_master.exceptions import Forbidden, Invalid
+from rce_master.exceptions import ForbiddenError, InvalidRequestError
 from rce_master.http import models
 from rce_master.http.routes import OF_USER, Call, RouteTable
 from rce_master.state import commands
@@ -70,7 +70,7 @@ async def add_robot_token(call: Call) -> models.TokenOut:
     """Make a robot's token."""
     body = call.read(models.RobotTokenIn)
     if not is_name(body.robot):
-        raise Invalid(
+        raise InvalidRequestError(
             f"robot: {body.robot!r} is not a robot ID: use letters, digits and '_', beginning with a letter"
         )
     scope = ROBOT_SCOPE + body.robot
@@ -96,7 +96,7 @@ async def _make(
     services = call.services
     owner = services.state_service.tables.users.get(user)
     if owner is None:
-        raise Forbidden(f"user {user!r} was removed meanwhile")
+        raise ForbiddenError(f"user {user!r} was removed meanwhile")
     token, record = new_token(user, label, services.clock(), days * _DAY_S, scope=scope)
     await services.state_service.submit(commands.AddToken(token=record, replaces=replaces))
     return models.TokenOut(
@@ -106,7 +106,7 @@ async def _make(
 
 def _of(call: Call) -> list[Token]:
     if call.owner != call.caller.name and not call.is_admin:
-        raise Forbidden("only an administrator sees the tokens of others")
+        raise ForbiddenError("only an administrator sees the tokens of others")
     now = call.services.clock()
     found = call.services.state_service.tables.tokens.by("user", call.owner)
     return sorted((token for token in found if not token.is_expired(now)), key=lambda token: token.created)

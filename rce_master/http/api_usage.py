@@ -5,7 +5,7 @@ from __future__ import annotations
 from aiohttp import web
 
 from rce.web.openapi import Query
-from rce_master.exceptions import Invalid
+from rce_master.exceptions import InvalidRequestError
 from rce_master.http.routes import ENDED, OF_USER, Call, RouteTable
 from rce_master.http.usage_models import UsageOut
 from rce_master.http.usage_views import UsageViews
@@ -41,7 +41,9 @@ async def stream_usage(call: Call) -> web.StreamResponse:
     """Stream what is consumed until an end is made of it, or the token is worth nothing any more."""
     interval = call.number("interval", 2)
     if not LEAST_INTERVAL_S <= interval <= MOST_INTERVAL_S:
-        raise Invalid(f"query parameter 'interval' must be {LEAST_INTERVAL_S} to {MOST_INTERVAL_S}")
+        raise InvalidRequestError(
+            f"query parameter 'interval' must be {LEAST_INTERVAL_S} to {MOST_INTERVAL_S}"
+        )
     with call.services.quotas.stream(call.caller):
         return await _stream(call, call.scope, interval)
 

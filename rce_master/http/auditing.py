@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce_master.exceptions import AuthError, Forbidden
+from rce_master.exceptions import AuthError, ForbiddenError
 
 if TYPE_CHECKING:
     from rce_master.exceptions import MasterError
@@ -25,9 +25,10 @@ def note_done(route: Route, call: Call) -> None:
 
 def note_refused(route: Route, call: Call, error: MasterError) -> None:
     """Note a request that was refused for who asked. What was wrong in itself is not noted."""
-    if isinstance(error, AuthError | Forbidden) and _is_noted(route):
+    if isinstance(error, AuthError | ForbiddenError) and _is_noted(route):
         user = call.user.name if call.user is not None else _claimed(call)
-        detail = f"{type(error).__name__} {route.method} {_subject(call)}".rstrip()
+        what = type(error).__name__.removesuffix("Error")
+        detail = f"{what} {route.method} {_subject(call)}".rstrip()
         call.services.audit.refuse(user, _action(route), detail=detail, address=call.address)
 
 

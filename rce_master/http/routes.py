@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from rce.guard.proxies import TrustedProxies
 from rce.web.openapi import Operation, Query
-from rce_master.exceptions import Forbidden, Invalid, NotFound, WrongCredentials
+from rce_master.exceptions import ForbiddenError, InvalidRequestError, NotFoundError, WrongCredentialsError
 from rce_master.state.records import UserRole
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ class Call:
         """Whether the caller could ask for the same now; for answers that go on for long."""
         try:
             user, _ = self.services.tokens.find(self.token)
-        except WrongCredentials:
+        except WrongCredentialsError:
             return False
         return user == self.user
 
@@ -117,8 +117,8 @@ class Call:
         """Whose robots and containers are meant: the caller's, or those of ``?user=`` for an administrator.
 
         Raises:
-            Forbidden: Somebody else's are asked for.
-            NotFound: There is no such user.
+            ForbiddenError: Somebody else's are asked for.
+            NotFoundError: There is no such user.
         """
         return self._owner(looks=self.request.method == "GET")
 
@@ -131,9 +131,11 @@ class Call:
         name = self.request.query.get("user", self.caller.name)
         looks = looks and self.caller.role.sees_all
         if name != self.caller.name and not self.is_admin and not looks:
-            raise Forbidden("only an administrator controls, and only roles above user see, what others have")
+            raise ForbiddenError(
+                "only an administrator controls, and only roles above user see, what others have"
+            )
         if name not in self.services.state_service.tables.users:
-            raise NotFound(f"there is no user {name!r}")
+            raise NotFoundError(f"there is no user {name!r}")
         return name
 
     @property
@@ -149,22 +151,22 @@ class Call:
         """A query parameter that must be there.
 
         Raises:
-            Invalid: It is not.
+            InvalidRequestError: It is not.
         """
         try:
             return self.request.query[name]
         except KeyError:
-            raise Invalid(f"query parameter {name!r} is missing") from None
+            raise InvalidRequestError(f"query parameter {name!r} is missing") from None
 
     def number(self, name: str, default: int) -> int:
         """A query parameter that is a whole number.
 
         Raises:
-            Invalid: It is none, or one that no counter reaches.
+            InvalidRequestError: It is none, or one that no counter reaches.
         """
         text = self.request.query.get(name, str(default))
         if not _NUMBER.fullmatch(text):
-            raise Invalid(f"query parameter {name!r} must be a whole number of at most 18 digits")
+            raise InvalidRequestError(f"query parameter {name!r} must be a whole number of at most 18 digits")
         return int(text)
 
     def read(self, model: type[M]) -> M:

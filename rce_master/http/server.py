@@ -15,12 +15,12 @@ from rce.web.origin import ServerNames, is_foreign
 from rce_master.exceptions import (
     AuthError,
     MasterError,
-    Refused,
+    RefusedError,
     StoreError,
-    TaskSetAway,
-    TooManyFailures,
-    TooManyLogins,
-    TooMuch,
+    TaskSetAwayError,
+    TooManyFailuresError,
+    TooManyLoginsError,
+    TooMuchError,
 )
 from rce_master.http.access import check_metrics
 from rce_master.http.entry import Entry
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 MAX_BODY = 1 << 20
 
@@ -112,11 +112,11 @@ async def _errors(request: web.Request, handler: Handler) -> web.StreamResponse:
 
 def _status(error: MasterError) -> int:
     match error:
-        case Refused():
+        case RefusedError():
             return error.status
-        case TooManyFailures():
+        case TooManyFailuresError():
             return 429
-        case TooManyLogins() | StoreError() | TaskSetAway():
+        case TooManyLoginsError() | StoreError() | TaskSetAwayError():
             return 503
         case AuthError():
             return 401
@@ -126,9 +126,9 @@ def _status(error: MasterError) -> int:
 
 def _headers(error: MasterError) -> dict[str, str]:
     match error:
-        case TooManyFailures() | TooMuch():
+        case TooManyFailuresError() | TooMuchError():
             return {hdrs.RETRY_AFTER: str(math.ceil(error.retry_after))}
-        case TooManyLogins():
+        case TooManyLoginsError():
             return {hdrs.RETRY_AFTER: "1"}
         case AuthError():
             return {hdrs.WWW_AUTHENTICATE: "Bearer"}

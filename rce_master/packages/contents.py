@@ -12,9 +12,9 @@ import tempfile
 from typing import TYPE_CHECKING
 
 from rce.packages.contents import Contents, inspect
-from rce.packages.exceptions import BadArchive
+from rce.packages.exceptions import BadArchiveError
 from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
-from rce_master.exceptions import Invalid, StoreError
+from rce_master.exceptions import InvalidRequestError, StoreError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Collection
@@ -39,12 +39,12 @@ class Incoming:
         """Tell what it holds.
 
         Raises:
-            Invalid: It is not a package's archive.
+            InvalidRequestError: It is not a package's archive.
         """
         try:
             return await asyncio.to_thread(self._inspect)
-        except BadArchive as error:
-            raise Invalid(f"the archive cannot be taken: {error}") from error
+        except BadArchiveError as error:
+            raise InvalidRequestError(f"the archive cannot be taken: {error}") from error
 
     def _inspect(self) -> Contents:
         with self.path.open("rb") as file:
@@ -68,7 +68,7 @@ class ContentStore:
         """Take an archive in; what was not kept at the end is removed.
 
         Raises:
-            Invalid: It is too large.
+            InvalidRequestError: It is too large.
             StoreError: It cannot be written.
         """
         try:
@@ -128,7 +128,7 @@ class ContentStore:
                 held += chunk
                 size += len(chunk)
                 if size > self._limits.archive:
-                    raise Invalid(f"the archive has more than {self._limits.archive} bytes")
+                    raise InvalidRequestError(f"the archive has more than {self._limits.archive} bytes")
                 if len(held) >= _BUFFER:
                     await asyncio.to_thread(_append, file.fileno(), digest.update, bytes(held))
                     held.clear()

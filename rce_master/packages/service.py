@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 from rce.control.messages import TaskSetKind
 from rce.guard.turns import CrowdedError, Turns
-from rce.packages.exceptions import BadKey, BadSignature
+from rce.packages.exceptions import BadKeyError, BadSignatureError
 from rce.packages.signing import statement, verify
-from rce_master.exceptions import Busy, Forbidden, Invalid
+from rce_master.exceptions import BusyError, ForbiddenError, InvalidRequestError
 from rce_master.packages.uploads import MAX_UPLOADS, Uploads
 from rce_master.state import commands, packages
 from rce_master.state.records import UserPackage, package_key_key, user_package_key
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rce_master.state.changes import Changes
     from rce_master.state_service import StateService
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 INSPECTED_AT_ONCE = 2
 """Archives that are looked through, which takes processor time."""
@@ -84,7 +84,7 @@ class PackageService:
                 try:
                     await asyncio.to_thread(self._store.sweep, known)
                 except OSError as error:
-                    logger.error("packages that are needed no more stay on the disk: %s", error)  # noqa: TRY400
+                    _log.error("packages that are needed no more stay on the disk: %s", error)
 
     async def push(
         self, request: PushRequest, size: int, chunks: AsyncIterator[bytes]
@@ -128,19 +128,21 @@ class PackageService:
             async with self._turns.turn(user):
                 return await incoming.inspect()
         except CrowdedError:
-            raise Busy("too many packages are pushed at the same time; try again in a moment") from None
+            raise BusyError("too many packages are pushed at the same time; try again in a moment") from None
 
     def _check_early(self, request: PushRequest, size: int) -> None:
         """Refuse what is to be refused anyway before all of it has come."""
         tables, settings = self._state_service.tables, self._state_service.state.settings
         if package_key_key(request.user, request.key) not in tables.package_keys:
-            raise Forbidden("the key is not registered with your account; run: rce package key register")
+            raise ForbiddenError("the key is not registered with your account; run: rce package key register")
         if user_package_key(request.user, request.name, request.version) not in tables.packages:
             packages.check_room(tables, settings, request.user, size)
 
     def _package(self, request: PushRequest, incoming: Incoming, contents: Contents) -> UserPackage:
         if contents.name != request.name:
-            raise Invalid(f"the archive holds the package {contents.name!r}, not {request.name!r}")
+            raise InvalidRequestError(
+                f"the archive holds the package {contents.name!r}, not {request.name!r}"
+            )
         return UserPackage(
             user=request.user,
             name=request.name,
@@ -179,7 +181,7 @@ def _verify(request: PushRequest, incoming: Incoming) -> None:
     signed = statement(request.user, request.name, request.version, incoming.sha256)
     try:
         verify(request.key, request.signature, signed)
-    except (BadKey, BadSignature) as error:
-        raise Invalid(
+    except (BadKeyError, BadSignatureError) as error:
+        raise InvalidRequestError(
             f"{error}; the package was changed on its way, or signed for another user or version"
         ) from error

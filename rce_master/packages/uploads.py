@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rce_master.exceptions import Busy, TooMuch
+from rce_master.exceptions import BusyError, TooMuchError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -60,11 +60,11 @@ class Uploads:
         """Have a place for as long as the context lasts.
 
         Raises:
-            TooMuch: The user is sending another one.
-            Busy: There is no room, or it took too long, or gave way to another one.
+            TooMuchError: The user is sending another one.
+            BusyError: There is no room, or it took too long, or gave way to another one.
         """
         if user in self._uploads:
-            raise TooMuch("you are pushing another package just now; try again when it is done", 5)
+            raise TooMuchError("you are pushing another package just now; try again when it is done", 5)
         if len(self._uploads) >= MAX_UPLOADS:
             self._make_room()
         upload: Upload | None = None
@@ -74,8 +74,10 @@ class Uploads:
                 yield upload
         except TimeoutError:
             if upload is not None and upload.gave_way:
-                raise Busy("the archive came too slowly and gave way to others; try again later") from None
-            raise Busy(f"the archive did not come in within {UPLOAD_S:.0f} s") from None
+                raise BusyError(
+                    "the archive came too slowly and gave way to others; try again later"
+                ) from None
+            raise BusyError(f"the archive did not come in within {UPLOAD_S:.0f} s") from None
         finally:
             if upload is not None and self._uploads.get(user) is upload:
                 del self._uploads[user]
@@ -84,7 +86,7 @@ class Uploads:
         now = self._clock()
         older = [one for one in self._uploads.values() if now - one.begun >= FIRST_S]
         if not older:
-            raise Busy("too many packages are pushed at the same time; try again in a moment")
+            raise BusyError("too many packages are pushed at the same time; try again in a moment")
         slowest = min(older, key=lambda one: one.rate(now))
         slowest.gave_way = True
         slowest.deadline.reschedule(asyncio.get_running_loop().time())

@@ -10,7 +10,7 @@ from rce.control.limits import MEGABYTE, MIN_MEMORY
 from rce.control.messages import TaskSetKind
 from rce.model.specs import Network, Resources
 from rce.protocol.container_checks import DEFAULT_PREFIX
-from rce_master.exceptions import Conflict, Forbidden, Invalid
+from rce_master.exceptions import ConflictError, ForbiddenError, InvalidRequestError
 from rce_master.state import limits
 from rce_master.state.placement import Room
 from rce_master.state.records import Container, TaskSet, UserRole, tombstone_key
@@ -132,7 +132,7 @@ def check_resources(tx: Transaction, user: str, id_: str, requested: Resources) 
         Refused: They may not; the text says why and how to mend it.
     """
     if 0 < requested.memory < MIN_MEMORY:
-        raise Invalid(
+        raise InvalidRequestError(
             f"memory: {requested.memory / MEGABYTE:.3g} MB are too little; a container itself needs "
             f"{MIN_MEMORY // MEGABYTE} MB (a plain number is MB)"
         )
@@ -145,9 +145,9 @@ def check_resources(tx: Transaction, user: str, id_: str, requested: Resources) 
 
 def _check_privileges(requested: Resources) -> None:
     if requested.network is Network.HOST:
-        raise Forbidden("network: host is for containers of administrators; use none or group")
+        raise ForbiddenError("network: host is for containers of administrators; use none or group")
     if requested.image.startswith("/"):
-        raise Forbidden("image: folders of the machine are for administrators; use an OCI image's name")
+        raise ForbiddenError("image: folders of the machine are for administrators; use an OCI image's name")
 
 
 def _check_group(requested: Resources, others: list[Container]) -> None:
@@ -160,12 +160,12 @@ def _check_group(requested: Resources, others: list[Container]) -> None:
             continue
         there = _address(theirs.group_ip)
         if there.ip == address.ip:
-            raise Conflict(
+            raise ConflictError(
                 f"groupIp: {address.ip} is the address of container {other.tag!r} of the group "
                 f"{requested.group!r}"
             )
         if there.network != address.network:
-            raise Conflict(
+            raise ConflictError(
                 f"groupIp: {address} is not in {there.network}, where container {other.tag!r} of the group "
                 f"{requested.group!r} is; give all of them addresses of one network"
             )

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from rce.control.model import EndpointState, EndpointStatus, LinkAddress, NodeState, NodeStatus
 from rce.model.specs import NodeSpec, ParameterValue
 from rce.protocol.container_checks import find_circle
-from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
+from rce_master.exceptions import ConflictError, InvalidRequestError, LimitReachedError, NotFoundError
 from rce_master.state import activity, capacity, draining, endpoints, limits, packages, placing
 from rce_master.state.lifecycle import ContainerEvent, ContainerPhase
 from rce_master.state.records import Container, ContainerLive
@@ -47,12 +47,12 @@ def create_container(tx: Transaction, command: CreateContainer) -> None:
     there = tx.tables.endpoints.get(id_)
     if isinstance(there, Container):
         if command.resources not in (there.resources, there.made):
-            raise Conflict(
+            raise ConflictError(
                 f"container {command.tag!r} exists with other settings; resize or destroy it first"
             )
         return
     if there is not None:
-        raise Conflict(f"{command.tag!r} is a robot already; a container needs another tag")
+        raise ConflictError(f"{command.tag!r} is a robot already; a container needs another tag")
     limits.check_containers(tx, command.user)
     capacity.check_resources(tx, command.user, id_, command.resources)
     made = Container(
@@ -83,13 +83,13 @@ def add_node(tx: Transaction, command: AddNode) -> None:
     if there == node:
         return
     if there is not None:
-        raise Conflict(
+        raise ConflictError(
             f"node {node.tag!r} of container {container.tag!r} exists with other settings; remove it first"
         )
     packages.check_node(tx.tables, command.user, node)
     _check_order(container, node)
     if len(container.nodes) >= tx.settings.max_nodes:
-        raise LimitReached(f"container {container.tag!r} has {tx.settings.max_nodes} nodes already")
+        raise LimitReachedError(f"container {container.tag!r} has {tx.settings.max_nodes} nodes already")
     size = endpoints.grown(tx, container, node)
     tx.put(replace(container, nodes={**container.nodes, node.tag: node}, size=size))
     tx.touch(container.id)
@@ -100,14 +100,16 @@ def _check_order(container: Container, node: NodeSpec) -> None:
     after = {other.tag: other.after for other in (*container.nodes.values(), node)}
     circle = find_circle(node.tag, after)
     if circle:
-        raise Invalid(f"node {node.tag!r}: after goes round in a circle: {' after '.join(circle)}")
+        raise InvalidRequestError(
+            f"node {node.tag!r}: after goes round in a circle: {' after '.join(circle)}"
+        )
 
 
 def remove_node(tx: Transaction, command: RemoveNode) -> None:
     """Remove a node."""
     container = find(tx, command.user, command.container)
     if command.tag not in container.nodes:
-        raise NotFound(f"container {container.tag!r} has no node {command.tag!r}")
+        raise NotFoundError(f"container {container.tag!r} has no node {command.tag!r}")
     kept = {t: n for t, n in container.nodes.items() if t != command.tag}
     size = container.size - endpoints.size_of(container.nodes[command.tag])
     tx.put(replace(container, nodes=kept, size=size))
@@ -122,7 +124,9 @@ def set_parameter(tx: Transaction, command: SetParameter) -> None:
     if there == command.value and type(there) is type(command.value):
         return
     if there is None and len(container.parameters) >= tx.settings.max_parameters:
-        raise LimitReached(f"container {container.tag!r} has {tx.settings.max_parameters} parameters already")
+        raise LimitReachedError(
+            f"container {container.tag!r} has {tx.settings.max_parameters} parameters already"
+        )
     before = None if there is None else (command.name, there)
     size = endpoints.grown(tx, container, (command.name, command.value), before)
     # Taken out first: 1 and True are equal, and an equal value must still replace the old one.
@@ -136,7 +140,7 @@ def delete_parameter(tx: Transaction, command: DeleteParameter) -> None:
     """Delete a parameter."""
     container = find(tx, command.user, command.container)
     if command.name not in container.parameters:
-        raise NotFound(f"container {container.tag!r} has no parameter {command.name!r}")
+        raise NotFoundError(f"container {container.tag!r} has no parameter {command.name!r}")
     kept = {n: v for n, v in container.parameters.items() if n != command.name}
     size = container.size - endpoints.size_of((command.name, container.parameters[command.name]))
     tx.put(replace(container, parameters=kept, size=size))
@@ -146,9 +150,11 @@ def delete_parameter(tx: Transaction, command: DeleteParameter) -> None:
 def _check_value(name: str, value: ParameterValue) -> None:
     for item in value if isinstance(value, list) else [value]:
         if isinstance(item, int) and not -_INT32 <= item < _INT32:
-            raise Invalid(f"parameter {name!r}: {item} does not fit into 32 bits, the size of ROS's integers")
+            raise InvalidRequestError(
+                f"parameter {name!r}: {item} does not fit into 32 bits, the size of ROS's integers"
+            )
         if isinstance(item, float) and not math.isfinite(item):
-            raise Invalid(f"parameter {name!r}: {item} is not a finite number")
+            raise InvalidRequestError(f"parameter {name!r}: {item} is not a finite number")
 
 
 def find(tx: Transaction, user: str, tag: str) -> Container:
@@ -161,8 +167,8 @@ def find(tx: Transaction, user: str, tag: str) -> Container:
     if isinstance(found, Container):
         return found
     if found is not None:
-        raise Invalid(f"{tag!r} is a robot, not a container")
-    raise NotFound(f"there is no container {tag!r}; create it first")
+        raise InvalidRequestError(f"{tag!r} is a robot, not a container")
+    raise NotFoundError(f"there is no container {tag!r}; create it first")
 
 
 # What task sets report

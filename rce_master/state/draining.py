@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from rce.control.messages import TaskSetKind
 from rce.control.model import EndpointState, EndpointStatus, NodeState
-from rce_master.exceptions import NotFound
+from rce_master.exceptions import NotFoundError
 from rce_master.state import activity, capacity, endpoints, placing
 from rce_master.state.lifecycle import ContainerEvent
 from rce_master.state.placement import Room, choose, refusals
@@ -59,7 +59,7 @@ def _processes(tables: Tables, name: str) -> list[str]:
     if name in tables.drains and name not in found:
         found.append(name)
     if not found:
-        raise NotFound(f"there is no container machine {name!r}; rce machines lists them")
+        raise NotFoundError(f"there is no container machine {name!r}; rce machines lists them")
     return found
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from rce.control.model import EndpointKind, LinkAddress
-from rce_master.exceptions import LimitReached
+from rce_master.exceptions import LimitReachedError
 from rce_master.state import activity
 from rce_master.state.records import Container, Endpoint, Robot, Tombstone
 
@@ -29,17 +29,17 @@ def grown(tx: Transaction, endpoint: Endpoint, part: object, instead_of: object 
     """Tell an endpoint's size when a part is put into it.
 
     Raises:
-        LimitReached: It, or all endpoints of its user, would be too large.
+        LimitReachedError: It, or all endpoints of its user, would be too large.
     """
     settings = tx.settings
     size = endpoint.size + size_of(part) - (0 if instead_of is None else size_of(instead_of))
     if size > settings.max_endpoint_bytes:
-        raise LimitReached(f"{endpoint.tag!r} would hold more than {settings.max_endpoint_bytes} bytes")
+        raise LimitReachedError(f"{endpoint.tag!r} would hold more than {settings.max_endpoint_bytes} bytes")
     if size > _SMALL:
         there = tx.tables.endpoints.get(endpoint.id)
         others = tx.tables.endpoints.total(endpoint.user) - (there.size if there is not None else 0)
         if others + size > settings.max_user_bytes:
-            raise LimitReached(
+            raise LimitReachedError(
                 f"your robots and containers would hold more than {settings.max_user_bytes} bytes"
             )
     return size

@@ -9,7 +9,7 @@ from msgspec.structs import asdict, replace
 from rce.control.limits import MEGABYTE
 from rce.control.messages import TaskSetKind
 from rce.model.quantities import write_cores
-from rce_master.exceptions import LimitReached, NotFound
+from rce_master.exceptions import LimitReachedError, NotFoundError
 from rce_master.state.records import UserLimits, UserRole
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class Limit(NamedTuple):
 def set_limits(tx: Transaction, command: SetLimits) -> None:
     """Change what a user may have; what is there already stays."""
     if command.user not in tx.tables.users:
-        raise NotFound(f"there is no user {command.user!r}")
+        raise NotFoundError(f"there is no user {command.user!r}")
     there = tx.tables.user_limits.get(command.user) or UserLimits(user=command.user)
     tx.put(replace(there, **command.limits))
     told = ", ".join(
@@ -85,11 +85,11 @@ def check_containers(tx: Transaction, user: str) -> None:
     """Check that a user may have one more container.
 
     Raises:
-        LimitReached: There are as many as they may have.
+        LimitReachedError: There are as many as they may have.
     """
     limit = limit_of(tx.tables, tx.settings, user, "containers")
     if limit.most and len(tx.tables.containers(user)) >= limit.most:
-        raise LimitReached(
+        raise LimitReachedError(
             f"you have {limit.most:g} containers already; destroy one first, or {_advice(user, 'containers')}"
         )
 
@@ -98,7 +98,7 @@ def check_all_resources(tx: Transaction, user: str, all_requested: list[Resource
     """Check what a user's containers ask for together.
 
     Raises:
-        LimitReached: It is more than they may have.
+        LimitReachedError: It is more than they may have.
     """
     for kind in _OF_MACHINES:
         limit = limit_of(tx.tables, tx.settings, user, kind)
@@ -109,7 +109,7 @@ def check_all_resources(tx: Transaction, user: str, all_requested: list[Resource
                 if limit.source == "machines"
                 else ""
             )
-            raise LimitReached(
+            raise LimitReachedError(
                 f"your containers would have {_plain(kind, asked)} {_UNITS.get(kind, kind)} in all, and you "
                 f"may have {_plain(kind, limit.most)}{share}; make others smaller (rce resize) or destroy "
                 f"them, or {_advice(user, kind)}"
@@ -126,18 +126,18 @@ def check_packages(tables: Tables, settings: StateSettings, user: str, size: int
         size: Bytes of its files, as far as they are known.
 
     Raises:
-        LimitReached: There are too many, or they are too large.
+        LimitReachedError: There are too many, or they are too large.
     """
     used = used_of(tables, user)
     limit = limit_of(tables, settings, user, "packages")
     if limit.most and used["packages"] >= limit.most:
-        raise LimitReached(
+        raise LimitReachedError(
             f"you have {used['packages']:g} versions of packages already; remove one first, "
             f"or {_advice(user, 'packages')}"
         )
     limit = limit_of(tables, settings, user, "disk")
     if limit.most and used["disk"] + size > limit.most:
-        raise LimitReached(
+        raise LimitReachedError(
             f"the files of your packages would have {used['disk'] + size:.0f} bytes, {limit.most:.0f} are "
             f"allowed; remove a version first, or {_advice(user, 'disk')}"
         )

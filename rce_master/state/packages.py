@@ -12,7 +12,7 @@ from rce.control.model import PackageSpec
 from rce.model.names import is_name, is_version
 from rce.packages.signing import key_id
 from rce.packages.versions import newest, split_package
-from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
+from rce_master.exceptions import ConflictError, InvalidRequestError, LimitReachedError, NotFoundError
 from rce_master.state import limits
 from rce_master.state.records import Container, UserPackage, package_key_key, user_package_key
 
@@ -30,11 +30,11 @@ def add_key(tx: Transaction, command: AddPackageKey) -> None:
     """Trust a key; the same one again is accepted silently."""
     key = command.key
     if key.user not in tx.tables.users:
-        raise NotFound(f"there is no user {key.user!r}")
+        raise NotFoundError(f"there is no user {key.user!r}")
     if key.id in tx.tables.package_keys:
         return
     if tx.tables.package_keys.count("user", key.user) >= tx.settings.max_package_keys:
-        raise LimitReached(f"you have {tx.settings.max_package_keys} keys already; revoke one first")
+        raise LimitReachedError(f"you have {tx.settings.max_package_keys} keys already; revoke one first")
     tx.put(key)
     tx.happen("package_key_registered", f"{key.user}/{key_id(key.key)}", key.label)
 
@@ -43,7 +43,7 @@ def remove_key(tx: Transaction, command: RemovePackageKey) -> None:
     """Trust a key no more. What it signed before stays until it is removed."""
     found = [key for key in tx.tables.package_keys.by("user", command.user) if key_id(key.key) == command.id]
     if not found:
-        raise NotFound(f"you have no key {command.id!r}")
+        raise NotFoundError(f"you have no key {command.id!r}")
     tx.delete(tx.tables.package_keys, found[0].id)
     tx.happen("package_key_revoked", f"{command.user}/{command.id}")
 
@@ -52,20 +52,22 @@ def check_new(tables: Tables, package: UserPackage) -> bool:
     """Tell whether a version is new; the same one again is not.
 
     Raises:
-        Invalid: Its name or version cannot be one.
-        NotFound: Its key is not registered.
-        Conflict: There is another one of the same version.
+        InvalidRequestError: Its name or version cannot be one.
+        NotFoundError: Its key is not registered.
+        ConflictError: There is another one of the same version.
     """
     if not is_name(package.name) or not is_version(package.version):
-        raise Invalid(f"{package.name}@{package.version} cannot be the name and the version of a package")
+        raise InvalidRequestError(
+            f"{package.name}@{package.version} cannot be the name and the version of a package"
+        )
     if package_key_key(package.user, package.key) not in tables.package_keys:
-        raise NotFound(
+        raise NotFoundError(
             f"the key {key_id(package.key)} is not registered with your account, or was revoked;"
             " run: rce package key register"
         )
     there = tables.packages.get(package.id)
     if there is not None and there.digest != package.digest:
-        raise Conflict(
+        raise ConflictError(
             f"{package.name} {package.version} is there with other contents, and a version never"
             " changes; give this one another version, or remove that one first"
         )
@@ -76,7 +78,7 @@ def add_package(tx: Transaction, command: AddPackage) -> None:
     """Take a version; the same one again is accepted silently. What names the package is told of it."""
     package = command.package
     if package.user not in tx.tables.users:
-        raise NotFound(f"there is no user {package.user!r}")
+        raise NotFoundError(f"there is no user {package.user!r}")
     if not check_new(tx.tables, package):
         return
     check_room(tx.tables, tx.settings, package.user, package.packed, package.size)
@@ -96,12 +98,12 @@ def check_room(tables: Tables, settings: StateSettings, user: str, packed: int, 
         size: Bytes of its files, as far as they are known.
 
     Raises:
-        LimitReached: There are too many, or they are too large.
+        LimitReachedError: There are too many, or they are too large.
     """
     limits.check_packages(tables, settings, user, size)
     held = packed + sum(package.packed for package in tables.packages.by("user", user))
     if held > settings.max_package_bytes:
-        raise LimitReached(
+        raise LimitReachedError(
             f"the archives of your packages would have {held} bytes, {settings.max_package_bytes} are"
             " allowed; remove a version first"
         )
@@ -111,10 +113,10 @@ def remove_package(tx: Transaction, command: RemovePackage) -> None:
     """Remove a version that no node needs."""
     found = tx.tables.packages.get(user_package_key(command.user, command.name, command.version))
     if found is None:
-        raise NotFound(f"there is no package {command.name!r} of version {command.version!r}")
+        raise NotFoundError(f"there is no package {command.name!r} of version {command.version!r}")
     users = uses(tx.tables, found.user).get(found.id)
     if users:
-        raise Conflict(
+        raise ConflictError(
             f"{found.name} {found.version} is used by {', '.join(users)}; remove the nodes first, or let them"
             " name another version"
         )
@@ -159,11 +161,11 @@ def check_node(tables: Tables, user: str, node: NodeSpec) -> None:
     """Check that there is the version which a node names.
 
     Raises:
-        NotFound: There is not.
+        NotFoundError: There is not.
     """
     name, version = split_package(node.pkg)
     if version and find(tables, user, node.pkg) is None:
-        raise NotFound(
+        raise NotFoundError(
             f"node {node.tag!r}: you have no package {name!r} of version {version!r}; see: rce package list"
         )
 

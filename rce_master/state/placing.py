@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from rce_master.exceptions import NoRoom
+from rce_master.exceptions import NoRoomError
 from rce_master.state import capacity
 from rce_master.state.lifecycle import ContainerEvent
 from rce_master.state.placement import Room, choose, refusals
@@ -31,7 +31,7 @@ def admit(tx: Transaction, container: Container, *, wait: bool) -> None:
     """Refuse a new container that no machine takes, or tell its user that it waits.
 
     Raises:
-        NoRoom: No machine takes it, and its user does not want to wait.
+        NoRoomError: No machine takes it, and its user does not want to wait.
     """
     known = capacity.rooms(tx.tables, away=True)
     if not any(tx.tables.is_connected(process) for process in known):
@@ -40,7 +40,7 @@ def admit(tx: Transaction, container: Container, *, wait: bool) -> None:
         return
     why = _why_nowhere(tx, container, capacity.rooms(tx.tables))
     if not wait:
-        raise NoRoom(
+        raise NoRoomError(
             f"no machine takes container {container.tag!r} now: {why}; to wait for room, ask with wait"
         )
     _tell(tx, container, why)

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from rce.control.limits import MEGABYTE
 from rce.model.quantities import write_bandwidth, write_cores
 from rce.model.specs import Resources
-from rce_master.exceptions import NoRoom
+from rce_master.exceptions import NoRoomError
 from rce_master.state import capacity, endpoints, placing
 from rce_master.state.containers import find
 
@@ -48,7 +48,7 @@ def _check_room(tx: Transaction, container: Container, requested: Resources) -> 
         room = capacity.room_at(tx.tables, task_set)
         lacks = room.without(had).shortages(requested, had)
         if lacks:
-            raise NoRoom(
+            raise NoRoomError(
                 f"container {container.tag!r} cannot grow so far: {room.name} {' and '.join(lacks)}; "
                 "nothing was changed"
             )

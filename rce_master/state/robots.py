@@ -9,7 +9,13 @@ from msgspec.structs import replace
 from rce.control.messages import TaskSetKind
 from rce.control.model import EndpointState, EndpointStatus
 from rce.model.names import EndpointId
-from rce_master.exceptions import Conflict, Forbidden, Invalid, LimitReached, NotFound
+from rce_master.exceptions import (
+    ConflictError,
+    ForbiddenError,
+    InvalidRequestError,
+    LimitReachedError,
+    NotFoundError,
+)
 from rce_master.state import activity, endpoints
 from rce_master.state.lifecycle import RobotEvent, RobotSession
 from rce_master.state.records import Robot, RobotLive
@@ -24,28 +30,30 @@ def login(tx: Transaction, command: RobotLogin) -> None:
     try:
         name = EndpointId.parse(command.id)
     except ValueError as error:
-        raise Invalid(str(error)) from None
+        raise InvalidRequestError(str(error)) from None
     user = tx.tables.users.get(name.user)
     if user is None:
-        raise NotFound(f"there is no user {name.user!r}")
+        raise NotFoundError(f"there is no user {name.user!r}")
     if not user.role.changes:
-        raise Forbidden(f"user {user.name!r} has the role {user.role.value}, which connects no robots")
+        raise ForbiddenError(f"user {user.name!r} has the role {user.role.value}, which connects no robots")
     if command.credential and command.credential not in tx.tables.tokens:
-        raise Forbidden("the robot's token was revoked")
+        raise ForbiddenError("the robot's token was revoked")
     if command.password and command.password != user.password:
-        raise Forbidden("the password was changed")
+        raise ForbiddenError("the password was changed")
     task_set = tx.tables.task_sets.get(command.process)
     if (
         task_set is None
         or task_set.kind is not TaskSetKind.ROBOT
         or not tx.tables.is_connected(command.process)
     ):
-        raise Conflict(f"{command.process!r} is not a connected robot task set")
+        raise ConflictError(f"{command.process!r} is not a connected robot task set")
     there = tx.tables.endpoints.get(command.id)
     if there is None:
         _new(tx, name)
     elif not isinstance(there, Robot):
-        raise Conflict(f"{name.tag!r} is a container of user {name.user!r}; a robot needs another robotID")
+        raise ConflictError(
+            f"{name.tag!r} is a container of user {name.user!r}; a robot needs another robotID"
+        )
     _enter(tx, command)
     tx.changes.answered = command.id
     tx.happen("robot_connected", command.id, f"at {command.process}")
@@ -53,7 +61,7 @@ def login(tx: Transaction, command: RobotLogin) -> None:
 
 def _new(tx: Transaction, name: EndpointId) -> None:
     if tx.tables.endpoints.count("robots_of", name.user) >= tx.settings.max_robots:
-        raise LimitReached(f"user {name.user!r} has {tx.settings.max_robots} robots already")
+        raise LimitReachedError(f"user {name.user!r} has {tx.settings.max_robots} robots already")
     tx.put(Robot(id=str(name)))
     tx.put(RobotLive(id=str(name), session=RobotSession.OFFLINE, since=tx.now))
     tx.touch(str(name))
@@ -67,7 +75,7 @@ def _enter(tx: Transaction, command: RobotLogin) -> None:
     if live.session is RobotSession.CONNECTED:
         client = live.status.client if live.status is not None else ""
         where = f", from {client}" if client else ""
-        raise Conflict(
+        raise ConflictError(
             f"robot {robot.tag!r} is connected already{where}; a robotID can be used once at a time"
         )
     if robot.task_set != process:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from rce.control.messages import Hello, TaskSetKind
 from rce.control.model import EndpointState, EndpointStatus
-from rce_master.exceptions import Conflict, Invalid, NotFound
+from rce_master.exceptions import ConflictError, InvalidRequestError, NotFoundError
 from rce_master.state import capacity, containers, draining, endpoints, placing, robots
 from rce_master.state.lifecycle import ContainerPhase, RobotSession
 from rce_master.state.records import (
@@ -59,10 +59,12 @@ def arrived(tx: Transaction, command: TaskSetArrived) -> None:
 
 def _check_name(tx: Transaction, hello: Hello) -> None:
     if not _PROCESS.fullmatch(hello.process):
-        raise Invalid(f"{hello.process!r:.60} names no task set: it takes 1 to 255 characters and no blanks")
+        raise InvalidRequestError(
+            f"{hello.process!r:.60} names no task set: it takes 1 to 255 characters and no blanks"
+        )
     before = tx.tables.task_sets.get(hello.process)
     if before is not None and before.kind is not hello.kind:
-        raise Conflict(f"there is a {before.kind.value} task set {hello.process!r} already")
+        raise ConflictError(f"there is a {before.kind.value} task set {hello.process!r} already")
 
 
 def _register(tx: Transaction, hello: Hello) -> None:
@@ -199,7 +201,7 @@ def fault(tx: Transaction, command: FaultReported) -> None:
     """Tell the user of an endpoint of a fault."""
     user = command.id.partition("/")[0]
     if user not in tx.tables.users:
-        raise NotFound(f"there is no user {user!r}")
+        raise NotFoundError(f"there is no user {user!r}")
     tx.notify(command.robot or user, command.text)
     tx.happen("fault", command.id, command.text)
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from msgspec.structs import replace
 
 from rce.model.names import is_name
-from rce_master.exceptions import Conflict, Invalid, NotFound
+from rce_master.exceptions import ConflictError, InvalidRequestError, NotFoundError
 from rce_master.state import endpoints, limits, packages, robots, tokens
 from rce_master.state.records import User, UserRole
 
@@ -20,9 +20,11 @@ def add_user(tx: Transaction, command: AddUser) -> None:
     """Make a user."""
     user = command.user
     if not is_name(user.name):
-        raise Invalid(f"{user.name!r} is not a user name: use letters, digits and '_', a letter first")
+        raise InvalidRequestError(
+            f"{user.name!r} is not a user name: use letters, digits and '_', a letter first"
+        )
     if user.name in tx.tables.users:
-        raise Conflict(f"there is a user {user.name!r} already")
+        raise ConflictError(f"there is a user {user.name!r} already")
     tx.put(user)
     tx.happen("user_added", user.name, user.role.value, user="")
 
@@ -82,7 +84,7 @@ def remember_login(tx: Transaction, command: RememberLogin) -> None:
 def _find(tx: Transaction, name: str) -> User:
     user = tx.tables.users.get(name)
     if user is None:
-        raise NotFound(f"there is no user {name!r}")
+        raise NotFoundError(f"there is no user {name!r}")
     return user
 
 
@@ -93,4 +95,4 @@ def _forget_login(tx: Transaction, user: str) -> None:
 
 def _keep_an_admin(tx: Transaction, user: User) -> None:
     if [u for u in tx.tables.users if u.role is UserRole.ADMIN] == [user]:
-        raise Conflict(f"{user.name!r} is the last administrator; make another one first")
+        raise ConflictError(f"{user.name!r} is the last administrator; make another one first")

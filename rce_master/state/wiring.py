@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from msgspec.structs import replace
 
 from rce.model.names import Form, InterfaceType, Role
-from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
+from rce_master.exceptions import ConflictError, InvalidRequestError, LimitReachedError, NotFoundError
 from rce_master.state import endpoints
 from rce_master.state.records import Container, Endpoint
 from rce_master.state.wiring_records import Connection, Interface, Link, interface_key
@@ -27,11 +27,11 @@ def add_interface(tx: Transaction, command: AddInterface) -> None:
     if there == interface:
         return
     if there is not None:
-        raise Conflict(
+        raise ConflictError(
             f"interface {_path(endpoint, interface.tag)!r} exists with other settings; remove it first"
         )
     if tx.tables.interfaces.count("endpoint", endpoint.id) >= tx.settings.max_interfaces:
-        raise LimitReached(f"{endpoint.tag!r} has {tx.settings.max_interfaces} interfaces already")
+        raise LimitReachedError(f"{endpoint.tag!r} has {tx.settings.max_interfaces} interfaces already")
     size = endpoints.grown(tx, endpoint, interface)
     tx.put(replace(endpoint, size=size))
     tx.put(Interface(endpoint=endpoint.id, number=tx.next_number("interface"), spec=interface))
@@ -43,21 +43,23 @@ def _checked(endpoint: Endpoint, interface: InterfaceSpec) -> InterfaceSpec:
     try:
         type_ = InterfaceType.parse(interface.type)
     except ValueError as error:
-        raise Invalid(f"interface {path!r}: {error}") from None
+        raise InvalidRequestError(f"interface {path!r}: {error}") from None
     if not isinstance(endpoint, Container):
         if type_.form is Form.INTERFACE:
-            raise Invalid(
+            raise InvalidRequestError(
                 f"interface {path!r}: {type_} is for containers; a robot takes "
                 f"{type_.role.value}Converter or {type_.role.value}Forwarder"
             )
         # Clients may name their local topic here; it means nothing to the engine.
         return replace(interface, addr="")
     if type_.form is not Form.INTERFACE:
-        raise Invalid(
+        raise InvalidRequestError(
             f"interface {path!r}: {type_} is for robots; a container takes {type_.role.value}Interface"
         )
     if not interface.addr:
-        raise Invalid(f"interface {path!r}: addr is missing; give the ROS name of the topic or service")
+        raise InvalidRequestError(
+            f"interface {path!r}: addr is missing; give the ROS name of the topic or service"
+        )
     return interface
 
 
@@ -66,7 +68,7 @@ def remove_interface(tx: Transaction, command: RemoveInterface) -> None:
     endpoint = _endpoint(tx, command.user, command.endpoint)
     interface = tx.tables.interface(endpoint.id, command.tag)
     if interface is None:
-        raise NotFound(f"there is no interface {_path(endpoint, command.tag)!r}")
+        raise NotFoundError(f"there is no interface {_path(endpoint, command.tag)!r}")
     tx.put(replace(endpoint, size=endpoint.size - endpoints.size_of(interface)))
     key = interface_key(endpoint.id, command.tag)
     tx.delete(tx.tables.interfaces, key)
@@ -105,7 +107,7 @@ def disconnect(tx: Transaction, command: Disconnect) -> None:
     pair = _pair(tx, command.user, command.tag_a, command.tag_b)
     connection = _connection(tx, pair)
     if connection is None:
-        raise NotFound(f"{command.tag_a!r} and {command.tag_b!r} are not connected")
+        raise NotFoundError(f"{command.tag_a!r} and {command.tag_b!r} are not connected")
     endpoints.remove_connection(tx, connection)
 
 
@@ -129,11 +131,11 @@ def _pair(tx: Transaction, user: str, tag_a: str, tag_b: str) -> _Pair:
 def _locate(tx: Transaction, user: str, path: str) -> tuple[Endpoint, InterfaceSpec]:
     tag, slash, interface_tag = path.partition("/")
     if not slash:
-        raise Invalid(f"{path!r} does not name an interface; write ENDPOINT/INTERFACE")
+        raise InvalidRequestError(f"{path!r} does not name an interface; write ENDPOINT/INTERFACE")
     endpoint = _endpoint(tx, user, tag)
     interface = tx.tables.interface(endpoint.id, interface_tag)
     if interface is None:
-        raise NotFound(f"there is no interface {path!r}; add it first")
+        raise NotFoundError(f"there is no interface {path!r}; add it first")
     return endpoint, interface
 
 
@@ -142,12 +144,12 @@ def _check_pair(tx: Transaction, pair: _Pair) -> None:
     path_a, path_b = _path(pair.a, one.tag), _path(pair.b, other.tag)
     role_a, role_b = InterfaceType.parse(one.type).role, InterfaceType.parse(other.type).role
     if role_a.complement is not role_b:
-        raise Invalid(
+        raise InvalidRequestError(
             f"{path_a!r} is a {one.type} and {path_b!r} a {other.type}: they do not complete each other; "
             f"a {role_a.value} connects to a {role_a.complement.value}"
         )
     if one.message_type != other.message_type:
-        raise Invalid(
+        raise InvalidRequestError(
             f"{path_a!r} has the class {one.message_type} and {path_b!r} {other.message_type}; "
             "they must be the same"
         )
@@ -158,12 +160,12 @@ def _check_pair(tx: Transaction, pair: _Pair) -> None:
 def _check_room(tx: Transaction, endpoint: Endpoint, interface: InterfaceSpec, role: Role) -> None:
     connections = tx.tables.connections
     if role is Role.SERVICE_PROVIDER and connections.count("end", interface_key(endpoint.id, interface.tag)):
-        raise Conflict(
+        raise ConflictError(
             f"{_path(endpoint, interface.tag)!r} is a ServiceProvider and connected already; "
             "it takes one connection: disconnect it first"
         )
     if connections.count("endpoint", endpoint.id) >= tx.settings.max_connections:
-        raise LimitReached(f"{endpoint.tag!r} has {tx.settings.max_connections} connections already")
+        raise LimitReachedError(f"{endpoint.tag!r} has {tx.settings.max_connections} connections already")
 
 
 def _connection(tx: Transaction, pair: _Pair) -> Connection | None:
@@ -177,7 +179,7 @@ def _connection(tx: Transaction, pair: _Pair) -> Connection | None:
 def _endpoint(tx: Transaction, user: str, tag: str) -> Endpoint:
     found = tx.tables.endpoints.get(f"{user}/{tag}")
     if found is None:
-        raise NotFound(
+        raise NotFoundError(
             f"there is no robot or container {tag!r}; robots must be connected, containers created"
         )
     return found

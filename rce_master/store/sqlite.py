@@ -49,7 +49,7 @@ class SqliteStore:
         """Open the store of a folder; made if it is not there.
 
         Raises:
-            StoreBusy: Another process has it open.
+            StoreBusyError: Another process has it open.
             StoreError: It cannot be opened, or a newer version of this program wrote it.
         """
         lock = FolderLock(folder)

@@ -3,7 +3,7 @@
 ::
 
     RobotError
-    +-- ConversionFailed    it took too long, needed too much memory, or too many wait
+    +-- ConversionFailedError  it took too long, needed too much memory, or too many wait
 """
 
 from __future__ import annotations
@@ -11,5 +11,5 @@ from __future__ import annotations
 from rce_robot.exceptions import RobotError
 
 
-class ConversionFailed(RobotError):  # noqa: N818 - reads as what happened
+class ConversionFailedError(RobotError):
     """A conversion was given up; the text is fit for an ``ER``."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rce.aio.tasks import BackgroundTasks
-from rce_robot.conversion.exceptions import ConversionFailed
+from rce_robot.conversion.exceptions import ConversionFailedError
 from rce_robot.conversion.process import WorkerProcess
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class _Order:
     def refuse(self, _: object = None) -> None:
         """Tell the one who waits that the pool is closed, if there was no answer yet."""
         if not self.answer.done():
-            self.answer.set_exception(ConversionFailed("the robot endpoint is shutting down"))
+            self.answer.set_exception(ConversionFailedError("the robot endpoint is shutting down"))
 
 
 class ConversionPool:
@@ -93,13 +93,13 @@ class ConversionPool:
             parts: The bytes that belong to it.
 
         Raises:
-            ConversionFailed: Too many of the user's wait, it took too long, or too much memory.
+            ConversionFailedError: Too many of the user's wait, it took too long, or too much memory.
         """
         if self._closed:
-            raise ConversionFailed("the robot endpoint is shutting down")
+            raise ConversionFailedError("the robot endpoint is shutting down")
         orders = self._waiting.setdefault(user, deque())
         if len(orders) >= self._settings.waiting:
-            raise ConversionFailed(f"{len(orders)} large messages wait to be converted already")
+            raise ConversionFailedError(f"{len(orders)} large messages wait to be converted already")
         order = _Order(user, job, parts, asyncio.get_running_loop().create_future())
         orders.append(order)
         self._go_on()
@@ -166,9 +166,9 @@ class ConversionPool:
             sound = True
             if not order.answer.done():
                 order.answer.set_result(result)
-        except (ConversionFailed, OSError) as error:
+        except (ConversionFailedError, OSError) as error:
             if not order.answer.done():
-                order.answer.set_exception(ConversionFailed(str(error)))
+                order.answer.set_exception(ConversionFailedError(str(error)))
         finally:
             order.refuse()
             self._running -= Counter([order.user])
@@ -189,7 +189,7 @@ class ConversionPool:
         except TimeoutError as error:
             self.killed += 1
             _log.warning("user %s: a conversion was given up after %g s", order.user, self._settings.timeout)
-            raise ConversionFailed(
+            raise ConversionFailedError(
                 f"converting the message takes more than {self._settings.timeout:g} s"
             ) from error
 

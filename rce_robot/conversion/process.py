@@ -11,7 +11,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from rce.buffers import unfilled
-from rce_robot.conversion.exceptions import ConversionFailed
+from rce_robot.conversion.exceptions import ConversionFailedError
 from rce_robot.conversion.jobs import HEAD, MAX_PARTS, decode_result, pack
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ class WorkerProcess:
         """Start the process and wait until it is ready.
 
         Raises:
-            ConversionFailed: It does not become ready.
+            ConversionFailedError: It does not become ready.
         """
         ours, theirs = socket.socketpair()
         loop = asyncio.get_running_loop()
@@ -79,13 +79,13 @@ class WorkerProcess:
             async with asyncio.timeout(_START_TIMEOUT_S):
                 await self._reader.ready
         except TimeoutError as error:
-            raise ConversionFailed("the process that converts large messages does not start") from error
+            raise ConversionFailedError("the process that converts large messages does not start") from error
 
     async def do(self, job: Job, parts: Sequence[Buffer]) -> tuple[Result, list[memoryview]]:
         """Do a job.
 
         Raises:
-            ConversionFailed: The process ended.
+            ConversionFailedError: The process ended.
         """
         assert self._transport is not None
         answer = self._reader.expect()
@@ -138,14 +138,16 @@ class _PacketReader(asyncio.BufferedProtocol):
         self._lost = True
         if not self.ready.done():
             self.ready.set_exception(
-                ConversionFailed("the process that converts large messages does not start")
+                ConversionFailedError("the process that converts large messages does not start")
             )
         self._fail()
 
     def _fail(self) -> None:
         if self._answer is not None and not self._answer.done():
             self._answer.set_exception(
-                ConversionFailed("the process that converted the message ended; it may need too much memory")
+                ConversionFailedError(
+                    "the process that converted the message ended; it may need too much memory"
+                )
             )
 
     def _begin(self, size: int) -> None:
@@ -159,13 +161,13 @@ class _PacketReader(asyncio.BufferedProtocol):
         elif self._sizes is None:
             (count,) = HEAD.unpack(part)
             if count > MAX_PARTS:
-                raise ConversionFailed(f"a worker answered with {count} parts")
+                raise ConversionFailedError(f"a worker answered with {count} parts")
             self._sizes = []
             self._begin(8 * count)
         elif not self._sizes:
             self._sizes = list(struct.unpack(f"!{len(part) // 8}Q", part))
             if sum(self._sizes) > _MAX_PACKET:
-                raise ConversionFailed(f"a worker answered with {sum(self._sizes)} bytes")
+                raise ConversionFailedError(f"a worker answered with {sum(self._sizes)} bytes")
             self._begin(self._sizes[0])
         else:
             self._parts.append(part)

@@ -50,7 +50,7 @@ class Peer:
         self.held = {}
         self.lock = threading.Lock()
 
-    # -------------------------------------------------------------- RPC
+    # RPC
 
     def contacts(self):
         uri = f"http://{self.address}:{self.rpc_port}"
@@ -93,7 +93,7 @@ class Peer:
         server.register_function(lambda: (self.master_uri, time.time()), "getCurrentTime")
         threading.Thread(target=server.serve_forever, daemon=True).start()
 
-    # -------------------------------------------------------------- the own master
+    # The own master
 
     def poll(self):
         publishers, subscribers, services = self.master.getSystemState(ME)[2]
@@ -107,7 +107,7 @@ class Peer:
                 self.state = state
                 self.stamp = time.time()
 
-    # -------------------------------------------------------------- heartbeats
+    # Heartbeats
 
     def open(self):
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM, socket.IPPROTO_UDP)
@@ -155,7 +155,7 @@ class Peer:
             self.sync(key, monitor.masterInfoFiltered(FILTER))
             self.others[key] = (secs, nsecs)
 
-    # -------------------------------------------------------------- synchronization
+    # Synchronization
 
     def sync(self, key, info):
         _, _, uri, _, publishers, subscribers, services, types, nodes, providers = info
@@ -199,7 +199,7 @@ class Peer:
             self.unregister(*entry)
         del self.others[key]
 
-    # -------------------------------------------------------------- life
+    # Life
 
     def run(self):
         self.poll()

@@ -5,7 +5,7 @@ On the wire it is ROS's actionlib: five topics below the action's name.
 
 from rce.ros.actions.client import ActionClient
 from rce.ros.actions.client_goal import ClientGoal
-from rce.ros.actions.exceptions import ActionError, GoalFailed, IllegalTransitionError, UnknownGoal
+from rce.ros.actions.exceptions import ActionError, GoalFailedError, IllegalTransitionError, UnknownGoalError
 from rce.ros.actions.goal_id import GoalId
 from rce.ros.actions.server import ActionServer, SimpleActionServer
 from rce.ros.actions.server_goal import ServerGoal
@@ -18,11 +18,11 @@ __all__ = [
     "ClientGoal",
     "CommState",
     "GoalEvent",
-    "GoalFailed",
+    "GoalFailedError",
     "GoalId",
     "GoalState",
     "IllegalTransitionError",
     "ServerGoal",
     "SimpleActionServer",
-    "UnknownGoal",
+    "UnknownGoalError",
 ]

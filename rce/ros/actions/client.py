@@ -84,7 +84,7 @@ class ActionClient:
         """The goals that are not over, the oldest first."""
         return tuple(self._goals.values())
 
-    # ------------------------------------------------------------------ life
+    # Life
 
     async def __aenter__(self) -> Self:
         node, types = self._node, self._types
@@ -114,7 +114,7 @@ class ActionClient:
         await self._stack.aclose()
         self._inputs.clear()
 
-    # ------------------------------------------------------------------ for programs
+    # For programs
 
     async def wait_for_server(self, timeout: float | None = None) -> None:
         """Wait until a server has spoken and all five topics are connected.
@@ -175,7 +175,7 @@ class ActionClient:
         """Ask the server to end all goals made up to a time, those of other clients and late ones too."""
         self._cancel.publish(stamp=time)
 
-    # ------------------------------------------------------------------ what the server says
+    # What the server says
 
     def _status_received(self, message: Message) -> None:
         now = self._clock.now()
@@ -208,7 +208,7 @@ class ActionClient:
         if goal is not None:
             goal.feedback_received(message.feedback)
 
-    # ------------------------------------------------------------------ looking after goals
+    # Looking after goals
 
     async def _look_after_goals(self) -> None:
         while True:

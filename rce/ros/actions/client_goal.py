@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator, Callable
 from typing import TYPE_CHECKING, Any
 
 from rce.aio.queues import BoundedQueue
-from rce.ros.actions.exceptions import GoalFailed
+from rce.ros.actions.exceptions import GoalFailedError
 from rce.ros.actions.goal_id import GoalId
 from rce.ros.actions.states import CommState, GoalState
 from rce.ros.actions.tracker import GoalTracker
@@ -107,12 +107,12 @@ class ClientGoal:
         """Wait for the result. A caller that is cancelled does not cancel the goal.
 
         Raises:
-            GoalFailed: It ended in another way than by success.
+            GoalFailedError: It ended in another way than by success.
             TimeoutError: It is not over within ``timeout`` seconds; it continues.
         """
         state = await self.wait(timeout)
         if state is not GoalState.SUCCEEDED or self._result is None:
-            raise GoalFailed(self.id, state, self.text, self._result)
+            raise GoalFailedError(self.id, state, self.text, self._result)
         return self._result
 
     def __aiter__(self) -> AsyncIterator[Message]:
@@ -126,7 +126,7 @@ class ClientGoal:
             await self._arrived.wait()
         return self._feedback.take()
 
-    # ------------------------------------------------------------------ what the client tells
+    # What the client tells
 
     def feedback_received(self, feedback: Message) -> None:
         """Take feedback."""

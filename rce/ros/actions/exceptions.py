@@ -4,9 +4,9 @@
 
     RosError
     +-- ActionError
-        +-- GoalFailed              a goal ended without success: how, why, and with which result
+        +-- GoalFailedError         a goal ended without success: how, why, and with which result
         +-- IllegalTransitionError  a goal cannot do that in its present state (misuse, or a peer out of step)
-        +-- UnknownGoal             a server was asked about a goal that it does not remember
+        +-- UnknownGoalError        a server was asked about a goal that it does not remember
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class ActionError(RosError):
     """Base of all errors of :mod:`rce.ros.actions`."""
 
 
-class GoalFailed(ActionError):  # noqa: N818
+class GoalFailedError(ActionError):
     """A goal did not succeed.
 
     Attributes:
@@ -54,7 +54,7 @@ class IllegalTransitionError(InvalidTransitionError, ActionError):
     """
 
 
-class UnknownGoal(ActionError, LookupError):  # noqa: N818
+class UnknownGoalError(ActionError, LookupError):
     """There is no such goal, or not any longer.
 
     Attributes:

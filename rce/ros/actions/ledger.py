@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from enum import Enum, auto
 
 from rce.lifecycle import remember
-from rce.ros.actions.exceptions import UnknownGoal
+from rce.ros.actions.exceptions import UnknownGoalError
 from rce.ros.actions.goal_id import GoalId
 from rce.ros.actions.states import GOAL_LIFE, GoalEvent, GoalState
 
@@ -73,12 +73,12 @@ class GoalLedger:
         """Return a goal's entry.
 
         Raises:
-            UnknownGoal: There is none (any longer).
+            UnknownGoalError: There is none (any longer).
         """
         try:
             return self._entries[goal_id]
         except KeyError:
-            raise UnknownGoal(goal_id) from None
+            raise UnknownGoalError(goal_id) from None
 
     def receive(self, goal_id: GoalId, now: float) -> Arrival:
         """Take a goal. Its id must not be empty; without a stamp, no cancellation up to a time meets it."""
@@ -132,7 +132,7 @@ class GoalLedger:
         """Let something happen to a goal.
 
         Raises:
-            UnknownGoal: There is no such goal.
+            UnknownGoalError: There is no such goal.
             IllegalTransitionError: It is not possible in the goal's state; nothing was changed.
         """
         entry = self[goal_id]

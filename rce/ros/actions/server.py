@@ -94,7 +94,7 @@ class ActionServer:
         """The goals that are not over, the oldest first."""
         return tuple(goal for goal in self._goals.values() if not goal.state.is_over)
 
-    # ------------------------------------------------------------------ life
+    # Life
 
     async def __aenter__(self) -> Self:
         node, types = self._node, self._types
@@ -140,7 +140,7 @@ class ActionServer:
             self._see_time()
             self._publish_status()
 
-    # ------------------------------------------------------------------ what clients say
+    # What clients say
 
     def _goal_received(self, message: Message) -> None:
         goal_id, now = GoalId.read(message.goal_id), self._see_time()
@@ -195,7 +195,7 @@ class ActionServer:
         if not goal.state.is_over:
             self.transition(self._ledger[goal.id], event, text, None)
 
-    # ------------------------------------------------------------------ what the program says
+    # What the program says
 
     def transition(self, entry: Entry, event: GoalEvent, text: str, result: Message | Content | None) -> None:
         """Let something happen to a goal and tell its clients.
@@ -227,7 +227,7 @@ class ActionServer:
         """Sleep in ROS time; tell whether the node continues."""
         return await self._node.sleep(seconds)
 
-    # ------------------------------------------------------------------ work
+    # Work
 
     async def _work_on(self, goal: ServerGoal) -> None:
         """Run the handler; whatever it does, the goal is over at the end."""
@@ -253,7 +253,7 @@ class ActionServer:
             _, goal = self._goals.popitem()
             work.give_up(goal, STOPPED)
 
-    # ------------------------------------------------------------------ publishing
+    # Publishing
 
     def _publish_status(self) -> None:
         entries = self._ledger.listed(self._time())

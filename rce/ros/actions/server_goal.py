@@ -72,7 +72,7 @@ class ServerGoal:
         """What was said last on how it stands."""
         return self._entry.text
 
-    # ------------------------------------------------------------------ what happens to it
+    # What happens to it
 
     def accept(self, text: str = "") -> None:
         """Begin to work on it.
@@ -125,7 +125,7 @@ class ServerGoal:
         """
         self._server.publish_feedback(self._entry, fields if feedback is None else feedback)
 
-    # ------------------------------------------------------------------ being asked to end
+    # Being asked to end
 
     @property
     def cancel_requested(self) -> bool:

@@ -35,7 +35,7 @@ class Graph:
         self._parameters = ParameterTree()
         self._types: dict[str, str] = {}
 
-    # ------------------------------------------------------------------ questions
+    # Questions
 
     @property
     def nodes(self) -> dict[str, str]:
@@ -73,7 +73,7 @@ class Graph:
         """The parameters; to be changed by :meth:`set_parameter` and :meth:`delete_parameter` only."""
         return self._parameters
 
-    # ------------------------------------------------------------------ topics and services
+    # Topics and services
 
     def register_publisher(self, topic: str, topic_type: str, node: str, uri: str) -> Outcome:
         """Note that a node publishes; the topic's subscribers are told."""
@@ -118,7 +118,7 @@ class Graph:
                 self._remove(kind, name, node, outcome)
         return outcome
 
-    # ------------------------------------------------------------------ parameters
+    # Parameters
 
     def set_parameter(self, name: str, value: Any, *, by: str = "") -> Outcome:
         """Set a parameter or namespace; its subscribers are told, but not the node ``by`` that did it."""
@@ -155,7 +155,7 @@ class Graph:
         for topic in self._types:
             assert self._is_used(topic), f"the type of {topic} is kept although it is unused"
 
-    # ------------------------------------------------------------------ inside
+    # Inside
 
     def _displace(self, node: str, uri: str) -> Outcome:
         """Remove and shut down an older node of the same name."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from rce.aio.tasks import TaskScope
 from rce.ros.core.events import Call
-from rce.ros.errors import RpcUnreachable, XmlRpcError
+from rce.ros.errors import RpcUnreachableError, XmlRpcError
 from rce.ros.xmlrpc import RpcClient
 from rce.ros.xmlrpc.codec import encode_call
 from rce.ros.xmlrpc.dispatch import ERROR
@@ -69,7 +69,7 @@ class Notifier:
         """Return a call's document, made once for all nodes that are told the same.
 
         Raises:
-            MalformedDocument: An argument has no XML-RPC form.
+            MalformedDocumentError: An argument has no XML-RPC form.
         """
         key = (call.method, id(call.arguments))
         known = self._documents.get(key)
@@ -85,7 +85,7 @@ class Notifier:
         try:
             document = self._written(call)
             answer = await self._client.send(call.uri, call.method, document, timeout=CALL_TIMEOUT)
-        except RpcUnreachable as error:
+        except RpcUnreachableError as error:
             _log.info("%s is not delivered: %s", call.method, error)
             queue.clear()  # nobody is there; who takes the address over registers and learns the state anew
         except XmlRpcError as error:

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from rce.ros import names
-from rce.ros.xmlrpc.dispatch import BadArgument
+from rce.ros.xmlrpc.dispatch import BadArgumentError
 
 Tree = dict[str, Any]
 
@@ -50,13 +50,13 @@ class ParameterTree:
         """Set a parameter, or replace a whole namespace by a dictionary.
 
         Raises:
-            BadArgument: The root would become something else than a namespace.
+            BadArgumentError: The root would become something else than a namespace.
         """
         path = names.segments(name)
         value = copy.deepcopy(value)
         if not path:
             if not isinstance(value, dict):
-                raise BadArgument("the root of the parameters must be a dictionary")
+                raise BadArgumentError("the root of the parameters must be a dictionary")
             self._root = value
             return
         branch = self._root

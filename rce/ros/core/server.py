@@ -18,7 +18,7 @@ from rce.ros.core.events import Call, GraphEvent, Outcome
 from rce.ros.core.graph import Graph
 from rce.ros.core.notifier import Notifier
 from rce.ros.core.roslaunch import roslaunch_methods
-from rce.ros.errors import ParameterMissing
+from rce.ros.errors import ParameterMissingError
 from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer
 
 DEFAULT_PORT = 11311
@@ -124,7 +124,7 @@ class Core:
         await self._stack.aclose()
         self._notifier = None
 
-    # ------------------------------------------------------------------ for the hosting process
+    # For the hosting process
 
     @contextmanager
     def watch(self) -> Iterator[GraphWatch]:
@@ -172,12 +172,12 @@ class Core:
         """Return a parameter or namespace by its global name.
 
         Raises:
-            ParameterMissing: It is not set.
+            ParameterMissingError: It is not set.
         """
         try:
             return copy.deepcopy(self.graph.parameters.get(name))
         except KeyError as error:
-            raise ParameterMissing(name) from error
+            raise ParameterMissingError(name) from error
 
     def delete_param(self, name: str) -> bool:
         """Delete a parameter or namespace by its global name; tell whether it was set."""
@@ -187,7 +187,7 @@ class Core:
             return False
         return True
 
-    # ------------------------------------------------------------------ inside
+    # Inside
 
     @asynccontextmanager
     async def _gathering_logs(self) -> AsyncIterator[None]:

@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 import psutil
 
 from rce.lookups import LOOKUPS
-from rce.ros.multimaster.errors import NoSuchInterface
+from rce.ros.multimaster.errors import NoSuchInterfaceError
 from rce.ros.node.settings import LOOPBACK, is_loopback
 
 DEFAULT_GROUP = "226.0.0.0"
@@ -31,7 +31,7 @@ async def address_of(interface: str) -> str:
     """Return the IPv4 address of an interface, given by its name, address or host name.
 
     Raises:
-        NoSuchInterface: There is no such interface, or it has no IPv4 address.
+        NoSuchInterfaceError: There is no such interface, or it has no IPv4 address.
     """
     for entry in psutil.net_if_addrs().get(interface, ()):
         if entry.family == socket.AF_INET:
@@ -40,11 +40,11 @@ async def address_of(interface: str) -> str:
         infos = await LOOKUPS.addresses(interface, 0, family=socket.AF_INET)
         address: str = infos[0][4][0]
     except (OSError, UnicodeError) as error:
-        raise NoSuchInterface(
+        raise NoSuchInterfaceError(
             f"{interface!r} is neither an interface with an IPv4 address nor a host"
         ) from error
     if address not in local_addresses() and not is_loopback(address):
-        raise NoSuchInterface(f"{interface!r} is not an address of this machine")
+        raise NoSuchInterfaceError(f"{interface!r} is not an address of this machine")
     return address
 
 
@@ -58,7 +58,7 @@ async def own_address(interface: str, group: str, environ: Mapping[str, str] | N
         environ: The environment.
 
     Raises:
-        NoSuchInterface: The interface is not there.
+        NoSuchInterfaceError: The interface is not there.
     """
     environ = os.environ if environ is None else environ
     named = interface or environ.get("ROS_IP", "")

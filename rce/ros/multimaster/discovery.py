@@ -17,7 +17,7 @@ from rce.ros.errors import MasterError
 from rce.ros.multimaster import addresses, messages
 from rce.ros.multimaster.announcements import Announcements
 from rce.ros.multimaster.contacts import OriginsReader, ask_contact
-from rce.ros.multimaster.errors import MalformedHeartbeat, MultimasterError
+from rce.ros.multimaster.errors import MalformedHeartbeatError, MultimasterError
 from rce.ros.multimaster.events import EventQueue
 from rce.ros.multimaster.heartbeat import Heartbeat, Kind, decode
 from rce.ros.multimaster.monitor import MasterMonitor
@@ -83,7 +83,7 @@ class Discovery:
         self._own = PeerKey("", 0)
         self._contact: Contact
 
-    # ------------------------------------------------------------------ for programs
+    # For programs
 
     @property
     def masters(self) -> list[Neighbour]:
@@ -115,7 +115,7 @@ class Discovery:
         request = Heartbeat(Kind.REQUEST, self._own.rpc_port, self.settings.heartbeat_hz).encode()
         self._socket.send(request, self._unicast_addresses())
 
-    # ------------------------------------------------------------------ life
+    # Life
 
     async def __aenter__(self) -> Self:
         settings = self.settings
@@ -206,7 +206,7 @@ class Discovery:
         self._socket.send(leaving.encode(), self._unicast_addresses())
         self._follow(self._neighbours.leave())
 
-    # ------------------------------------------------------------------ the own master
+    # The own master
 
     async def _watch_master(self, wait: Callable[[float], Awaitable[None]]) -> None:
         failures = 0
@@ -235,7 +235,7 @@ class Discovery:
             self._node, self._contact.master_name, self._contact.master_uri
         )
 
-    # ------------------------------------------------------------------ heartbeats
+    # Heartbeats
 
     async def _send_heartbeats(self) -> None:
         requests = FIRST_REQUESTS
@@ -265,7 +265,7 @@ class Discovery:
     def _received(self, datagram: bytes, sender: tuple[str, int], to_group: bool) -> None:
         try:
             beat = decode(datagram)
-        except MalformedHeartbeat as error:
+        except MalformedHeartbeatError as error:
             _log.debug("from %s: %s", sender, error)
             return
         host = sender[0]
@@ -304,7 +304,7 @@ class Discovery:
             known = known + [(host, self.settings.mcast_port) for host in self._neighbours.hosts - named]
         return known
 
-    # ------------------------------------------------------------------ what follows
+    # What follows
 
     def _follow(self, step: Step) -> None:
         for event in step.events:

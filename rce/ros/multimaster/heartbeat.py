@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
-from rce.ros.multimaster.errors import MalformedHeartbeat
+from rce.ros.multimaster.errors import MalformedHeartbeatError
 
 MAX_RATE = 25.5
 """Highest rate that a heartbeat can tell, in hertz."""
@@ -93,15 +93,15 @@ def decode(datagram: bytes) -> Heartbeat:
     """Read a datagram.
 
     Raises:
-        MalformedHeartbeat: It is none of these.
+        MalformedHeartbeatError: It is none of these.
     """
     if len(datagram) != SIZE:
-        raise MalformedHeartbeat(f"a heartbeat has {SIZE} bytes, not {len(datagram)}")
+        raise MalformedHeartbeatError(f"a heartbeat has {SIZE} bytes, not {len(datagram)}")
     mark, version, rate, secs, nsecs, port, local_secs, local_nsecs = _PACKET.unpack(datagram)
     if mark != _MARK:
-        raise MalformedHeartbeat(f"a heartbeat begins with 'R', not {mark!r}")
+        raise MalformedHeartbeatError(f"a heartbeat begins with 'R', not {mark!r}")
     if version not in (_STATE_VERSION, _REQUEST_VERSION):
-        raise MalformedHeartbeat(f"heartbeats of version {version} are not known")
+        raise MalformedHeartbeatError(f"heartbeats of version {version} are not known")
     stamp, local = Stamp(secs, nsecs), Stamp(local_secs, local_nsecs)
     if _GONE in (secs, local_secs):
         return Heartbeat(Kind.LEAVING, port, rate / 10)

@@ -146,7 +146,7 @@ class PeerTable:
         self._liveness = liveness or LivenessSettings()
         self._peers: dict[PeerKey, _Peer] = {}
 
-    # ------------------------------------------------------------------ questions
+    # Questions
 
     @property
     def masters(self) -> list[Neighbour]:
@@ -166,7 +166,7 @@ class PeerTable:
             if peer.contact is not None and peer.online
         ]
 
-    # ------------------------------------------------------------------ what happens
+    # What happens
 
     def received(self, host: str, beat: Heartbeat, now: float) -> Step:
         """Take a heartbeat.
@@ -230,7 +230,7 @@ class PeerTable:
             self._remove(peer, step)
         return step
 
-    # ------------------------------------------------------------------ inside
+    # Inside
 
     def _beat(self, peer: _Peer, beat: Heartbeat, now: float, step: Step) -> None:
         is_new = (beat.stamp, beat.stamp_local) != (peer.heard.stamp, peer.heard.stamp_local)

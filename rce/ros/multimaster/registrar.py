@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rce.aio.tasks import TaskScope
-from rce.ros.errors import MasterError, ParameterMissing, XmlRpcError
+from rce.ros.errors import MasterError, ParameterMissingError, XmlRpcError
 from rce.ros.multimaster.plan import Clash, Registration, RegistrationKind, split_clashes
 from rce.ros.multimaster.source import multicall, multicall_as
 from rce.ros.node import Node
@@ -116,7 +116,7 @@ class Registrar:
         try:
             entries = json.loads(await self._node.get_param(RECORD))
             left = [Registration(RegistrationKind(kind), *rest) for kind, *rest in entries]
-        except ParameterMissing:
+        except ParameterMissingError:
             return
         except (TypeError, ValueError) as error:
             _log.warning("the record of a former synchronization cannot be read: %s", error)
@@ -125,7 +125,7 @@ class Registrar:
             _log.info("%d registrations of a former synchronization are taken back", len(left))
             await multicall_as(self._master, [_unregistering(entry) for entry in left])
 
-    # ------------------------------------------------------------------ inside
+    # Inside
 
     async def _without_clashes(
         self, origin: str, candidates: set[Registration]

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from rce.ros.core import Core, GraphWatch
-from rce.ros.errors import MasterUnreachable, XmlRpcError
+from rce.ros.errors import MasterUnreachableError, XmlRpcError
 from rce.ros.multimaster.state import Names
 from rce.ros.node.master import MasterClient
 from rce.ros.xmlrpc.dispatch import SUCCESS
@@ -67,7 +67,7 @@ class RpcSource:
             publishers, subscribers, services = (_names(part) for part in state)
             topic_types = {topic: kind for topic, kind in types if isinstance(kind, str)}
         except (TypeError, ValueError) as error:
-            raise MasterUnreachable(self._master.uri, "its state has no known form") from error
+            raise MasterUnreachableError(self._master.uri, "its state has no known form") from error
         nodes = sorted(
             {
                 node
@@ -107,7 +107,7 @@ async def multicall(master: MasterClient, calls: Sequence[tuple[Any, ...]]) -> l
         The value of each answer; None for a call that the master refused.
 
     Raises:
-        MasterUnreachable: The master does not answer as it should.
+        MasterUnreachableError: The master does not answer as it should.
     """
     values: list[Any] = []
     for begin in range(0, len(calls), MAX_CALLS):
@@ -138,9 +138,9 @@ async def _multicall(master: MasterClient, calls: list[dict[str, Any]]) -> list[
     try:
         answers = await master.rpc.call(master.uri, "system.multicall", (calls,), timeout=master.timeout)
     except XmlRpcError as error:
-        raise MasterUnreachable(master.uri, str(error)) from error
+        raise MasterUnreachableError(master.uri, str(error)) from error
     if not isinstance(answers, list) or len(answers) != len(calls):
-        raise MasterUnreachable(master.uri, "system.multicall was answered in no known form")
+        raise MasterUnreachableError(master.uri, "system.multicall was answered in no known form")
     return [_value(answer) for answer in answers]
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 from urllib.parse import urlsplit
 
-from rce.ros.multimaster.errors import MalformedState
+from rce.ros.multimaster.errors import MalformedStateError
 from rce.ros.multimaster.filters import SyncFilter
 from rce.ros.multimaster.heartbeat import ZERO, Stamp
 
@@ -136,7 +136,7 @@ class MasterInfo:
         """Read the ten values.
 
         Raises:
-            MalformedState: They are not what they should be.
+            MalformedStateError: They are not what they should be.
         """
         try:
             stamp, local, uri, name, publishers, subscribers, services, types, nodes, providers = values
@@ -153,7 +153,7 @@ class MasterInfo:
                 _providers(providers),
             )
         except (TypeError, ValueError, OverflowError) as error:
-            raise MalformedState(f"this is not a masterInfo: {error}") from error
+            raise MalformedStateError(f"this is not a masterInfo: {error}") from error
 
 
 def stamp_text(stamp: Stamp) -> str:

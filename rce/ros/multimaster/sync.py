@@ -14,7 +14,7 @@ from rce.aio.tasks import TaskScope
 from rce.ros.errors import MasterError, ServiceError
 from rce.ros.multimaster import messages
 from rce.ros.multimaster.addresses import master_name
-from rce.ros.multimaster.errors import NoDiscovery
+from rce.ros.multimaster.errors import NoDiscoveryError
 from rce.ros.multimaster.filters import SyncLists
 from rce.ros.multimaster.listing import masters_known_at
 from rce.ros.multimaster.peer_table import Neighbour, PeerChange, PeerEvent
@@ -114,7 +114,7 @@ class MasterSync:
         """Names of the masters that are synchronized with and online."""
         return sorted(remote.master.name for remote in self._remotes.values() if remote.is_online)
 
-    # ------------------------------------------------------------------ life
+    # Life
 
     async def __aenter__(self) -> Self:
         async with AsyncExitStack() as stack:
@@ -164,7 +164,7 @@ class MasterSync:
             ]
         }
 
-    # ------------------------------------------------------------------ the discovery
+    # The discovery
 
     async def _follow_discovery(self) -> None:
         """Keep the remotes as the discovery's list has them; its changes come in between."""
@@ -175,7 +175,7 @@ class MasterSync:
                 await self._listen_for_changes()
                 masters = await masters_known_at(self._node, self._master)
                 self._own_uri = await self._ask_own_uri()
-            except (NoDiscovery, ServiceError, MasterError, TypesError) as error:
+            except (NoDiscoveryError, ServiceError, MasterError, TypesError) as error:
                 if has_discovery:
                     _log.warning("%s", error)
                 has_discovery = False
@@ -271,7 +271,7 @@ class MasterSync:
         finally:
             del self._remotes[remote.master.uri]
 
-    # ------------------------------------------------------------------ relay links
+    # Relay links
 
     async def _start_links(self) -> None:
         settings = self.settings
@@ -308,7 +308,7 @@ class MasterSync:
     def _registered_nodes(self) -> set[str]:
         return {entry.node for entries in self.registrar.held.values() for entry in entries}
 
-    # ------------------------------------------------------------------ the own master
+    # The own master
 
     async def _watch_master(self) -> None:
         """Register everything again when another process stands in the master's place."""

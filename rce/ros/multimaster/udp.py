@@ -107,7 +107,7 @@ class HeartbeatSocket:
                 if error.errno != errno.EADDRINUSE:  # that says: is a member already
                     self._complain(self.group, error)
 
-    # ------------------------------------------------------------------ inside
+    # Inside
 
     async def _open(self, sock: socket.socket, *, to_group: bool) -> asyncio.DatagramTransport:
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from rce.ros.errors import MasterRefused, MasterUnreachable, XmlRpcError
+from rce.ros.errors import MasterRefusedError, MasterUnreachableError, XmlRpcError
 from rce.ros.xmlrpc import RpcClient
 from rce.ros.xmlrpc.dispatch import SUCCESS
 
@@ -30,18 +30,18 @@ class MasterClient:
             The value of the answer.
 
         Raises:
-            MasterUnreachable: No usable answer.
-            MasterRefused: The status is not success.
+            MasterUnreachableError: No usable answer.
+            MasterRefusedError: The status is not success.
         """
         try:
             answer = await self.rpc.call(self.uri, method, (self.caller, *arguments), timeout=self.timeout)
             status, text, value = answer
         except XmlRpcError as error:
-            raise MasterUnreachable(self.uri, str(error)) from error
+            raise MasterUnreachableError(self.uri, str(error)) from error
         except (TypeError, ValueError) as error:
-            raise MasterUnreachable(self.uri, f"{method} was answered in no known form") from error
+            raise MasterUnreachableError(self.uri, f"{method} was answered in no known form") from error
         if status != SUCCESS:
-            raise MasterRefused(method, status, text)
+            raise MasterRefusedError(method, status, text)
         return value
 
     async def register_publisher(self, topic: str, kind: str) -> None:
@@ -73,7 +73,7 @@ class MasterClient:
         """Return the slave API of a node, if the master knows it."""
         try:
             uri: str = await self.call("lookupNode", name)
-        except MasterRefused:
+        except MasterRefusedError:
             return None
         return uri
 
@@ -81,6 +81,6 @@ class MasterClient:
         """Return the ``rosrpc`` URI of a service's provider, if there is one."""
         try:
             uri: str = await self.call("lookupService", name)
-        except MasterRefused:
+        except MasterRefusedError:
             return None
         return uri

@@ -10,7 +10,13 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from rce.aio.tasks import TaskScope
-from rce.ros.errors import HandshakeRefused, MasterError, MasterUnreachable, NodeClosed, TypeMismatch
+from rce.ros.errors import (
+    HandshakeRefusedError,
+    MasterError,
+    MasterUnreachableError,
+    NodeClosedError,
+    TypeMismatchError,
+)
 from rce.ros.logfiles import LogFile
 from rce.ros.node import clock, rosout, signals
 from rce.ros.node.clock import NANOSECONDS, Clock
@@ -83,7 +89,7 @@ class GraphMember:
         self._parameters: Parameters
         self._listener: Listener
 
-    # ------------------------------------------------------------------ for programs
+    # For programs
 
     @property
     def name(self) -> str:
@@ -152,7 +158,7 @@ class GraphMember:
         """
         await self._registrar(self._running.master).register_all()
 
-    # ------------------------------------------------------------------ life
+    # Life
 
     async def __aenter__(self) -> Self:
         settings = self._settings = await self._settings.placed()
@@ -235,7 +241,7 @@ class GraphMember:
         """Provide a service under a global name."""
         runtime, uri = self._running, self._service_uri
         if name in self._services:
-            raise TypeMismatch(f"this node provides {name} already")
+            raise TypeMismatchError(f"this node provides {name} already")
 
         async def release(service: Service) -> None:
             del self._services[service.name]
@@ -256,7 +262,7 @@ class GraphMember:
         while True:
             try:
                 self._clock.simulated = await self._parameters.get(clock.PARAMETER, default=False) is True
-            except MasterUnreachable as error:
+            except MasterUnreachableError as error:
                 if deadline is not None and loop.time() >= deadline:
                     raise
                 _log.info("%s; trying again", error)
@@ -284,17 +290,17 @@ class GraphMember:
         for client in self._clients:
             await client.close()
 
-    # ------------------------------------------------------------------ inside
+    # Inside
 
     @property
     def _running(self) -> Runtime:
         """What the node works with.
 
         Raises:
-            NodeClosed: It is not part of the graph (yet, or any longer).
+            NodeClosedError: It is not part of the graph (yet, or any longer).
         """
         if self._runtime is None:
-            raise NodeClosed(f"node {self.name} is used outside its 'async with' block")
+            raise NodeClosedError(f"node {self.name} is used outside its 'async with' block")
         return self._runtime
 
     @property
@@ -322,5 +328,5 @@ class GraphMember:
     def _accept_service(self, connection: Connection, fields: dict[str, str]) -> None:
         service = self._services.get(fields["service"])
         if service is None:
-            raise HandshakeRefused(f"service {fields['service']} is not provided here")
+            raise HandshakeRefusedError(f"service {fields['service']} is not provided here")
         service.accept(connection, fields)

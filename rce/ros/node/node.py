@@ -82,7 +82,7 @@ class Node(GraphMember):
             rosout: Publish the log on ``/rosout``.
 
         Raises:
-            InvalidName: A name or remapping is not legal.
+            InvalidNameError: A name or remapping is not legal.
         """
         settings = NodeSettings.gather(
             name,
@@ -106,11 +106,11 @@ class Node(GraphMember):
         """Return the global name that ``name`` stands for, after remapping.
 
         Raises:
-            InvalidName: It is not legal.
+            InvalidNameError: It is not legal.
         """
         return self._settings.resolver.resolve(name)
 
-    # ------------------------------------------------------------------ topics
+    # Topics
 
     async def advertise(
         self, topic: str, kind: str | MessageType, *, latch: bool = False, queue_size: int = DEFAULT_QUEUE
@@ -124,8 +124,8 @@ class Node(GraphMember):
             queue_size: How many messages wait for a slow subscriber before its oldest is dropped.
 
         Raises:
-            TypeMismatch: This node publishes the topic with another type.
-            UnknownType: There is no such type.
+            TypeMismatchError: This node publishes the topic with another type.
+            UnknownTypeError: There is no such type.
             MasterError: The master cannot be told.
         """
         runtime = self._running
@@ -153,8 +153,8 @@ class Node(GraphMember):
             queue_size: How many messages wait for a coroutine or an iteration before the oldest is dropped.
 
         Raises:
-            TypeMismatch: This node subscribes to the topic with another type.
-            UnknownType: There is no such type.
+            TypeMismatchError: This node subscribes to the topic with another type.
+            UnknownTypeError: There is no such type.
             MasterError: The master cannot be told.
         """
         runtime = self._running
@@ -185,8 +185,8 @@ class Node(GraphMember):
             queue_size: As for :meth:`subscribe`.
 
         Raises:
-            TypeMismatch: This node subscribes to the topic with another type.
-            UnknownType: There is no such type.
+            TypeMismatchError: This node subscribes to the topic with another type.
+            UnknownTypeError: There is no such type.
             MasterError: The master cannot be told.
         """
         name = self.resolve(topic)
@@ -215,7 +215,7 @@ class Node(GraphMember):
         name = self.resolve(topic)
         return await self._subscribe_raw(name, kind, ListenerSink(listener, name), hears_own=False)
 
-    # ------------------------------------------------------------------ services
+    # Services
 
     async def advertise_service(self, name: str, kind: str | ServiceType, handler: Handler) -> Service:
         """Provide a service.
@@ -225,12 +225,12 @@ class Node(GraphMember):
             kind: Its type.
             handler: Called with each request; returns a response or a mapping of its fields. A plain function
                 must not block; coroutine functions run side by side for different clients. What it raises is
-                the caller's answer: :class:`~rce.ros.errors.ServiceFault` with its text, anything else is
-                logged too.
+                the caller's answer: :class:`~rce.ros.errors.ServiceFaultError` with its text; anything else
+                is logged too.
 
         Raises:
-            TypeMismatch: This node provides the service already.
-            UnknownType: There is no such type.
+            TypeMismatchError: This node provides the service already.
+            UnknownTypeError: There is no such type.
             MasterError: The master cannot be told.
         """
         service_type = self._running.types.service(kind)
@@ -242,8 +242,8 @@ class Node(GraphMember):
         """Provide a service whose requests and responses are passed as they are on the wire.
 
         Raises:
-            TypeMismatch: This node provides the service already.
-            UnknownType: There is no such type.
+            TypeMismatchError: This node provides the service already.
+            UnknownTypeError: There is no such type.
             MasterError: The master cannot be told.
         """
         return await self._provide(self.resolve(name), self._running.types.service(kind), handler)
@@ -257,7 +257,7 @@ class Node(GraphMember):
             persistent: Keep connections for later calls; else every call looks the provider up anew.
 
         Raises:
-            UnknownType: There is no such type.
+            UnknownTypeError: There is no such type.
         """
         runtime = self._running
         client = ServiceClient(
@@ -278,7 +278,7 @@ class Node(GraphMember):
             while not await answers(runtime, service):  # noqa: ASYNC110 - a master tells nobody of services
                 await asyncio.sleep(SERVICE_POLL)
 
-    # ------------------------------------------------------------------ time
+    # Time
 
     @property
     def is_time_simulated(self) -> bool:
@@ -309,14 +309,14 @@ class Node(GraphMember):
         """
         return Timer(self._clock, period, callback, self._running.tasks, oneshot=oneshot)
 
-    # ------------------------------------------------------------------ parameters
+    # Parameters
 
     async def get_param(self, name: str, default: Any = REQUIRED) -> Any:
         """Return a parameter, or all of a namespace as a dictionary.
 
         Raises:
-            ParameterMissing: It is not set and there is no ``default``.
-            MasterUnreachable: The master does not answer.
+            ParameterMissingError: It is not set and there is no ``default``.
+            MasterUnreachableError: The master does not answer.
         """
         return await self._parameters.get(self.resolve(name), default)
 
@@ -324,8 +324,8 @@ class Node(GraphMember):
         """Return a parameter as the master told it last: the first call asks, later changes are told.
 
         Raises:
-            ParameterMissing: It is not set, or an empty namespace, and there is no ``default``.
-            MasterUnreachable: The master does not answer.
+            ParameterMissingError: It is not set, or an empty namespace, and there is no ``default``.
+            MasterUnreachableError: The master does not answer.
         """
         return await self._parameters.get_cached(self.resolve(name), default)
 
@@ -341,7 +341,7 @@ class Node(GraphMember):
         """Delete a parameter or namespace.
 
         Raises:
-            ParameterMissing: It is not set.
+            ParameterMissingError: It is not set.
         """
         await self._parameters.delete(self.resolve(name))
 

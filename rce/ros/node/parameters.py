@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rce.ros import names
-from rce.ros.errors import MasterRefused, ParameterMissing
+from rce.ros.errors import MasterRefusedError, ParameterMissingError
 from rce.ros.node.master import MasterClient
 
 ParameterCallback = Callable[[str, Any], None]
@@ -38,14 +38,14 @@ class Parameters:
         """Return a parameter, or all of a namespace as a dictionary.
 
         Raises:
-            ParameterMissing: It is not set and there is no default.
-            MasterUnreachable: The master does not answer.
+            ParameterMissingError: It is not set and there is no default.
+            MasterUnreachableError: The master does not answer.
         """
         try:
             return await self._master.call("getParam", name)
-        except MasterRefused as error:
+        except MasterRefusedError as error:
             if default is REQUIRED:
-                raise ParameterMissing(name) from error
+                raise ParameterMissingError(name) from error
             return default
 
     async def get_cached(self, name: str, default: Any = REQUIRED) -> Any:
@@ -54,8 +54,8 @@ class Parameters:
         An empty namespace counts as not set. The value must not be changed.
 
         Raises:
-            ParameterMissing: It is not set and there is no default.
-            MasterUnreachable: The master does not answer.
+            ParameterMissingError: It is not set and there is no default.
+            MasterUnreachableError: The master does not answer.
         """
         if name not in self._known:
             await self._subscribe(name)
@@ -63,7 +63,7 @@ class Parameters:
         if value != UNSET:
             return value
         if default is REQUIRED:
-            raise ParameterMissing(name)
+            raise ParameterMissingError(name)
         return default
 
     async def set(self, name: str, value: Any) -> None:
@@ -79,19 +79,19 @@ class Parameters:
         """Delete a parameter or namespace.
 
         Raises:
-            ParameterMissing: It is not set.
+            ParameterMissingError: It is not set.
         """
         try:
             await self._master.call("deleteParam", name)
-        except MasterRefused as error:
-            raise ParameterMissing(name) from error
+        except MasterRefusedError as error:
+            raise ParameterMissingError(name) from error
         self._note(name, UNSET)
 
     async def search(self, name: str) -> str | None:
         """Look for a relative name in the node's namespace and then upwards; return the global name."""
         try:
             found: str = await self._master.call("searchParam", name)
-        except MasterRefused:
+        except MasterRefusedError:
             return None
         return found
 

@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from rce.aio.queues import BoundedQueue
-from rce.ros.errors import HandshakeRefused, NodeClosed, TypeMismatch
+from rce.ros.errors import HandshakeRefusedError, NodeClosedError, TypeMismatchError
 from rce.ros.node.local import LocalLink, LocalMessage
 from rce.ros.node.runtime import Runtime
 from rce.ros.node.settings import MAX_QUEUED_BYTES
@@ -107,7 +107,7 @@ class TopicOutput:
         """Take a subscriber.
 
         Raises:
-            HandshakeRefused: It means another type.
+            HandshakeRefusedError: It means another type.
         """
         require(fields, "md5sum")
         kind = self.kind
@@ -133,10 +133,10 @@ class TopicOutput:
         """Take a subscriber of this process.
 
         Raises:
-            HandshakeRefused: It means another type.
+            HandshakeRefusedError: It means another type.
         """
         if md5sum not in (ANY, self.kind.md5sum):
-            raise HandshakeRefused(
+            raise HandshakeRefusedError(
                 f"{self.topic} is of type {self.kind.name} there, which does not have md5 sum {md5sum}"
             )
         for chunks in self._latched():
@@ -234,8 +234,8 @@ class Publisher:
 
         Raises:
             SerializationError: A value does not fit its field.
-            TypeMismatch: The message is of another type.
-            NodeClosed: The publisher was closed.
+            TypeMismatchError: The message is of another type.
+            NodeClosedError: The publisher was closed.
         """
         kind = self._output.kind
         if message is None:
@@ -243,7 +243,7 @@ class Publisher:
         elif fields:
             raise TypeError("give a message or its fields, not both")
         elif message.__class__ is not kind.cls and not isinstance(message, Mapping):
-            raise TypeMismatch(f"{self.topic} carries {kind.name}, not {type(message).__name__}")
+            raise TypeMismatchError(f"{self.topic} carries {kind.name}, not {type(message).__name__}")
         if self._output.local_links and not isinstance(message, Mapping):
             self._publish_locally(kind, message)
             return
@@ -258,7 +258,7 @@ class Publisher:
             source: Whose message it is, if this publishes for others: one message of each is remembered.
 
         Raises:
-            NodeClosed: The publisher was closed.
+            NodeClosedError: The publisher was closed.
         """
         output = self._output
         self._send(payload, latch, source)
@@ -272,7 +272,7 @@ class Publisher:
     def _send(self, payload: Payload, latch: bool, source: str = "") -> None:
         """Send to the subscribers of other processes."""
         if self._closed:
-            raise NodeClosed(f"the publisher of {self.topic} is closed")
+            raise NodeClosedError(f"the publisher of {self.topic} is closed")
         chunks = frame(payload)
         if latch or self.latch:
             self.latched[source] = chunks
@@ -284,7 +284,7 @@ class Publisher:
         """Give an object to the subscribers of this process; write it only if there are others."""
         output = self._output
         if self._closed:
-            raise NodeClosed(f"the publisher of {self.topic} is closed")
+            raise NodeClosedError(f"the publisher of {self.topic} is closed")
         local_message = LocalMessage(kind, message)
         if output.links or self.latch:
             self._send(local_message.payload(), False)

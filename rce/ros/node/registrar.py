@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rce.aio.backoff import Backoff
-from rce.ros.errors import MasterError, MasterRefused, MasterUnreachable, RpcUnreachable
+from rce.ros.errors import MasterError, MasterRefusedError, MasterUnreachableError, RpcUnreachableError
 from rce.ros.node.master import MasterClient
 from rce.ros.node.parameters import Parameters
 from rce.ros.node.service import Service
@@ -84,7 +84,7 @@ class Registrar:
                 await self.master.rpc.until_lost(self.master.uri)
         except TimeoutError:
             return False
-        except RpcUnreachable as error:
+        except RpcUnreachableError as error:
             _log.debug("%s", error)
         return True
 
@@ -93,7 +93,7 @@ class Registrar:
         while True:
             try:
                 await attempt()
-            except MasterUnreachable as error:
+            except MasterUnreachableError as error:
                 _log.debug("%s; trying again", error)
             except MasterError as error:
                 _log.warning("%s does not take %s back: %s", self.master.uri, self.master.caller, error)
@@ -122,5 +122,5 @@ class Registrar:
     async def _ask_run_id(self) -> Any:
         try:
             return await self.master.call("getParam", RUN_ID)
-        except MasterRefused:
+        except MasterRefusedError:
             return None  # a bare rosmaster has none

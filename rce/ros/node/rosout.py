@@ -6,7 +6,7 @@ import logging
 from collections import deque
 from collections.abc import Callable
 
-from rce.ros.errors import NodeClosed
+from rce.ros.errors import NodeClosedError
 from rce.ros.node.clock import NANOSECONDS, Clock
 from rce.ros.node.publisher import Publisher
 
@@ -48,7 +48,7 @@ class RosoutHandler(logging.Handler):
             record = self._waiting.popleft()
             try:
                 self._publish(record)
-            except NodeClosed:
+            except NodeClosedError:
                 return
             except Exception:  # noqa: BLE001 - a record that cannot be formatted must not fail its writer
                 self.handleError(record)

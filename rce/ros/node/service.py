@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from rce.ros.errors import ServiceFault
+from rce.ros.errors import ServiceFaultError
 from rce.ros.node.runtime import Runtime
 from rce.ros.tcpros.connection import Connection
 from rce.ros.tcpros.framing import Chunks, answer_frame
@@ -74,7 +74,7 @@ class Service:
         """Take a client.
 
         Raises:
-            HandshakeRefused: It means another type.
+            HandshakeRefusedError: It means another type.
         """
         require(fields, "md5sum")
         check_type(fields, md5sum=self.type.md5sum, kind=self.type.name, subject=f"service {self.name}")
@@ -131,7 +131,7 @@ class Service:
             return self._failure(error)
 
     def _failure(self, error: Exception) -> Chunks:
-        if isinstance(error, ServiceFault):
+        if isinstance(error, ServiceFaultError):
             return answer_frame(error.text.encode(), ok=False)
         _log.error("service %s failed", self.name, exc_info=error)
         return answer_frame(f"error processing request: {error}".encode(), ok=False)

@@ -9,12 +9,12 @@ from urllib.parse import urlsplit
 
 from rce.ros.dialing import open_peer_socket
 from rce.ros.errors import (
-    HandshakeRefused,
-    NodeClosed,
-    ServiceFault,
-    ServiceLost,
-    ServiceNotFound,
-    ServiceTimeout,
+    HandshakeRefusedError,
+    NodeClosedError,
+    ServiceFaultError,
+    ServiceLostError,
+    ServiceNotFoundError,
+    ServiceTimeoutError,
 )
 from rce.ros.node.runtime import Runtime
 from rce.ros.tcpros.connection import Connection
@@ -82,21 +82,21 @@ class ServiceClient:
         A call that is cancelled or times out loses its connection, so its late answer reaches nobody.
 
         Raises:
-            ServiceNotFound: Nobody provides the service.
-            ServiceLost: The provider cannot be reached or went away before it answered.
-            ServiceFault: The provider answered with an error.
-            ServiceTimeout: No answer within ``timeout`` seconds.
+            ServiceNotFoundError: Nobody provides the service.
+            ServiceLostError: The provider cannot be reached or went away before it answered.
+            ServiceFaultError: The provider answered with an error.
+            ServiceTimeoutError: No answer within ``timeout`` seconds.
         """
         if self._closed:
-            raise NodeClosed(f"the client of {self.name} is closed")
+            raise NodeClosedError(f"the client of {self.name} is closed")
         try:
             async with asyncio.timeout(timeout), self._slots:
                 return await self._exchange(payload)
         except TimeoutError as error:
-            raise ServiceTimeout(self.name) from error
+            raise ServiceTimeoutError(self.name) from error
 
     async def close(self) -> None:
-        """Close the kept connections; calls under way end with ServiceLost."""
+        """Close the kept connections; calls under way end with ServiceLostError."""
         self._closed = True
         for call in list(self._open):
             await call.close()
@@ -105,7 +105,7 @@ class ServiceClient:
         call = self._take_idle() or await self._connect()
         try:
             answer = await call.ask(payload)
-        except ServiceFault:
+        except ServiceFaultError:
             await self._give_back(call)
             raise
         except BaseException:
@@ -133,7 +133,7 @@ class ServiceClient:
     async def _connect(self) -> _Call:
         uri = await self._runtime.master.lookup_service(self.name)
         if uri is None:
-            raise ServiceNotFound(self.name)
+            raise ServiceNotFoundError(self.name)
         call = await _Call.open(self.name, uri, self._runtime.scratch)
         self._open.add(call)
         try:
@@ -157,8 +157,8 @@ class ServiceClient:
         try:
             raise_error_field(answer)
             check_type(answer, md5sum=self.type.md5sum, kind=self.type.name, subject=f"service {self.name}")
-        except HandshakeRefused as error:
-            raise ServiceFault(self.name, str(error)) from error
+        except HandshakeRefusedError as error:
+            raise ServiceFaultError(self.name, str(error)) from error
         call.connection.header_done(has_lead=True)
 
 
@@ -174,7 +174,7 @@ async def answers(runtime: Runtime, name: str) -> bool:
             return "error" not in decode_header(await call.exchange((encode_header(probe),)))
         finally:
             await call.close()
-    except ServiceLost:
+    except ServiceLostError:
         return False
 
 
@@ -195,14 +195,14 @@ class _Call:
         try:
             host, port = address.hostname, address.port
             if host is None or port is None:
-                raise ServiceLost(
+                raise ServiceLostError(
                     service, f"the provider's URI {uri!r} is not of the form rosrpc://host:port"
                 )
             _, call.connection = await loop.create_connection(
                 lambda: Connection(call, scratch), sock=await open_peer_socket(host, port)
             )
         except (OSError, ValueError) as error:
-            raise ServiceLost(service, f"the provider at {uri} cannot be reached: {error}") from error
+            raise ServiceLostError(service, f"the provider at {uri} cannot be reached: {error}") from error
         return call
 
     async def ask(self, payload: bytes | bytearray | memoryview) -> bytes:
@@ -212,7 +212,7 @@ class _Call:
     async def exchange(self, chunks: tuple[bytes, ...]) -> bytes:
         """Send a frame and wait for the one that answers it."""
         if not self.connection.is_open:
-            raise ServiceLost(self._service)
+            raise ServiceLostError(self._service)
         self._answer = asyncio.get_running_loop().create_future()
         try:
             self.connection.write(chunks)
@@ -235,13 +235,13 @@ class _Call:
         elif connection.reader.lead:
             self._answer.set_result(payload)
         else:
-            self._answer.set_exception(ServiceFault(self._service, payload.decode(errors="replace")))
+            self._answer.set_exception(ServiceFaultError(self._service, payload.decode(errors="replace")))
 
     def connection_lost(self, connection: Connection, error: Exception | None) -> None:
         """Tell who waits for an answer."""
         del connection  # the only one
         if self._answer is not None and not self._answer.done():
-            lost = ServiceLost(self._service)
+            lost = ServiceLostError(self._service)
             lost.__cause__ = error
             self._answer.set_exception(lost)
 

@@ -62,7 +62,7 @@ class NodeSettings:
             anonymous: Make the name unique.
 
         Raises:
-            InvalidName: A name or remapping is not legal.
+            InvalidNameError: A name or remapping is not legal.
         """
         arguments = parse_arguments(argv)
         specials = arguments.specials

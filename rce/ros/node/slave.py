@@ -12,7 +12,7 @@ from typing import Any
 
 from rce.ros.node.topics import Topics
 from rce.ros.xmlrpc.arguments import graph_name, node_uris
-from rce.ros.xmlrpc.dispatch import ERROR, FAILURE, SUCCESS, BadArgument, Method
+from rce.ros.xmlrpc.dispatch import ERROR, FAILURE, SUCCESS, BadArgumentError, Method
 
 Answer = tuple[int, str, Any]
 
@@ -70,7 +70,7 @@ class SlaveApi:
         name = graph_name("topic", topic, caller)
         is_list = isinstance(protocols, list) and all(isinstance(protocol, list) for protocol in protocols)
         if not protocols or not (is_list or isinstance(protocols, str)):
-            raise BadArgument('parameter [protocols] must be a list of lists such as ["TCPROS"]')
+            raise BadArgumentError('parameter [protocols] must be a list of lists such as ["TCPROS"]')
         if name not in self.topics.outputs:
             return ERROR, f"Not a publisher of [{name}]", []
         if any(protocol[:1] == ["TCPROS"] for protocol in protocols):
@@ -87,7 +87,7 @@ class SlaveApi:
 
     def _param_update(self, _caller: str, key: Any, value: Any) -> Answer:
         if not isinstance(key, str) or not key:
-            raise BadArgument("parameter [key] must be a non-empty string")
+            raise BadArgumentError("parameter [key] must be a non-empty string")
         if not self.on_parameter(key, value):
             return ERROR, f"not subscribed to {key}", 0  # the master then forgets the subscription
         return SUCCESS, "", 0

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from rce.aio.queues import BoundedQueue
 from rce.aio.tasks import TaskScope
-from rce.ros.errors import NodeClosed
+from rce.ros.errors import NodeClosedError
 from rce.ros.node.local import LocalMessage
 from rce.ros.node.runtime import TypeName
 from rce.ros.node.settings import MAX_QUEUED_BYTES
@@ -273,10 +273,10 @@ class Subscriber:
         """Wait for the next message.
 
         Raises:
-            NodeClosed: The subscriber has a callback, which takes the messages.
+            NodeClosedError: The subscriber has a callback, which takes the messages.
         """
         if not isinstance(self.sink, QueueSink) or self._kind is None:
-            raise NodeClosed(f"the messages of {self.topic} go to a callback")
+            raise NodeClosedError(f"the messages of {self.topic} go to a callback")
         try:
             payload, _ = await self.sink.take()
         except EOFError:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from rce.aio.backoff import Backoff
 from rce.ros.dialing import open_peer_socket
-from rce.ros.errors import HandshakeRefused, RosError, TcprosError, TypeMismatch
+from rce.ros.errors import HandshakeRefusedError, RosError, TcprosError, TypeMismatchError
 from rce.ros.node.local import LocalLink, LocalMessage, find_neighbour
 from rce.ros.node.runtime import Runtime
 from rce.ros.node.subscriber import Subscriber
@@ -49,12 +49,14 @@ class TopicInput:
         """Check that another subscriber of the node means the same type; the first concrete one counts.
 
         Raises:
-            TypeMismatch: It does not.
+            TypeMismatchError: It does not.
         """
         if md5sum in (ANY, self.md5sum):
             return
         if self.md5sum != ANY:
-            raise TypeMismatch(f"{self.topic} is subscribed to as {self.kind_name} already, not {kind_name}")
+            raise TypeMismatchError(
+                f"{self.topic} is subscribed to as {self.kind_name} already, not {kind_name}"
+            )
         self.kind_name, self.md5sum = kind_name, md5sum
 
     def connected(self) -> int:
@@ -130,7 +132,7 @@ class TopicInput:
             neighbour = find_neighbour(uri) if self._runtime.intra_process else None
             try:
                 await (self._receive(link) if neighbour is None else self._receive_locally(uri, neighbour))
-            except HandshakeRefused as error:
+            except HandshakeRefusedError as error:
                 _log.warning("no messages of %s from %s: %s", self.topic, uri, error)
             except (RosError, OSError) as error:
                 _log.info("%s from %s: %s", self.topic, uri, str(error) or type(error).__name__)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce.ros.errors import HandshakeRefused, TypeMismatch
+from rce.ros.errors import HandshakeRefusedError, TypeMismatchError
 from rce.ros.node.publisher import Publisher, TopicOutput
 from rce.ros.node.runtime import Runtime, TypeName
 from rce.ros.node.subscriber import Sink, Subscriber
@@ -33,7 +33,7 @@ class Topics:
         """Make a publisher; return once the master knows of the topic.
 
         Raises:
-            TypeMismatch: The node publishes the topic with another type already.
+            TypeMismatchError: The node publishes the topic with another type already.
             MasterError: The master cannot be told.
         """
         name = kind if isinstance(kind, str) else kind.name
@@ -42,7 +42,7 @@ class Topics:
         if output is None:
             output = self.outputs[topic] = TopicOutput(runtime, topic, kind, queue_size)
         elif output.kind_name != name:
-            raise TypeMismatch(f"{topic} is published as {output.kind_name} already, not {name}")
+            raise TypeMismatchError(f"{topic} is published as {output.kind_name} already, not {name}")
         output.queue_size = max(output.queue_size, queue_size)
 
         async def release(publisher: Publisher) -> None:
@@ -83,7 +83,7 @@ class Topics:
             hears_own: Whether it takes what this node publishes.
 
         Raises:
-            TypeMismatch: The node subscribes to the topic with another type already.
+            TypeMismatchError: The node subscribes to the topic with another type already.
             MasterError: The master cannot be told.
         """
         name, md5sum = (kind.name, kind.md5sum) if kind is not None else (ANY, ANY)
@@ -125,14 +125,14 @@ class Topics:
         """Take a subscriber's connection.
 
         Raises:
-            HandshakeRefused: The topic is not published here, or as another type.
+            HandshakeRefusedError: The topic is not published here, or as another type.
         """
         output = self.outputs.get(fields["topic"])
         if output is None:
-            raise HandshakeRefused(f"topic {fields['topic']} is not published here")
+            raise HandshakeRefusedError(f"topic {fields['topic']} is not published here")
         output.accept(connection, fields)
 
-    # ------------------------------------------------------------------ what the slave API tells
+    # What the slave API tells
 
     def names(self) -> list[str]:
         """Return the topics that are published or subscribed to."""

@@ -74,7 +74,7 @@ class Connection(asyncio.BufferedProtocol):
         self._large: bytes | None = None  # a frame that was set aside
         self._peer = "?"
 
-    # ------------------------------------------------------------------ for the owner
+    # For the owner
 
     @property
     def is_open(self) -> bool:
@@ -122,7 +122,7 @@ class Connection(asyncio.BufferedProtocol):
     def __str__(self) -> str:
         return f"TCPROS connection with {self._peer}"
 
-    # ------------------------------------------------------------------ for the transport
+    # For the transport
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Keep the transport."""
@@ -170,7 +170,7 @@ class Connection(asyncio.BufferedProtocol):
         self.full = False
         self.owner.writable(self)
 
-    # ------------------------------------------------------------------ inside
+    # Inside
 
     def _set_large_aside(self) -> None:
         """Take a complete frame out of memory of its own, to be handed over later.

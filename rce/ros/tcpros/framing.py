@@ -14,7 +14,7 @@ import io
 import struct
 
 from rce.buffers import unfilled
-from rce.ros.errors import MalformedFrame
+from rce.ros.errors import MalformedFrameError
 
 MAX_FRAME = 2**28
 """Longest message in bytes."""
@@ -109,7 +109,7 @@ class FrameReader:
         """Return the next complete frame, without head.
 
         Raises:
-            MalformedFrame: A frame is longer than :attr:`limit`.
+            MalformedFrameError: A frame is longer than :attr:`limit`.
         """
         if self._large is not None:
             return None
@@ -120,7 +120,7 @@ class FrameReader:
             return None
         length: int = _LENGTH.unpack_from(self._scratch, body - 4)[0]
         if length > self.limit:
-            raise MalformedFrame(f"a frame of {length} bytes is longer than {self.limit}")
+            raise MalformedFrameError(f"a frame of {length} bytes is longer than {self.limit}")
         self.lead = self._scratch[self._begin] if self.has_lead else 1
         stop = body + length
         if stop > self._end:

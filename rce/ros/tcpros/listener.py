@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Self
 
 from rce.ros.closing import close_all
-from rce.ros.errors import HandshakeRefused
+from rce.ros.errors import HandshakeRefusedError
 from rce.ros.tcpros.connection import Connection
 from rce.ros.tcpros.header import decode_header, encode_header
 
@@ -83,8 +83,8 @@ class _Greeter:
             elif "topic" in fields:
                 self._topic(connection, fields)
             else:
-                raise HandshakeRefused("the connection header names neither a topic nor a service")  # noqa: TRY301
-        except HandshakeRefused as error:
+                raise HandshakeRefusedError("the connection header names neither a topic nor a service")  # noqa: TRY301
+        except HandshakeRefusedError as error:
             _log.warning("refused %s of %s: %s", connection, fields.get("callerid", "?"), error)
             connection.write((encode_header({"error": str(error)}),))
             connection.close()

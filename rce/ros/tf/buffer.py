@@ -53,7 +53,7 @@ class Buffer:
         """Each frame's present parent; roots are missing."""
         return {child: edge.latest.parent for child, edge in self._edges.items()}
 
-    # ------------------------------------------------------------------ telling
+    # Telling
 
     def insert(self, stamped: StampedTransform, *, static: bool = False) -> bool:
         """Take a transform.
@@ -88,7 +88,7 @@ class Buffer:
         for child, edge in self._edges.items():
             self._frames |= {child: None, edge.latest.parent: None}
 
-    # ------------------------------------------------------------------ asking
+    # Asking
 
     def lookup(self, target: str, source: str, time: Time | None = None) -> StampedTransform:
         """Return ``target_from_source``.
@@ -178,7 +178,7 @@ class Buffer:
             add(root, 0)
         return "\n".join(lines)
 
-    # ------------------------------------------------------------------ walking the tree
+    # Walking the tree
 
     def _known(self, frame: str) -> str:
         name = strip(frame)

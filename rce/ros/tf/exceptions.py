@@ -4,12 +4,12 @@
 
     RosError
     +-- TransformError
-        +-- UnknownFrameError     nobody has told of such a frame (also a LookupError)
-        +-- ConnectivityError     two frames are in different trees
-        +-- FrameLoopError        the frames form a circle: no tree at all
-        +-- ExtrapolationError    the time is before or after what is known of an edge
-        +-- TransformTimeout      no answer in time; the cause is one of the above (also a TimeoutError)
-        +-- BadTransformError     a transform that cannot be taken (also a ValueError)
+        +-- UnknownFrameError      nobody has told of such a frame (also a LookupError)
+        +-- ConnectivityError      two frames are in different trees
+        +-- FrameLoopError         the frames form a circle: no tree at all
+        +-- ExtrapolationError     the time is before or after what is known of an edge
+        +-- TransformTimeoutError  no answer in time; the cause is one of the above (also a TimeoutError)
+        +-- BadTransformError      a transform that cannot be taken (also a ValueError)
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ class ExtrapolationError(TransformError):
         )
 
 
-class TransformTimeout(TransformError, TimeoutError):  # noqa: N818
+class TransformTimeoutError(TransformError, TimeoutError):
     """A transform did not become known in time.
 
     Attributes:

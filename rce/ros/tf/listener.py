@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from rce.aio.tasks import TaskScope
-from rce.ros.errors import NodeClosed
+from rce.ros.errors import NodeClosedError
 from rce.ros.handles import release
 from rce.ros.tf.broadcaster import KIND, TF, TF_STATIC, find_prefix
 from rce.ros.tf.buffer import Buffer
@@ -18,7 +18,7 @@ from rce.ros.tf.exceptions import (
     BadTransformError,
     ConnectivityError,
     ExtrapolationError,
-    TransformTimeout,
+    TransformTimeoutError,
     UnknownFrameError,
 )
 from rce.ros.tf.frames import resolve
@@ -67,7 +67,7 @@ class TransformListener:
         self._latest = 0.0
         self._complaints: set[str] = set()
 
-    # ------------------------------------------------------------------ life
+    # Life
 
     async def __aenter__(self) -> Self:
         async with AsyncExitStack() as stack:
@@ -96,7 +96,7 @@ class TransformListener:
         self._stopped = True
         self._changed.set()
 
-    # ------------------------------------------------------------------ for programs
+    # For programs
 
     def lookup(self, target: str, source: str, time: Time | None = None) -> StampedTransform:
         """Return ``target_from_source``; as :meth:`rce.ros.tf.Buffer.lookup`, below the prefix.
@@ -134,10 +134,10 @@ class TransformListener:
             timeout: Real seconds to wait; None: indefinitely.
 
         Raises:
-            TransformTimeout: It did not become known in time; the cause says why.
+            TransformTimeoutError: It did not become known in time; the cause says why.
             ExtrapolationError: ``time`` is before what the buffer holds: waiting does not help.
             FrameLoopError: The frames are not a tree.
-            NodeClosed: The node stops.
+            NodeClosedError: The node stops.
         """
         try:
             async with asyncio.timeout(timeout):
@@ -151,17 +151,17 @@ class TransformListener:
                     await self._next_change()
         except TimeoutError as error:
             assert timeout is not None
-            raise TransformTimeout(timeout, reason) from error
+            raise TransformTimeoutError(timeout, reason) from error
 
     def resolve(self, frame: str) -> str:
         """Return the full name of a frame."""
         return resolve(self.prefix, frame)
 
-    # ------------------------------------------------------------------ hearing
+    # Hearing
 
     async def _next_change(self) -> None:
         if self._stopped:
-            raise NodeClosed(f"{self._node.name} listens to transforms no longer")
+            raise NodeClosedError(f"{self._node.name} listens to transforms no longer")
         self._changed.clear()
         await self._changed.wait()
 

@@ -26,7 +26,7 @@ async def get(context: ToolContext, name: str, *, as_json: bool) -> None:
     """Print a parameter, or a whole namespace.
 
     Raises:
-        ParameterMissing: It is not set.
+        ParameterMissingError: It is not set.
     """
     value = await context.node.get_param(name)
     if as_json:
@@ -55,6 +55,6 @@ async def delete(context: ToolContext, name: str) -> None:
     """Delete a parameter or a namespace.
 
     Raises:
-        ParameterMissing: It is not set.
+        ParameterMissingError: It is not set.
     """
     await context.node.delete_param(name)

@@ -3,9 +3,9 @@
 ::
 
     TypesError
-    +-- UnknownType          no definition of that name was found
-    +-- BadDefinition        a definition's text is wrong (where: file and line)
-    +-- SerializationError   a value does not fit its type, or bytes do not hold a message of it
+    +-- UnknownTypeError    no definition of that name was found
+    +-- BadDefinitionError  a definition's text is wrong (where: file and line)
+    +-- SerializationError  a value does not fit its type, or bytes do not hold a message of it
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ class TypesError(Exception):
     """Base of all errors of :mod:`rce.ros.types`."""
 
 
-class UnknownType(TypesError, LookupError):  # noqa: N818
+class UnknownTypeError(TypesError, LookupError):
     """There is no definition of a type.
 
     Attributes:
@@ -32,7 +32,7 @@ class UnknownType(TypesError, LookupError):  # noqa: N818
         return f"unknown type {self.name}: {self.hint}"
 
 
-class BadDefinition(TypesError, ValueError):  # noqa: N818
+class BadDefinitionError(TypesError, ValueError):
     """The text of a definition cannot be read.
 
     Attributes:

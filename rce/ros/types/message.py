@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from rce.ros.types.definition import PART_HEADER, SEPARATOR, checksum_text, md5
-from rce.ros.types.exceptions import UnknownType
+from rce.ros.types.exceptions import UnknownTypeError
 from rce.ros.types.fields import Field, min_size
 from rce.ros.types.objects import make_class, make_codec, make_message
 from rce.ros.types.values import BUILTINS
@@ -130,6 +130,8 @@ def _field(raw: RawField, definition: Definition, resolve: Callable[[str], Messa
     if raw.type not in BUILTINS:
         try:
             message = resolve(raw.type)
-        except UnknownType as error:
-            raise UnknownType(error.name, f"{error.hint} (used at {definition.source}:{raw.line})") from error
+        except UnknownTypeError as error:
+            raise UnknownTypeError(
+                error.name, f"{error.hint} (used at {definition.source}:{raw.line})"
+            ) from error
     return Field(raw.name, raw.type, raw.is_array, raw.length, message)

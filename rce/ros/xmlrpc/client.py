@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 import h11
 
 from rce.ros.dialing import open_peer_socket
-from rce.ros.errors import RpcUnreachable
+from rce.ros.errors import RpcUnreachableError
 from rce.ros.xmlrpc.codec import decode_response, encode_call
 
 _log = logging.getLogger(__name__)
@@ -67,9 +67,9 @@ class RpcClient:
             timeout: Seconds for all of it.
 
         Raises:
-            RpcUnreachable: No answer came, for whatever reason.
-            RemoteFault: The server answered with a fault.
-            MalformedDocument: An argument cannot be sent or the answer cannot be read.
+            RpcUnreachableError: No answer came, for whatever reason.
+            RemoteFaultError: The server answered with a fault.
+            MalformedDocumentError: An argument cannot be sent or the answer cannot be read.
         """
         return await self.send(uri, method, encode_call(method, arguments), timeout=timeout)
 
@@ -83,29 +83,29 @@ class RpcClient:
             timeout: Seconds for all of it.
 
         Raises:
-            RpcUnreachable: No answer came, for whatever reason.
-            RemoteFault: The server answered with a fault.
-            MalformedDocument: The answer cannot be read.
+            RpcUnreachableError: No answer came, for whatever reason.
+            RemoteFaultError: The server answered with a fault.
+            MalformedDocumentError: The answer cannot be read.
         """
         try:
             async with asyncio.timeout(timeout):
                 answer = await self._exchange(uri, document)
         except TimeoutError as error:
-            raise RpcUnreachable(uri, f"{method} took longer than {timeout:g} s") from error
+            raise RpcUnreachableError(uri, f"{method} took longer than {timeout:g} s") from error
         except (OSError, h11.ProtocolError, EOFError, ValueError) as error:
-            raise RpcUnreachable(uri, str(error) or type(error).__name__) from error
+            raise RpcUnreachableError(uri, str(error) or type(error).__name__) from error
         return decode_response(answer)
 
     async def until_lost(self, uri: str) -> None:
         """Wait until the server at ``uri`` goes away: until a connection made for nothing else is lost.
 
         Raises:
-            RpcUnreachable: It is away already.
+            RpcUnreachableError: It is away already.
         """
         try:
             reader, writer = await asyncio.open_connection(sock=await open_peer_socket(*_address(uri)))
         except (OSError, ValueError) as error:
-            raise RpcUnreachable(uri, str(error)) from error
+            raise RpcUnreachableError(uri, str(error)) from error
         _keep_alive(writer.get_extra_info("socket"))
         try:
             with contextlib.suppress(OSError):  # lost, whatever the reason

@@ -12,7 +12,7 @@ from rce.ros.logrecord import LogRecord, read_record, started
 from rce_container.environment.logs.files import ROSOUT_LOG, LogWriter
 from rce_container.environment.logs.node_log import NodeLog
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 WINDOW_S = 1.0
 WINDOW_BYTES = 1 << 18
@@ -51,7 +51,7 @@ class RosoutLog:
         try:
             record = read_record(payload)
         except ValueError as error:
-            log.warning("%s", error)
+            _log.warning("%s", error)
             return
         if self._clock() >= self._window_end:
             self._begin_window()

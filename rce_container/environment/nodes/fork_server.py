@@ -11,7 +11,7 @@ from pathlib import Path
 
 from rce_container.forkserver.nodes import Script, encode_script
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _TIMEOUT_S = 5.0
 _MAX_ANSWER = 32
@@ -44,7 +44,7 @@ class NodeForkServer:
             socket.send_fds(self._sock, [packet], (stdout, stderr))
             answer = self._sock.recv(_MAX_ANSWER)
         except OSError as error:
-            log.warning(
+            _log.warning(
                 "nodes start more slowly from now on: the node fork server does not answer: %s", error
             )
             answer = b""

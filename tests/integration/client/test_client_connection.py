@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rce.link import PeerFault
+from rce.link import PeerFaultError
 from rce_client.connection import Connection, State
 from rce_client.exceptions import (
     CallError,
@@ -143,7 +143,7 @@ async def test_an_answer_that_cannot_be_sent_fails_its_caller(engine: Engine) ->
     async with engine.connection() as conn:
         provider = await conn.service_provider("serve", ECHO, handler)
         await provider.wait_active(10)
-        with pytest.raises(PeerFault, match="the answer cannot be sent"):
+        with pytest.raises(PeerFaultError, match="the answer cannot be sent"):
             await engine.end("serve").port.call(ros_string("bad"))
         assert await engine.end("serve").port.call(ros_string("x")) == ros_string("good")
 

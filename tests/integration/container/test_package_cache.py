@@ -18,7 +18,7 @@ from rce_container.packages import cache as cache_module
 from rce_container.packages import disk, shelf
 from rce_container.packages.cache import PackageCache
 from rce_container.packages.disk import replicate
-from rce_container.packages.exceptions import NoSpace, Unfetched, Unverified
+from rce_container.packages.exceptions import FetchError, NoSpaceError, VerificationError
 from rce_container.packages.shelf import Shelf
 
 
@@ -106,25 +106,25 @@ async def test_what_nobody_holds_goes_when_room_is_needed(depot: Depot, tmp_path
 async def test_what_is_not_what_was_signed_is_refused(depot: Depot, tmp_path: Path) -> None:
     cache = opened(depot, tmp_path / "cache")
     nav = depot.make("nav")
-    with pytest.raises(Unverified, match="does not fit the key"):
+    with pytest.raises(VerificationError, match="does not fit the key"):
         await cache.ensure("eve", nav)
     assert depot.asked == []
     other = depot.make("other")
     depot.contents[nav.sha256] = depot.contents[other.sha256]
-    with pytest.raises(Unverified, match="not what was signed"):
+    with pytest.raises(VerificationError, match="not what was signed"):
         await cache.ensure("user", nav)
     wrong = sign(depot.contents[other.sha256], "nav", "1.0")
-    with pytest.raises(Unverified, match="holds the package 'other'"):
+    with pytest.raises(VerificationError, match="holds the package 'other'"):
         await cache.ensure("user", wrong)
     garbage = sign(b"garbage", "nav", "1.0")
     depot.contents[garbage.sha256] = b"garbage"
-    with pytest.raises(Unverified, match="cannot be unpacked"):
+    with pytest.raises(VerificationError, match="cannot be unpacked"):
         await cache.ensure("user", garbage)
     small = PackageCache(tmp_path / "cache", depot.fetch, space=1, limits=ArchiveLimits(archive=50))
-    with pytest.raises(Unverified, match="more than 50 bytes"):
+    with pytest.raises(VerificationError, match="more than 50 bytes"):
         await small.ensure("user", other)
     del depot.contents[nav.sha256]
-    with pytest.raises(Unfetched, match="the master is away"):
+    with pytest.raises(FetchError, match="the master is away"):
         await cache.ensure("user", nav)
     assert kept(tmp_path / "cache") == set()
     assert not list((tmp_path / "cache" / "incoming").iterdir())
@@ -142,7 +142,7 @@ async def test_a_full_disk_is_told_and_leaves_nothing(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(cache_module, "unpack", full)
-    with pytest.raises(NoSpace, match="disk of the container's machine is full"):
+    with pytest.raises(NoSpaceError, match="disk of the container's machine is full"):
         await cache.ensure("user", nav)
     assert not list((tmp_path / "cache" / "incoming").iterdir())
     monkeypatch.undo()

@@ -15,7 +15,7 @@ from websockets.asyncio.client import connect
 
 from rce.control.server import ControlServer
 from rce.guard.lobby import Lobby
-from rce.link.exceptions import LinkRefused
+from rce.link.exceptions import LinkRefusedError
 from rce.link.frames import FrameReader
 from rce.link.handover import HandoverReceiver, HandoverSender, LinkAcceptor
 from rce.link.handshake import check_answer, encode_hello
@@ -200,7 +200,7 @@ async def test_links_are_answered(way: str, first: bytes) -> None:
             assert len(lobby) == FEW
             reader, writer = await asyncio.open_connection(ADDRESS, port)
             writer.write(encode_hello("L", "wrong"))
-            with pytest.raises(LinkRefused):
+            with pytest.raises(LinkRefusedError):
                 check_answer(FrameReader(limits).feed(await reader.read(1000))[0])
             writer.close()
             await writer.wait_closed()

@@ -14,7 +14,7 @@ import pytest
 
 from rce.aio.backoff import Backoff
 from rce.control.model import ConnectionSpec, EndpointKind, EndpointSpec, LinkAddress, LinkSpec
-from rce.link import Endpoint, Interface, InterfaceError, LinkHub, LinkLimits, LinkTimeouts, PeerFault
+from rce.link import Endpoint, Interface, InterfaceError, LinkHub, LinkLimits, LinkTimeouts, PeerFaultError
 from rce.link.handover import HandoverReceiver, HandoverSender, LinkAcceptor
 from rce.model.names import EndpointId
 from rce.model.specs import InterfaceSpec
@@ -88,7 +88,7 @@ class FakeInterface(Interface):
 
     async def upper(self, payload: bytes) -> bytes:
         if payload == b"fail":
-            raise PeerFault("told to fail")
+            raise PeerFaultError("told to fail")
         return payload.upper()
 
     async def serve(self, payload: bytes) -> Buffer:

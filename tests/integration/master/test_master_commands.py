@@ -12,7 +12,7 @@ from rce.control.messages import Put
 from rce_master.cli import follow, show
 from rce_master.cli.client import ApiClient
 from rce_master.cli.credentials import FILE_VARIABLE, Credentials, load, save
-from rce_master.cli.exceptions import ApiError, CliError, NotLoggedIn
+from rce_master.cli.exceptions import ApiError, CliError, NotLoggedInError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -72,7 +72,7 @@ async def test_logs_are_printed_whole(
     site: Site, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(FILE_VARIABLE, str(tmp_path / "deep" / "login.json"))
-    with pytest.raises(NotLoggedIn):
+    with pytest.raises(NotLoggedInError):
         load()
     save(Credentials(url=site.url, user="testUser", token=site.token, expires=0.0))
     assert site.token not in repr(load())

@@ -13,10 +13,10 @@ from support.multimaster import STRING, DiscoveryNetwork, node
 from support.ports import free_ports
 
 from rce.ros.core import Core
-from rce.ros.errors import MasterUnreachable
+from rce.ros.errors import MasterUnreachableError
 from rce.ros.multimaster import messages
 from rce.ros.multimaster.discovery import Discovery
-from rce.ros.multimaster.errors import NoDiscovery
+from rce.ros.multimaster.errors import NoDiscoveryError
 from rce.ros.multimaster.listing import list_masters
 from rce.ros.xmlrpc import RpcClient
 
@@ -41,7 +41,7 @@ async def test_a_core_of_the_same_process_is_watched(network: DiscoveryNetwork) 
 
 async def test_masters_and_changes_are_shown_in_the_graph(network: DiscoveryNetwork) -> None:
     async with Core(port=0) as a, Core(port=0) as b:
-        with pytest.raises(NoDiscovery):
+        with pytest.raises(NoDiscoveryError):
             await list_masters(a.uri)
         async with Discovery(network.settings(a.uri, name="a")) as discovery:
             watcher = node("watcher", a.uri, types=messages.registry())
@@ -71,7 +71,7 @@ async def test_masters_and_changes_are_shown_in_the_graph(network: DiscoveryNetw
                 assert (await rpc.call(discovery.monitor_uri, "getCurrentTime", ()))[0] == a.uri
                 (pair,) = await rpc.call(discovery.monitor_uri, "getTopicsMd5sum", ([STRING, "no/Such"],))
                 assert pair == [STRING, "992ce8a1687cec8c8bd883ec73ca41d1"]
-    with pytest.raises(MasterUnreachable):
+    with pytest.raises(MasterUnreachableError):
         await list_masters(a.uri)
 
 

@@ -14,7 +14,7 @@ import pytest
 from support.multimaster import STRING, DiscoveryNetwork, node
 
 from rce.ros.core import Core
-from rce.ros.errors import ServiceFault
+from rce.ros.errors import ServiceFaultError
 from rce.ros.multimaster.filters import SyncLists
 from rce.ros.multimaster.relay.link import STRANGERS_PER_ADDRESS
 from rce.ros.multimaster.relay.throttle import MessageThrottle
@@ -195,13 +195,13 @@ async def test_one_connection_carries_topics_and_services_both_ways() -> None:
         assert "/secret" not in cloud.graph.topic_types
 
         def refuse(_: object) -> None:
-            raise ServiceFault("/add", "not today")
+            raise ServiceFaultError("/add", "not today")
 
         await planner.advertise_service("add", "roscpp/GetLoggers", lambda _: {"loggers": []})
         await planner.advertise_service("refuse", "roscpp/Empty", refuse)
         await robot.wait_until(lambda graph: graph.service("/refuse") and graph.service("/add"), timeout=20)  # type: ignore[arg-type,return-value]
         assert (await base.service_client("add", "roscpp/GetLoggers").call({}, timeout=20)).loggers == []
-        with pytest.raises(ServiceFault, match="not today"):
+        with pytest.raises(ServiceFaultError, match="not today"):
             await base.service_client("refuse", "roscpp/Empty").call({}, timeout=20)
 
 

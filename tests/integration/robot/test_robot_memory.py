@@ -12,7 +12,7 @@ from support.cloud import DIGEST, Cloud, running_cloud
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
-from rce.link import Overloaded
+from rce.link import OverloadedError
 from rce_robot.settings import SessionSettings
 
 if TYPE_CHECKING:
@@ -222,6 +222,6 @@ async def test_a_call_dropped_while_it_comes_in_ends_at_its_caller() -> None:
         end = await cloud.wire("serve", "ServiceClientForwarder", "std_srvs/SetBool")
         async with dial(cloud, "testUser", "testRobot"):
             await end.active.until(lambda: end.is_active)
-            with pytest.raises(Overloaded, match="the request was dropped: memory is short"):
+            with pytest.raises(OverloadedError, match="the request was dropped: memory is short"):
                 await end.port.call(bytes(30 * MIB))
             assert end.losses == 0

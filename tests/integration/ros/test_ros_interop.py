@@ -13,7 +13,7 @@ import pytest
 from support.processes import finish
 
 from rce.ros.core import Core
-from rce.ros.errors import ServiceFault
+from rce.ros.errors import ServiceFaultError
 from rce.ros.node import Node
 
 pytestmark = pytest.mark.needs("rospy")
@@ -105,7 +105,7 @@ async def test_a_rospy_node_and_ours(core: Core, make_node: MakeNode, tmp_path: 
         client = ours.service_client("set_level", "roscpp/SetLoggerLevel")
         await client.call({"logger": "x", "level": "warn"}, timeout=20)
         assert await ours.get_param("/level") == "warn"
-        with pytest.raises(ServiceFault, match="as asked"):
+        with pytest.raises(ServiceFaultError, match="as asked"):
             await client.call({"logger": "fail"}, timeout=20)
         loggers = await ours.service_client("/real/get_loggers", "roscpp/GetLoggers", persistent=False)()
         assert "rosout" in {logger.name for logger in loggers.loggers}
@@ -156,7 +156,7 @@ async def test_service_tools_call_our_nodes(core: Core, make_node: MakeNode) -> 
             return {"loggers": [{"name": "a", "level": "info"}, {"name": "b", "level": "debug"}]}
 
         def refuse(request: Any) -> None:
-            raise ServiceFault("/refuse", "never")
+            raise ServiceFaultError("/refuse", "never")
 
         await ours.advertise_service("get", "roscpp/GetLoggers", loggers)
         await ours.advertise_service("refuse", "roscpp/Empty", refuse)

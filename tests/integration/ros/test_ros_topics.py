@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from rce.ros.core import Core
-from rce.ros.errors import MasterUnreachable, NodeClosed, TypeMismatch
+from rce.ros.errors import MasterUnreachableError, NodeClosedError, TypeMismatchError
 from rce.ros.node import Node, Subscriber
 from rce.ros.tcpros.header import encode_header
 from rce.ros.types import TypeRegistry
@@ -289,16 +289,16 @@ async def test_a_lost_connection_is_made_again(make_node: MakeNode) -> None:
 async def test_types_must_agree(core: Core, make_node: MakeNode, caplog: pytest.LogCaptureFixture) -> None:
     async with make_node("a") as a, make_node("b") as b:
         publisher = await a.advertise("t", STRING)
-        with pytest.raises(TypeMismatch):
+        with pytest.raises(TypeMismatchError):
             await a.advertise("t", "std_msgs/Bool")
         wrong = await b.subscribe("t", "std_msgs/Bool")
-        with pytest.raises(TypeMismatch):
+        with pytest.raises(TypeMismatchError):
             await b.subscribe("t", STRING)
         with pytest.raises(TimeoutError):
             await wrong.wait_for_publishers(timeout=0.3)
         assert "md5 sum" in caplog.text
         assert publisher.connections == 0
-        with pytest.raises(TypeMismatch):
+        with pytest.raises(TypeMismatchError):
             publisher.publish(TypeRegistry().message("std_msgs/Bool").new(data=True))
 
 
@@ -311,7 +311,7 @@ async def test_handles_share_a_topic_until_the_last_is_closed(core: Core, make_n
         await one.close()
         second.publish(data="still here")
         assert await collect(two, 1) == ["still here"]
-        with pytest.raises(NodeClosed):
+        with pytest.raises(NodeClosedError):
             first.publish(data="no")
         assert [message async for message in one] == []
         await second.close()
@@ -326,7 +326,7 @@ async def test_leaving_unregisters_everything(core: Core, make_node: MakeNode) -
         await a.advertise_service("s", "std_srvs/Empty", lambda request: None)
         assert ["/s", ["/a"]] in core.graph.system_state()[2]
     assert core.graph.system_state() == [[], [], []]
-    with pytest.raises(NodeClosed):
+    with pytest.raises(NodeClosedError):
         await a.advertise("t", STRING)
 
 
@@ -345,7 +345,7 @@ async def test_log_records_are_published(make_node: MakeNode) -> None:
 
 
 async def test_a_node_without_master_says_so() -> None:
-    with pytest.raises(MasterUnreachable, match=r"127\.0\.0\.1:1/"):
+    with pytest.raises(MasterUnreachableError, match=r"127\.0\.0\.1:1/"):
         async with Node("a", argv=[], master_uri="http://127.0.0.1:1/", master_timeout=0):
             pass
 

@@ -14,7 +14,7 @@ from rce.ros.actions import (
     ActionServer,
     ClientGoal,
     CommState,
-    GoalFailed,
+    GoalFailedError,
     GoalId,
     GoalState,
     ServerGoal,
@@ -108,7 +108,7 @@ async def test_many_goals_at_the_same_time(make_node: MakeNode) -> None:
             assert list((await anext(aiter(goal))).sequence) == [order]
         assert [goal.request.order for goal in server.goals] == [0, 1, 2]
         refused = await client.send(order=3)
-        with pytest.raises(GoalFailed, match="rejected: the server works on 3 goals already"):
+        with pytest.raises(GoalFailedError, match="rejected: the server works on 3 goals already"):
             await refused.result()
         goals[1].cancel()
         assert await goals[1].wait() is GoalState.PREEMPTED
@@ -129,7 +129,7 @@ async def test_a_cancelled_goal_keeps_its_result(make_node: MakeNode) -> None:
         goal = await client.send(order=1)
         await anext(aiter(goal))
         goal.cancel()
-        with pytest.raises(GoalFailed, match="preempted: enough") as caught:
+        with pytest.raises(GoalFailedError, match="preempted: enough") as caught:
             await goal.result()
         assert caught.value.state is GoalState.PREEMPTED
         assert list(caught.value.result.sequence) == [1]  # type: ignore[union-attr]
@@ -170,9 +170,9 @@ async def test_a_handler_that_fails_aborts_its_goal(
         return {"sequence": "no numbers"}
 
     async with pair(make_node, fail) as (_, client):
-        with pytest.raises(GoalFailed, match="aborted: ZeroDivisionError: by nothing"):
+        with pytest.raises(GoalFailedError, match="aborted: ZeroDivisionError: by nothing"):
             await (await client.send(order=1)).result()
-        with pytest.raises(GoalFailed, match=r"aborted: SerializationError: .*sequence"):
+        with pytest.raises(GoalFailedError, match=r"aborted: SerializationError: .*sequence"):
             await (await client.send(order=0)).result()
         assert "the handler of /job failed" in caplog.text
         with pytest.raises(SerializationError):
@@ -216,7 +216,7 @@ async def test_a_server_that_stops_aborts_its_goals(make_node: MakeNode) -> None
         async with make_node("server") as a, SimpleActionServer(a, "job", FIBONACCI, until_cancelled):
             goal = await client.send(order=1)
             await anext(aiter(goal))
-        with pytest.raises(GoalFailed, match="aborted: the server stopped"):
+        with pytest.raises(GoalFailedError, match="aborted: the server stopped"):
             await goal.result(20)
 
 
@@ -242,7 +242,7 @@ async def test_a_server_that_starts_anew_has_lost_the_goal(core: Core, make_node
                 status.publish(status_list=[{"goal_id": {"id": received.goal_id.id}, "status": 1}])
                 await active.wait()
             async with make_node("server") as a, ActionServer(a, "job", FIBONACCI, fibonacci):
-                with pytest.raises(GoalFailed, match="does not list the goal any longer"):
+                with pytest.raises(GoalFailedError, match="does not list the goal any longer"):
                     await goal.result()
                 assert goal.state is GoalState.LOST
 
@@ -255,7 +255,7 @@ async def test_a_silent_server_loses_the_goal(make_node: MakeNode) -> None:
         ActionClient(b, "job", FIBONACCI, patience=0.01) as client,
     ):
         goal = await client.send(order=1)
-        with pytest.raises(GoalFailed, match="the server is silent"):
+        with pytest.raises(GoalFailedError, match="the server is silent"):
             await goal.result(20)
 
 
@@ -293,11 +293,11 @@ async def test_goals_end_for_a_client_that_leaves_or_whose_node_stops(make_node:
     async with pair(make_node, until_cancelled) as (_, client):
         goal = await client.send(order=1)
         client._node.shutdown("test")
-        with pytest.raises(GoalFailed, match="the node stops"):
+        with pytest.raises(GoalFailedError, match="the node stops"):
             await goal.result()
     async with pair(make_node, until_cancelled) as (_, client):
         goal = await client.send(order=1)
-    with pytest.raises(GoalFailed, match="the client was closed"):
+    with pytest.raises(GoalFailedError, match="the client was closed"):
         await goal.result()
 
 

@@ -11,7 +11,7 @@ from support.ports import free_port
 from support.ros_real import Graph
 
 from rce.ros.core import Core
-from rce.ros.errors import RemoteFault
+from rce.ros.errors import RemoteFaultError
 from rce.ros.node import Node
 from rce.ros.xmlrpc import RpcClient
 
@@ -102,7 +102,7 @@ async def play(uri: str, calls: list[tuple[str, tuple[Any, ...]]]) -> list[Any]:
         for method, arguments in calls:
             try:
                 found.append(comparable(method, await rpc.call(uri, method, arguments)))
-            except RemoteFault:
+            except RemoteFaultError:
                 found.append("fault")
     return found
 

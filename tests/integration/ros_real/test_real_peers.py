@@ -13,7 +13,7 @@ import pytest
 from support.ports import free_port
 from support.ros_real import Graph, our_graph
 
-from rce.ros.errors import ServiceFault
+from rce.ros.errors import ServiceFaultError
 from rce.ros.node import Node
 
 pytestmark = [pytest.mark.needs("rospy"), pytest.mark.timeout(300)]
@@ -52,7 +52,7 @@ async def test_topics_services_and_parameters(
         client = node.service_client("peer_set", "std_srvs/SetBool")
         assert (await client.call({"data": True}, timeout=20)).message == "done"
         assert await node.get_param(f"{name}/set") is True
-        with pytest.raises(ServiceFault, match="as asked" if language == "rospy" else None):
+        with pytest.raises(ServiceFaultError, match="as asked" if language == "rospy" else None):
             await client.call({"data": False}, timeout=20)
         await node.advertise_service(
             "ours_trigger", "std_srvs/Trigger", lambda _: {"success": True, "message": "ü"}

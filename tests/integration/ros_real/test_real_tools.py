@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from support.ros_real import Graph
 
-from rce.ros.errors import ServiceFault
+from rce.ros.errors import ServiceFaultError
 from rce.ros.node import Node
 
 pytestmark = [pytest.mark.needs("rospy", "rostopic")]
@@ -82,7 +82,7 @@ async def test_rosservice(graph: Graph, make_node: MakeNode) -> None:
             return {"loggers": [{"name": "a", "level": "info"}, {"name": "b", "level": "debug"}]}
 
         def refuse(request: Any) -> None:
-            raise ServiceFault("/refuse", "never")
+            raise ServiceFaultError("/refuse", "never")
 
         await ours.advertise_service("get", "roscpp/GetLoggers", loggers)
         await ours.advertise_service("set", "std_srvs/SetBool", lambda request: {"success": request.data})

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from support.ros_real import TIMEOUT_S, Graph, interrupt
 
-from rce.ros.errors import ServiceFault
+from rce.ros.errors import ServiceFaultError
 from rce.ros.node import Node, Publisher
 from rce.ros.types import Time
 
@@ -151,7 +151,7 @@ async def test_services(graph: Graph, make_node: MakeNode, roscpp_library: str) 
 
     def set_bool(request: Any) -> dict[str, Any]:
         if not request.data:
-            raise ServiceFault("/our_set", "no")
+            raise ServiceFaultError("/our_set", "no")
         return {"success": True, "message": "ours"}
 
     async with make_node(graph, "ours") as node:
@@ -170,7 +170,7 @@ async def test_services(graph: Graph, make_node: MakeNode, roscpp_library: str) 
             client = node.service_client("cpp_set", SET_BOOL)
             for _ in range(200):
                 assert (await client.call({"data": True}, timeout=TIMEOUT_S)).message == "cpp"
-            with pytest.raises(ServiceFault):
+            with pytest.raises(ServiceFaultError):
                 await client.call({"data": False}, timeout=TIMEOUT_S)
             await until_set(node, "/lib/served", 1)
             assert await graph.service("/cpp_set") is None

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from rce.ros.core import Core
-from rce.ros.errors import NodeClosed
+from rce.ros.errors import NodeClosedError
 from rce.ros.node import Node
 from rce.ros.tf import (
     BadTransformError,
@@ -23,7 +23,7 @@ from rce.ros.tf import (
     Transform,
     TransformBroadcaster,
     TransformListener,
-    TransformTimeout,
+    TransformTimeoutError,
 )
 from rce.ros.types import Time
 
@@ -96,7 +96,7 @@ async def test_robots_with_prefixes_share_a_map(core: Core, make_node: MakeNode)
             tf.send("/map", "base_link", Transform.make(x=x), at(10 + x))
         assert x_of(await at_one.wait_for("/map", "base_link")) == 1
         assert x_of(await everything.wait_for("map", "robot2/base_link")) == 2
-        with pytest.raises(TransformTimeout, match="before the first"):
+        with pytest.raises(TransformTimeoutError, match="before the first"):
             await everything.wait_for("robot1/base_link", "robot2/base_link", timeout=0.01)
         tf_one.send("/map", "base_link", Transform.make(x=1.5), at(12))
         assert x_of(await everything.wait_for("robot1/base_link", "robot2/base_link")) == 0.5
@@ -113,12 +113,12 @@ async def test_waiting_ends_with_a_reason(make_node: MakeNode) -> None:
         TransformBroadcaster(robot) as tf,
         TransformListener(robot) as listener,
     ):
-        with pytest.raises(TransformTimeout, match=r"waited 0\.01 s: there is no frame 'map'"):
+        with pytest.raises(TransformTimeoutError, match=r"waited 0\.01 s: there is no frame 'map'"):
             await listener.wait_for("map", "base", timeout=0.01)
         await tf._publisher.wait_for_subscribers(timeout=20)
         tf.send("map", "base", Transform(), at(10))
         await listener.wait_for("map", "base", timeout=20)
-        with pytest.raises(TransformTimeout, match="after the last") as caught:
+        with pytest.raises(TransformTimeoutError, match="after the last") as caught:
             await listener.wait_for("map", "base", at(11), timeout=0.01)
         assert isinstance(caught.value.reason, ExtrapolationError)
         with pytest.raises(ExtrapolationError, match="before the first"):
@@ -126,7 +126,7 @@ async def test_waiting_ends_with_a_reason(make_node: MakeNode) -> None:
         waiting = asyncio.create_task(listener.wait_for("map", "base", at(11)))
         await asyncio.sleep(0)
         robot.shutdown("test")
-        with pytest.raises(NodeClosed):
+        with pytest.raises(NodeClosedError):
             await asyncio.wait_for(waiting, 20)
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from rce.ros.core import Core
-from rce.ros.errors import ServiceFault
+from rce.ros.errors import ServiceFaultError
 from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
@@ -77,5 +77,5 @@ async def test_param_test_answers_with_its_parameters_as_they_are_now() -> None:
         await node.set_param("int", 43)
         assert (await ask()).msg == "label: int=43 str=text float=3.5 bool=True"
         await node.delete_param("str")
-        with pytest.raises(ServiceFault, match="parameter /str is not set"):
+        with pytest.raises(ServiceFaultError, match="parameter /str is not set"):
             await ask()

@@ -272,7 +272,7 @@ class MakeBelieveFleet:
         )
         assert without_poses(told) == without_poses(now)
 
-    # -- mail -----------------------------------------------------------------------------------
+    # Mail
 
     def _post(self, topic: str, robot: str, action: Callable[..., None], *values: Any) -> None:
         """Topics are in order each, as over TCP, but not with one another."""

@@ -84,7 +84,7 @@ def test_a_wall_parts_the_map() -> None:
     assert grid.reachable(0) == {0, 3, 6}
 
 
-# -- paths ------------------------------------------------------------------------------------------
+# Paths
 
 
 @given(grids, st.integers(0, 80), st.integers(0, 80))
@@ -118,7 +118,7 @@ def test_a_blocked_goal_is_reached_from_nowhere() -> None:
     assert distances(GridMap(2, 2, blocked=frozenset({3})), 3) == [inf] * 4
 
 
-# -- files ------------------------------------------------------------------------------------------
+# Files
 
 MAP = "type octile\nheight 2\nwidth 3\nmap\n..@\nT.G\n"
 
@@ -176,7 +176,7 @@ def test_public_maps_are_read(rce_data: Path) -> None:
     assert all(grid.connected((row.start, row.goal)) for row in rows)
 
 
-# -- occupancy --------------------------------------------------------------------------------------
+# Occupancy
 
 
 @given(grids, st.integers(1, 4))

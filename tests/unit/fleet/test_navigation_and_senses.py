@@ -33,7 +33,7 @@ def test_directions_survive_wrapping_and_quaternions(angle: float) -> None:
     assert sin(yaw_of(0.0, 0.0, z, w)) == pytest.approx(sin(angle), abs=1e-9)
 
 
-# -- navigation -------------------------------------------------------------------------------------
+# Navigation
 
 
 def drive(navigator: Navigator, pose: Pose, seconds: float, clear: Any = lambda _pose: inf) -> list[Pose]:
@@ -106,7 +106,7 @@ def test_a_stopped_robot_brakes_softly() -> None:
     assert 0.2 < end.x - pose.x < 0.5
 
 
-# -- lidar ------------------------------------------------------------------------------------------
+# Lidar
 
 
 def oracle(world: World, spec: LidarSpec, seer: str) -> np.ndarray[Any, Any]:
@@ -162,7 +162,7 @@ def test_edges_behind_and_far_away_are_not_seen() -> None:
     assert ranges[[0, 1, 2, 6, 7]].tolist() == [2.0] * 5
 
 
-# -- obstacles --------------------------------------------------------------------------------------
+# Obstacles
 
 
 def test_the_cells_ahead_are_those_on_the_line() -> None:
@@ -189,7 +189,7 @@ def test_the_way_ahead_is_measured_from_the_hull() -> None:
     assert clear_ahead(points, Pose(0.0, 0.0, pi / 2), 0.22) == inf
 
 
-# -- move_base --------------------------------------------------------------------------------------
+# move_base
 
 
 class Bench:
@@ -273,7 +273,7 @@ def test_a_robot_that_finds_a_box_stops_and_says_where() -> None:
     assert bench.base.blocked == ()
 
 
-# -- world ------------------------------------------------------------------------------------------
+# World
 
 
 def test_time_goes_on_in_whole_steps() -> None:

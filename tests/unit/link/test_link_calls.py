@@ -10,7 +10,14 @@ import pytest
 from rce.guard.holdings import Holdings
 from rce.link.calls import CallServer, PendingCalls
 from rce.link.carrier import LocalCarrier
-from rce.link.exceptions import MessageTooLarge, NotConnected, Overloaded, PeerFault, PeerLost, ProtocolError
+from rce.link.exceptions import (
+    MessageTooLargeError,
+    NotConnectedError,
+    OverloadedError,
+    PeerFaultError,
+    PeerLostError,
+    ProtocolError,
+)
 from rce.link.frames import Frame, FrameType
 from rce.link.settings import LinkLimits
 
@@ -43,16 +50,16 @@ async def test_pending_calls_have_their_own_ids_and_answers() -> None:
     calls = PendingCalls(3)
     (a, first), (b, second), (c, third) = (calls.add() for _ in range(3))
     assert len({a, b, c}) == 3
-    with pytest.raises(Overloaded):
+    with pytest.raises(OverloadedError):
         calls.add()
     calls.answer(b, b"two")
-    calls.fail(a, PeerFault("no"))
+    calls.fail(a, PeerFaultError("no"))
     calls.answer(77, b"nobody asked")
     assert await second == b"two"
-    with pytest.raises(PeerFault, match="no"):
+    with pytest.raises(PeerFaultError, match="no"):
         await first
-    calls.fail_all(lambda: PeerLost("gone"))
-    with pytest.raises(PeerLost):
+    calls.fail_all(lambda: PeerLostError("gone"))
+    with pytest.raises(PeerLostError):
         await third
     assert not calls.drop(c)
     assert len(calls) == 0
@@ -77,7 +84,7 @@ async def test_server_serves_few_at_a_time_and_refuses_too_many() -> None:
     server = CallServer(serve, LinkLimits(serving=2, waiting=3), "test")
     for n in range(5):
         server.accept(channel.as_channel(), n, b"%d" % n)
-    with pytest.raises(Overloaded):
+    with pytest.raises(OverloadedError):
         server.accept(channel.as_channel(), 5, b"")
     assert server.has(channel.as_channel(), 0)
     assert server.has(channel.as_channel(), 4)
@@ -90,7 +97,7 @@ async def test_server_serves_few_at_a_time_and_refuses_too_many() -> None:
     assert channel.replies == {n: b"%d" % n for n in range(5)}
     assert most == 2
     await server.close()
-    with pytest.raises(NotConnected):
+    with pytest.raises(NotConnectedError):
         server.accept(channel.as_channel(), 9, b"")
 
 
@@ -135,9 +142,9 @@ async def test_what_a_server_raises_is_told_to_the_peer() -> None:
 
 
 def test_errors_have_texts() -> None:
-    assert str(NotConnected()) == "not connected"
-    assert "70 bytes" in str(MessageTooLarge(70, 64))
-    assert "64 bytes" in str(MessageTooLarge(70, 64))
+    assert str(NotConnectedError()) == "not connected"
+    assert "70 bytes" in str(MessageTooLargeError(70, 64))
+    assert "64 bytes" in str(MessageTooLargeError(70, 64))
 
 
 class Ping:

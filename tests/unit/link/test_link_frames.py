@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce.link.exceptions import LinkRefused, ProtocolError
+from rce.link.exceptions import LinkRefusedError, ProtocolError
 from rce.link.frames import (
     HANDSHAKE_SIZE,
     HEADER,
@@ -244,7 +244,7 @@ def test_bad_hello_is_refused(frame: Frame) -> None:
 
 def test_answers_to_hello() -> None:
     check_answer(Frame(FrameType.WELCOME))
-    with pytest.raises(LinkRefused, match="not you"):
+    with pytest.raises(LinkRefusedError, match="not you"):
         check_answer(Frame(FrameType.REFUSE, payload=b"not you"))
     with pytest.raises(ProtocolError):
         check_answer(Frame(FrameType.DATA))

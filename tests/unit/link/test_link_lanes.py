@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rce.aio.queues import OverflowPolicy
-from rce.link.exceptions import Overloaded, ProtocolError
+from rce.link.exceptions import OverloadedError, ProtocolError
 from rce.link.frames import (
     FRAGMENT_SIZE,
     LATCHED,
@@ -103,7 +103,7 @@ def test_backlog_is_the_sum_of_what_waits(steps: list[tuple[int, int]]) -> None:
     for what, size in steps:
         queue = queues[size % 2]
         if what < 3:
-            with contextlib.suppress(Overloaded):
+            with contextlib.suppress(OverloadedError):
                 queue.push(data(1, size))
                 assert grown.pop() == backlog.bytes
         elif what == 3 and len(queue):
@@ -170,7 +170,7 @@ def test_calls_are_refused_not_dropped() -> None:
     queue = service(max_messages=2)
     for n in (1, 2):
         queue.push(Frame(FrameType.CALL, 1, n))
-    with pytest.raises(Overloaded):
+    with pytest.raises(OverloadedError):
         queue.push(Frame(FrameType.CALL, 1, 3))
     assert queue.withdraw(1)
     assert not queue.withdraw(1)

@@ -9,7 +9,13 @@ from support.master_world import World
 
 from rce.control.model import EndpointState, EndpointStatus
 from rce.model.specs import Network, NodeSpec
-from rce_master.exceptions import Conflict, Forbidden, Invalid, LimitReached, NoRoom
+from rce_master.exceptions import (
+    ConflictError,
+    ForbiddenError,
+    InvalidRequestError,
+    LimitReachedError,
+    NoRoomError,
+)
 from rce_master.state import commands, placing
 from rce_master.state.records import UserRole
 from rce_master.state.settings import StateSettings
@@ -34,7 +40,7 @@ def test_out_of_capacity_names_what_is_missing_where(world: World) -> None:
     world.container_set("c1", name="m1", cores=2)
     world.container_set("c2", name="m2", cores=8, labels=("lidar",))
     world.container("a", cpu=0.5, special_features=())
-    with pytest.raises(NoRoom) as caught:
+    with pytest.raises(NoRoomError) as caught:
         world.container("big", cpu=4.0, special_features=("gpu",))
     assert str(caught.value) == (
         "no machine takes container 'big' now: m1 lacks the label gpu; m2 lacks the label gpu; "
@@ -42,7 +48,7 @@ def test_out_of_capacity_names_what_is_missing_where(world: World) -> None:
     )
     assert caught.value.status == 409
     with pytest.raises(
-        NoRoom, match=r"m1 has 2 of 2 cores free, 9 needed; m2 has 7\.5 of 8 cores free, 9 needed"
+        NoRoomError, match=r"m1 has 2 of 2 cores free, 9 needed; m2 has 7\.5 of 8 cores free, 9 needed"
     ):
         world.container("big", cpu=9.0)
     assert "anna/big" not in world.state.tables.endpoints
@@ -99,7 +105,7 @@ def test_a_machine_that_may_come_back_is_waited_for(world: World) -> None:
     assert at(world, "c") == "c1"
     world.leave("c1")
     world.tick(30)
-    with pytest.raises(NoRoom):
+    with pytest.raises(NoRoomError):
         world.container("d", special_features=("gpu",))
 
 
@@ -107,7 +113,7 @@ def test_the_same_again_is_not_counted_twice(world: World) -> None:
     world.container_set("c1", slots=1)
     world.container()
     world.container()
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictError):
         world.container(size=2)
 
 
@@ -141,14 +147,14 @@ def test_a_users_containers_have_limits_and_an_administrators_have_none() -> Non
     world.user("root", UserRole.ADMIN)
     world.container("a", size=2, cpu=1.0, memory=64 * MB)
     with pytest.raises(
-        LimitReached, match="would have 4 slots in all, and you may have 3; make others smaller"
+        LimitReachedError, match="would have 4 slots in all, and you may have 3; make others smaller"
     ):
         world.container("b", size=2)
-    with pytest.raises(LimitReached, match=r"would have 2 cores in all, and you may have 1\.5"):
+    with pytest.raises(LimitReachedError, match=r"would have 2 cores in all, and you may have 1\.5"):
         world.container("b", cpu=1.0)
-    with pytest.raises(LimitReached, match="would have 128 MB of memory in all, and you may have 100"):
+    with pytest.raises(LimitReachedError, match="would have 128 MB of memory in all, and you may have 100"):
         world.container("b", memory=64 * MB)
-    with pytest.raises(LimitReached, match="slots"):
+    with pytest.raises(LimitReachedError, match="slots"):
         resize(world, "a", size=4)
     resize(world, "a", size=1)
     world.container("b", size=2)
@@ -156,16 +162,18 @@ def test_a_users_containers_have_limits_and_an_administrators_have_none() -> Non
 
 
 def test_too_little_memory_is_refused_before_it_kills(world: World) -> None:
-    with pytest.raises(Invalid, match=r"memory: 1 MB are too little; a container itself needs 32 MB"):
+    with pytest.raises(
+        InvalidRequestError, match=r"memory: 1 MB are too little; a container itself needs 32 MB"
+    ):
         world.container(memory=MB)
 
 
 def test_the_machines_network_and_folders_are_for_administrators(world: World) -> None:
     world.user("root", UserRole.ADMIN)
     world.container_set("c1", networks=("none", "host"), runtimes=("podman",))
-    with pytest.raises(Forbidden, match="network: host is for containers of administrators"):
+    with pytest.raises(ForbiddenError, match="network: host is for containers of administrators"):
         world.container(network=Network.HOST)
-    with pytest.raises(Forbidden, match="image: folders of the machine are for administrators"):
+    with pytest.raises(ForbiddenError, match="image: folders of the machine are for administrators"):
         world.container(image="/")
     world.container(image="debian:12")
     world.container("c", "root", network=Network.HOST, image="/srv/rootfs")
@@ -181,15 +189,15 @@ def test_a_group_is_on_one_machine_with_addresses_of_one_network(world: World) -
 
     member("a", "10.0.0.2/24")
     with pytest.raises(
-        Conflict, match=r"groupIp: 10\.0\.0\.2 is the address of container 'a' of the group 'g'"
+        ConflictError, match=r"groupIp: 10\.0\.0\.2 is the address of container 'a' of the group 'g'"
     ):
         member("b", "10.0.0.2")
-    with pytest.raises(Conflict, match=r"groupIp: 10\.0\.1\.3/24 is not in 10\.0\.0\.0/24"):
+    with pytest.raises(ConflictError, match=r"groupIp: 10\.0\.1\.3/24 is not in 10\.0\.0\.0/24"):
         member("b", "10.0.1.3")
     member("b", "10.0.0.3")
     member("c")
     assert at(world, "a") == at(world, "b") == at(world, "c")
-    with pytest.raises(NoRoom, match="0 of 3 slots free"):
+    with pytest.raises(NoRoomError, match="0 of 3 slots free"):
         member("d")
     member("a", "10.0.0.2", "bob")
     assert at(world, "a", "bob") != at(world, "a")
@@ -234,7 +242,7 @@ def test_what_has_no_room_to_grow_is_told_and_stays_as_it_is(world: World) -> No
     world.container(cpu=1.0)
     world.container("other", cpu=0.5)
     before = world.spec("c")
-    with pytest.raises(NoRoom) as caught:
+    with pytest.raises(NoRoomError) as caught:
         resize(world, cpu=4.0)
     assert str(caught.value) == (
         "container 'c' cannot grow so far: m1 has 1.5 of 2 cores free, 4 needed; nothing was changed"
@@ -257,7 +265,7 @@ def test_a_client_that_comes_back_may_ask_for_the_size_before_or_after(world: Wo
     world.container(cpu=1.0)
     world.container(cpu=0.5)
     assert world.spec("c").resources.cpu == 0.5
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictError):
         world.container(cpu=2.0)
 
 
@@ -273,7 +281,7 @@ def test_nodes_may_not_wait_for_one_another_in_a_circle(world: World) -> None:
 
     add("a", "b", "c")
     add("b", "c")
-    with pytest.raises(Invalid, match="node 'c': after goes round in a circle: c after"):
+    with pytest.raises(InvalidRequestError, match="node 'c': after goes round in a circle: c after"):
         add("c", "a")
     add("c")
 

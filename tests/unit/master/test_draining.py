@@ -9,7 +9,7 @@ from support.master_world import World
 
 from rce.control.model import EndpointState, EndpointStatus, LinkAddress, NodeState, NodeStatus
 from rce.model.specs import Network
-from rce_master.exceptions import NoRoom, NotFound
+from rce_master.exceptions import NoRoomError, NotFoundError
 from rce_master.state import commands
 from rce_master.state.changes import Changes
 from rce_master.state.core import State
@@ -107,12 +107,12 @@ def test_a_draining_machine_takes_nothing_new(two: World) -> None:
     two.container("new")
     assert at(two, "new") == "c2"
     drain(two, "c2")
-    with pytest.raises(NoRoom, match="m1 is draining; m2 is draining"):
+    with pytest.raises(NoRoomError, match="m1 is draining; m2 is draining"):
         two.container("newer")
     drain(two, "m1", undo=True)
     two.container("newer")
     assert at(two, "newer") == "c1"
-    with pytest.raises(NotFound, match="there is no container machine 'm3'"):
+    with pytest.raises(NotFoundError, match="there is no container machine 'm3'"):
         drain(two, "m3")
 
 
@@ -205,9 +205,9 @@ def test_copies_count_where_they_are_made(two: World) -> None:
     two.container("large", size=3)
     drain(two)
     assert moves(two) == {"c": "c2"}
-    with pytest.raises(NoRoom, match="m2 has 0 of 4 slots free"):
+    with pytest.raises(NoRoomError, match="m2 has 0 of 4 slots free"):
         two.container("more")
-    with pytest.raises(NoRoom, match="m2 has 1 of 4 slots free, 2 needed"):
+    with pytest.raises(NoRoomError, match="m2 has 1 of 4 slots free, 2 needed"):
         two.do(commands.ResizeContainer(user="anna", tag="c", size=2))
 
 

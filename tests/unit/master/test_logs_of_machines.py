@@ -8,7 +8,7 @@ from rce.control.exceptions import PeerTimeoutError
 from rce.control.logs import LogQuery
 from rce.control.messages import LogChunk, MachineInfo, TaskSetKind
 from rce.control.model import EndpointState, EndpointStatus
-from rce_master.exceptions import NotFound, TaskSetAway
+from rce_master.exceptions import NotFoundError, TaskSetAwayError
 from rce_master.logs import LogRequest, read_log
 from rce_master.state.lifecycle import ContainerPhase
 from rce_master.state.records import Container, ContainerLive, TaskSet, User, UserRole
@@ -75,10 +75,10 @@ async def test_a_container_is_read_where_it_is() -> None:
         LogQuery(incarnation="now"),
         LogQuery(incarnation="former", since=17.0),
     ], "not what was there before its user"
-    with pytest.raises(NotFound, match="has no node 'x'"):
+    with pytest.raises(NotFoundError, match="has no node 'x'"):
         await cloud.read("x")
     cloud.machines["a"].silent = True
-    with pytest.raises(TaskSetAway):
+    with pytest.raises(TaskSetAwayError):
         await cloud.read()
 
 
@@ -88,7 +88,7 @@ async def test_of_a_container_that_is_gone_the_last_life_counts() -> None:
     assert await cloud.read("any") == "newer"
     assert older.queries == [LogQuery(since=17.0)], "not what was there before its user"
     assert not cloud.robots.queries
-    with pytest.raises(NotFound, match="there is no container 'box'"):
+    with pytest.raises(NotFoundError, match="there is no container 'box'"):
         await Cloud(a=Machine()).read()
 
 
@@ -98,7 +98,7 @@ async def test_an_earlier_life_is_looked_for_where_the_container_is_and_then_els
     cloud.machines["a"].text = ""
     assert await cloud.read("removed", PREVIOUS) == "there"
     cloud.machines["b"].text = ""
-    with pytest.raises(NotFound, match="no logs of an earlier life"):
+    with pytest.raises(NotFoundError, match="no logs of an earlier life"):
         await cloud.read("removed", PREVIOUS)
-    with pytest.raises(NotFound, match="no machine is connected"):
+    with pytest.raises(NotFoundError, match="no machine is connected"):
         await Cloud(at="away").read("", PREVIOUS)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rce_master.exceptions import StoreBusy, StoreError
+from rce_master.exceptions import StoreBusyError, StoreError
 from rce_master.store import MemoryStore, Row, SqliteStore
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ async def test_only_the_owner_can_read_it(tmp_path: Path) -> None:
 
 async def test_two_masters_do_not_share_a_folder(tmp_path: Path) -> None:
     store = await SqliteStore.open(tmp_path)
-    with pytest.raises(StoreBusy, match="a master is running"):
+    with pytest.raises(StoreBusyError, match="a master is running"):
         await SqliteStore.open(tmp_path)
     await store.close()
     await (await SqliteStore.open(tmp_path)).close()

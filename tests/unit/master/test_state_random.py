@@ -10,7 +10,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, TaskSetKind
 from rce.control.model import EndpointState, EndpointStatus, LinkAddress
 from rce.model.specs import InterfaceSpec, Network, NodeSpec, Resources
-from rce_master.exceptions import Refused
+from rce_master.exceptions import RefusedError
 from rce_master.state import capacity, commands
 from rce_master.state.core import State
 from rce_master.state.records import User, UserRole
@@ -66,7 +66,7 @@ class Histories(RuleBasedStateMachine):
         known = self.connection_ids()
         try:
             changes = self.state.apply(command, self.now)
-        except Refused:
+        except RefusedError:
             assert self.image(persistent_only=False) == before
             return
         for row in changes.rows():

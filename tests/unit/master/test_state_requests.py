@@ -6,7 +6,13 @@ import pytest
 from support.master_world import World
 
 from rce.model.specs import ParameterSpec, ParameterValue
-from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound, Refused
+from rce_master.exceptions import (
+    ConflictError,
+    InvalidRequestError,
+    LimitReachedError,
+    NotFoundError,
+    RefusedError,
+)
 from rce_master.state import commands
 from rce_master.state.records import UserRole
 from rce_master.state.settings import StateSettings
@@ -33,34 +39,34 @@ def test_something_else_under_the_same_tag_is_refused(world: World) -> None:
     world.wired()
     world.node("c", "n")
     with pytest.raises(
-        Conflict, match=r"container 'c' exists with other settings; resize or destroy it first"
+        ConflictError, match=r"container 'c' exists with other settings; resize or destroy it first"
     ):
         world.container(memory=5)
     with pytest.raises(
-        Conflict, match="node 'n' of container 'c' exists with other settings; remove it first"
+        ConflictError, match="node 'n' of container 'c' exists with other settings; remove it first"
     ):
         world.node("c", "n", exe="other.py")
-    with pytest.raises(Conflict, match="interface 'c/in' exists with other settings"):
+    with pytest.raises(ConflictError, match="interface 'c/in' exists with other settings"):
         world.interface("c/in", "PublisherInterface", addr="/elsewhere")
 
 
 def test_tags_are_unique_among_robots_and_containers(world: World) -> None:
     world.wired()
-    with pytest.raises(Conflict, match="'rob' is a robot already"):
+    with pytest.raises(ConflictError, match="'rob' is a robot already"):
         world.container("rob")
-    with pytest.raises(Conflict, match="'c' is a container"):
+    with pytest.raises(ConflictError, match="'c' is a container"):
         world.login("c")
 
 
 def test_forms_belong_to_their_end(world: World) -> None:
     world.wired()
-    with pytest.raises(Invalid, match="a robot takes PublisherConverter or PublisherForwarder"):
+    with pytest.raises(InvalidRequestError, match="a robot takes PublisherConverter or PublisherForwarder"):
         world.interface("rob/x", "PublisherInterface")
-    with pytest.raises(Invalid, match="a container takes SubscriberInterface"):
+    with pytest.raises(InvalidRequestError, match="a container takes SubscriberInterface"):
         world.interface("c/x", "SubscriberForwarder", addr="/x")
-    with pytest.raises(Invalid, match="addr is missing"):
+    with pytest.raises(InvalidRequestError, match="addr is missing"):
         world.interface("c/x", "SubscriberInterface", addr="")
-    with pytest.raises(Invalid, match="unknown interface type 'Nonsense'"):
+    with pytest.raises(InvalidRequestError, match="unknown interface type 'Nonsense'"):
         world.interface("c/x", "Nonsense")
 
 
@@ -75,19 +81,19 @@ def test_connections_need_complementing_roles_and_one_class(world: World) -> Non
     world.interface("rob/sub", "SubscriberConverter")
     world.interface("c/sub", "SubscriberInterface")
     world.interface("c/number", "PublisherInterface", cls="std_msgs/Int32")
-    with pytest.raises(Invalid, match="a Subscriber connects to a Publisher"):
+    with pytest.raises(InvalidRequestError, match="a Subscriber connects to a Publisher"):
         world.connect("rob/sub", "c/sub")
-    with pytest.raises(Invalid, match="must be the same"):
+    with pytest.raises(InvalidRequestError, match="must be the same"):
         world.connect("rob/sub", "c/number")
-    with pytest.raises(NotFound, match="there is no interface 'c/nothing'; add it first"):
+    with pytest.raises(NotFoundError, match="there is no interface 'c/nothing'; add it first"):
         world.connect("rob/sub", "c/nothing")
-    with pytest.raises(NotFound, match="there is no robot or container 'nobody'"):
+    with pytest.raises(NotFoundError, match="there is no robot or container 'nobody'"):
         world.connect("rob/sub", "nobody/x")
-    with pytest.raises(Invalid, match="write ENDPOINT/INTERFACE"):
+    with pytest.raises(InvalidRequestError, match="write ENDPOINT/INTERFACE"):
         world.connect("rob", "c/sub")
-    with pytest.raises(Invalid, match="must be the same"):
+    with pytest.raises(InvalidRequestError, match="must be the same"):
         world.connect("c/sub", "c/number")
-    with pytest.raises(Invalid, match="do not complete each other"):
+    with pytest.raises(InvalidRequestError, match="do not complete each other"):
         world.connect("c/sub", "c/sub")
 
 
@@ -117,7 +123,7 @@ def test_a_service_of_an_endpoint_for_itself_takes_one_connection(world: World) 
         world.interface("c/serve", "ServiceClientInterface", cls="std_srvs/Empty")
         world.interface("c/other", "ServiceClientInterface", cls="std_srvs/Empty")
         world.connect(f"c/{name}", "c/serve")
-        with pytest.raises(Conflict, match="takes one connection"):
+        with pytest.raises(ConflictError, match="takes one connection"):
             world.connect(f"c/{name}", "c/other")
 
 
@@ -127,7 +133,7 @@ def test_a_service_provider_takes_one_connection(world: World) -> None:
     world.interface("c/one", "ServiceClientInterface", cls="std_srvs/Empty")
     world.interface("c/two", "ServiceClientInterface", cls="std_srvs/Empty")
     world.connect("rob/call", "c/one")
-    with pytest.raises(Conflict, match="takes one connection: disconnect it first"):
+    with pytest.raises(ConflictError, match="takes one connection: disconnect it first"):
         world.connect("c/two", "rob/call")
     world.do(commands.Disconnect(user="anna", tag_a="c/one", tag_b="rob/call"))
     world.connect("c/two", "rob/call")
@@ -136,7 +142,7 @@ def test_a_service_provider_takes_one_connection(world: World) -> None:
 def test_disconnecting_what_is_not_connected_is_told(world: World) -> None:
     world.wired()
     world.interface("c/other", "PublisherInterface")
-    with pytest.raises(NotFound, match="are not connected"):
+    with pytest.raises(NotFoundError, match="are not connected"):
         world.do(commands.Disconnect(user="anna", tag_a="rob/out", tag_b="c/other"))
 
 
@@ -146,7 +152,7 @@ def test_removing_an_interface_removes_its_connections_at_both_ends(world: World
     assert set(changes.touched) == {"anna/rob", "anna/c"}
     assert world.spec("c").connections == ()
     assert world.spec("c").links == ()
-    with pytest.raises(NotFound, match="there is no interface 'rob/out'"):
+    with pytest.raises(NotFoundError, match="there is no interface 'rob/out'"):
         world.do(commands.RemoveInterface(user="anna", endpoint="rob", tag="out"))
 
 
@@ -157,11 +163,11 @@ def test_destroying_a_container_removes_all_that_is_in_it(world: World) -> None:
     assert set(changes.touched) == {"anna/rob"}
     assert world.spec("rob").links == ()
     assert [(w.process, w.id) for w in changes.withdrawals] == [("c1", "anna/c")]
-    with pytest.raises(NotFound, match="there is no container 'c'; create it first"):
+    with pytest.raises(NotFoundError, match="there is no container 'c'; create it first"):
         world.node("c", "n")
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         world.do(commands.DestroyContainer(user="anna", tag="c"))
-    with pytest.raises(Invalid, match="is a robot, not a container"):
+    with pytest.raises(InvalidRequestError, match="is a robot, not a container"):
         world.do(commands.DestroyContainer(user="anna", tag="rob"))
 
 
@@ -170,9 +176,9 @@ def test_users_do_not_see_each_other(world: World) -> None:
     world.user("bert")
     world.login("bot", user="bert")
     world.interface("bot/in", "PublisherConverter", user="bert")
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         world.connect("bot/in", "rob/out", user="bert")
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         world.do(commands.DestroyContainer(user="bert", tag="c"))
     world.container("c", user="bert")
     assert world.spec("c", "bert").links == ()
@@ -195,13 +201,13 @@ def test_parameters_are_set_and_replaced(world: World) -> None:
     before = revision(world, "c")
     set_([1, "a", False])
     assert revision(world, "c") == before
-    with pytest.raises(Invalid, match="does not fit into 32 bits"):
+    with pytest.raises(InvalidRequestError, match="does not fit into 32 bits"):
         set_(2**31)
-    with pytest.raises(Invalid, match="finite"):
+    with pytest.raises(InvalidRequestError, match="finite"):
         set_([1.0, float("nan")])
     world.do(commands.DeleteParameter(user="anna", container="c", name="p"))
     assert world.spec("c").parameters == ()
-    with pytest.raises(NotFound, match="has no parameter 'p'"):
+    with pytest.raises(NotFoundError, match="has no parameter 'p'"):
         world.do(commands.DeleteParameter(user="anna", container="c", name="p"))
 
 
@@ -210,13 +216,13 @@ def test_a_refused_command_changes_nothing_and_uses_no_number() -> None:
     world.wired()
     world.node("c", "n")
     before = {table.name: list(table) for table in world.state.tables.all}
-    with pytest.raises(LimitReached):
+    with pytest.raises(LimitReachedError):
         world.container("other")
-    with pytest.raises(LimitReached):
+    with pytest.raises(LimitReachedError):
         world.interface("c/more", "PublisherInterface")
-    with pytest.raises(LimitReached):
+    with pytest.raises(LimitReachedError):
         world.node("c", "more")
-    with pytest.raises(Refused):
+    with pytest.raises(RefusedError):
         world.login("rob")
     assert {table.name: list(table) for table in world.state.tables.all} == before
 
@@ -272,7 +278,7 @@ def test_the_robot_dials_the_container_and_the_smaller_id_its_equal(world: World
 
 def test_the_last_administrator_stays(world: World) -> None:
     world.user("root", UserRole.ADMIN)
-    with pytest.raises(Conflict, match="last administrator"):
+    with pytest.raises(ConflictError, match="last administrator"):
         world.do(commands.RemoveUser(name="root"))
     world.user("second", UserRole.ADMIN)
     world.do(commands.RemoveUser(name="root"))

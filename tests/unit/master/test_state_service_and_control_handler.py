@@ -36,7 +36,7 @@ from rce.control.messages import (
 from rce.control.model import EndpointState, EndpointStatus, LinkAddress
 from rce_master.auth import Authenticator, client_digest
 from rce_master.control_handler import ControlHandler
-from rce_master.exceptions import MasterError, NotFound, StoreError, TaskSetAway
+from rce_master.exceptions import MasterError, NotFoundError, StoreError, TaskSetAwayError
 from rce_master.reconciler import Reconciler
 from rce_master.state import commands
 from rce_master.state.records import User, UserRole
@@ -266,7 +266,7 @@ async def test_of_several_commands_only_the_bad_ones_are_refused(cloud: Cloud) -
             commands.CreateContainer(user="anna", tag="d"),
         ]
     )
-    assert [type(outcome) for outcome in outcomes] == [type(None), NotFound, type(None)]
+    assert [type(outcome) for outcome in outcomes] == [type(None), NotFoundError, type(None)]
     assert await cloud.state_service.submit_all([]) == []
 
 
@@ -451,20 +451,20 @@ async def test_logs_are_read_where_the_container_is(cloud: Cloud) -> None:
     robots, containers = cloud.robots(), cloud.containers()
     await robots.hello()
     await wire(robots)
-    with pytest.raises(TaskSetAway, match="cannot be reached"):
+    with pytest.raises(TaskSetAwayError, match="cannot be reached"):
         await cloud.reconciler.read_log("anna/c", "n", 0, 10)
     await containers.hello()
     assert (await cloud.reconciler.read_log("anna/c", "n", 0, 10)).text == "hello"
-    with pytest.raises(NotFound, match="has no node 'x'"):
+    with pytest.raises(NotFoundError, match="has no node 'x'"):
         await cloud.reconciler.read_log("anna/c", "x", 0, 10)
     containers.log = LogChunk(request=0, offset=0, error="no logs of an earlier life")
-    with pytest.raises(NotFound, match="no container 'd'"):
+    with pytest.raises(NotFoundError, match="no container 'd'"):
         await cloud.reconciler.read_log("anna/d", "x", 0, 10)
     containers.log = LogChunk(request=0, offset=0, error="no such log")
-    with pytest.raises(NotFound, match="no such log"):
+    with pytest.raises(NotFoundError, match="no such log"):
         await cloud.reconciler.read_log("anna/c", "n", 0, 10)
     containers.log = LogChunk(request=0, offset=0, text="away")
-    with pytest.raises(TaskSetAway, match="did not answer"):
+    with pytest.raises(TaskSetAwayError, match="did not answer"):
         await cloud.reconciler.read_log("anna/c", "n", 0, 10)
 
 

@@ -12,7 +12,7 @@ from rce.control.model import (
     NodeState,
     NodeStatus,
 )
-from rce_master.exceptions import Conflict, Invalid, NotFound, TransitionError
+from rce_master.exceptions import ConflictError, InvalidRequestError, NotFoundError, TransitionError
 from rce_master.state import commands
 from rce_master.state.core import State
 from rce_master.state.lifecycle import (
@@ -156,7 +156,7 @@ def test_faults_reach_the_user(world: World) -> None:
     assert (notice.to, notice.text) == ("anna", "no such package")
     fault = commands.FaultReported(id="anna/c", text="bad", robot="anna/rob")
     assert world.do(fault).notices[0].to == "anna/rob"
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         world.do(commands.FaultReported(id="zoe/c", text="x"))
 
 
@@ -184,9 +184,9 @@ def test_a_robot_is_kept_for_its_grace_time_and_finds_everything_again(world: Wo
 def test_a_robot_connects_once(world: World) -> None:
     world.wired()
     world.robot_set("r2")
-    with pytest.raises(Conflict, match="connected already"):
+    with pytest.raises(ConflictError, match="connected already"):
         world.login(process="r2")
-    with pytest.raises(Conflict, match="is not a connected robot task set"):
+    with pytest.raises(ConflictError, match="is not a connected robot task set"):
         world.login("other", process="c1")
 
 
@@ -254,7 +254,7 @@ def test_a_robot_that_was_let_in_and_never_came_can_log_in_again(world: World) -
     world.robot_set()
     world.login(arrives=False)
     world.tick(14)
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictError):
         world.login()
     world.tick(1)
     assert world.session() == "absent"
@@ -391,10 +391,10 @@ def test_a_new_password_ends_the_sessions_of_the_users_robots(world: World) -> N
 
 @pytest.mark.parametrize("name", ["", "a b", "x" * 256, "a\n"])
 def test_a_task_set_without_a_usable_name_is_refused(world: World, name: str) -> None:
-    with pytest.raises(Invalid, match="names no task set"):
+    with pytest.raises(InvalidRequestError, match="names no task set"):
         world.robot_set(name)
     world.robot_set("r1")
-    with pytest.raises(Conflict, match="there is a robot task set 'r1' already"):
+    with pytest.raises(ConflictError, match="there is a robot task set 'r1' already"):
         world.container_set("r1")
 
 

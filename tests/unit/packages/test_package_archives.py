@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from rce.packages.archive import ArchiveWriter, read_archive
 from rce.packages.contents import inspect
-from rce.packages.exceptions import BadArchive
+from rce.packages.exceptions import BadArchiveError
 from rce.packages.limits import ArchiveLimits
 from rce.packages.tree import Entry, Kind, Tree
 from rce.packages.unpacking import unpack
@@ -131,13 +131,13 @@ HOSTILE: dict[str, tuple[bytes, str]] = {
 def test_hostile_archives_are_refused(name: str, tmp_path: Path) -> None:
     data, text = HOSTILE[name]
     packed = gzip.compress(data)
-    with on_disk(packed) as opened, pytest.raises(BadArchive, match=text):
+    with on_disk(packed) as opened, pytest.raises(BadArchiveError, match=text):
         inspect(opened)
     target = tmp_path / "deep" / "target"
     target.mkdir(parents=True)
     try:
         unpacked(packed, target)
-    except BadArchive:
+    except BadArchiveError:
         pass
     else:
         assert "manifest" in name or name == "another name", "only those are not the unpacking's concern"
@@ -155,22 +155,22 @@ def test_a_bomb_is_stopped_early(tmp_path: Path) -> None:
             opened.write(bytes(1 << 20))
         opened.write(END)
     limits = ArchiveLimits(free=1 << 20)
-    with pytest.raises(BadArchive, match="unpacks to more than"):
+    with pytest.raises(BadArchiveError, match="unpacks to more than"):
         unpacked(packed.getvalue(), tmp_path, limits)
     written = sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file())
     assert written < 16 << 20
     other = tmp_path / "other"
     other.mkdir()
-    with pytest.raises(BadArchive, match="its files have more than"):
+    with pytest.raises(BadArchiveError, match="its files have more than"):
         unpacked(packed.getvalue(), other, ArchiveLimits(unpacked=1 << 20))
     assert not (other / "nav" / "x").exists()
 
 
 def test_limits_of_the_archive_itself(tmp_path: Path) -> None:
     many = gzip.compress(START + b"".join(file(f"nav/x{number:03}") for number in range(100)) + END)
-    with pytest.raises(BadArchive, match="more than 50 files"):
+    with pytest.raises(BadArchiveError, match="more than 50 files"):
         unpacked(many, tmp_path, ArchiveLimits(entries=50))
-    with pytest.raises(BadArchive, match="the archive has more than"):
+    with pytest.raises(BadArchiveError, match="the archive has more than"):
         unpacked(many, tmp_path, ArchiveLimits(archive=100))
 
 
@@ -178,7 +178,7 @@ def test_limits_of_the_archive_itself(tmp_path: Path) -> None:
     "spoil", [lambda d: d[:-20], lambda d: d[:40] + b"\xff" + d[41:], lambda d: b"x" + d]
 )
 def test_a_damaged_archive_is_told(spoil: Callable[[bytes], bytes], tmp_path: Path) -> None:
-    with pytest.raises(BadArchive):
+    with pytest.raises(BadArchiveError):
         unpacked(spoil(gzip.compress(START + END)), tmp_path)
 
 
@@ -224,7 +224,7 @@ def test_no_garbage_does_anything_but_be_refused(garbage: bytes, at: int) -> Non
     with tempfile.TemporaryDirectory() as scratch:
         target = Path(scratch) / "target"
         target.mkdir()
-        with contextlib.suppress(BadArchive):
+        with contextlib.suppress(BadArchiveError):
             unpacked(gzip.compress(data, 1), target)
         assert [path.name for path in Path(scratch).iterdir()] == ["target"]
         for path in target.rglob("*"):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rce.config.resources import examples_dir
-from rce.packages.exceptions import BadArchive
+from rce.packages.exceptions import BadArchiveError
 from rce.packages.folder import look_into
 from rce.packages.limits import ArchiveLimits
 
@@ -35,7 +35,7 @@ def inside(folder: Path, version: str = "") -> list[str]:
 
 
 def fault(folder: Path, version: str = "", limits: ArchiveLimits | None = None) -> str:
-    with pytest.raises(BadArchive) as caught:
+    with pytest.raises(BadArchiveError) as caught:
         look_into(folder, version, *([limits] if limits else []))
     return str(caught.value)
 
@@ -178,5 +178,5 @@ def test_what_no_node_can_name_is_told(package: Path) -> None:
 def test_a_file_that_changes_while_it_is_packed_is_noticed(package: Path) -> None:
     source = look_into(package)
     (package / "nodes" / "run.py").write_text("print('changed')\n")
-    with pytest.raises(BadArchive, match="changed while it was read"):
+    with pytest.raises(BadArchiveError, match="changed while it was read"):
         source.pack(io.BytesIO())

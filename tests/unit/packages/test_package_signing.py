@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rce.model.names import VERSION_PATTERN, is_version
-from rce.packages.exceptions import BadKey, BadSignature
+from rce.packages.exceptions import BadKeyError, BadSignatureError
 from rce.packages.requirements import read_requirements
 from rce.packages.signing import SigningKey, key_id, statement, verify
 from rce.packages.versions import newest, split_package, version_key
@@ -31,20 +31,20 @@ def test_a_signature_is_of_one_key_and_one_statement() -> None:
         statement("anna", "nav", "1.0", "1" * 64),
     ]
     for other in others:
-        with pytest.raises(BadSignature, match=key_id(key.public)):
+        with pytest.raises(BadSignatureError, match=key_id(key.public)):
             verify(key.public, signature, other)
     for wrong in ("", "00", "zz" * 64, signature[:-2], signature + "00", "é"):
-        with pytest.raises(BadSignature):
+        with pytest.raises(BadSignatureError):
             verify(key.public, wrong, SIGNED)
-    with pytest.raises(BadSignature):
+    with pytest.raises(BadSignatureError):
         verify(SigningKey.generate().public, signature, SIGNED)
 
 
 @pytest.mark.parametrize("key", ["", "00", "0" * 63, "zz" * 32, "0" * 66, "é" * 64])
 def test_what_is_no_key(key: str) -> None:
-    with pytest.raises(BadKey):
+    with pytest.raises(BadKeyError):
         verify(key, "0" * 128, SIGNED)
-    with pytest.raises(BadKey):
+    with pytest.raises(BadKeyError):
         key_id(key)
 
 
@@ -60,7 +60,7 @@ def test_a_key_survives_its_file() -> None:
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
     for text in (b"", b"nonsense", locked, other):
-        with pytest.raises(BadKey):
+        with pytest.raises(BadKeyError):
             SigningKey.from_pem(text)
 
 

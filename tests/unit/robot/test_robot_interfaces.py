@@ -11,7 +11,14 @@ import pytest
 
 from rce.aio.queues import OverflowPolicy
 from rce.guard.holdings import Holding, Holdings
-from rce.link import CallTimeout, InterfaceError, NotConnected, Overloaded, PeerFault, PeerLost
+from rce.link import (
+    CallTimeoutError,
+    InterfaceError,
+    NotConnectedError,
+    OverloadedError,
+    PeerFaultError,
+    PeerLostError,
+)
 from rce.model.names import InterfaceType
 from rce.model.specs import InterfaceSpec
 from rce.protocol.messages import DataMessage
@@ -415,7 +422,7 @@ async def test_the_robot_asks() -> None:
     assert shown(message)["msg"] == {"success": True, "message": "done"}
 
 
-@pytest.mark.parametrize("error", [NotConnected(), PeerFault("no"), CallTimeout("late")])
+@pytest.mark.parametrize("error", [NotConnectedError(), PeerFaultError("no"), CallTimeoutError("late")])
 async def test_a_call_that_fails_is_told(error: Exception) -> None:
     setup = Setup("ServiceProviderConverter", SERVICE)
     setup.port.answer = error
@@ -454,13 +461,13 @@ async def test_the_robot_answers() -> None:
 
 async def test_the_ways_in_which_the_robot_does_not_answer() -> None:
     setup = Setup("ServiceClientConverter", SERVICE, call_timeout=0.01)
-    with pytest.raises(CallTimeout):
+    with pytest.raises(CallTimeoutError):
         await setup.interface.serve(b"\x01")
     setup.robot.room = False
-    with pytest.raises(Overloaded):
+    with pytest.raises(OverloadedError):
         await setup.interface.serve(b"\x01")
     setup.robot.connected = False
-    with pytest.raises(PeerLost):
+    with pytest.raises(PeerLostError):
         await setup.interface.serve(b"\x01")
     with pytest.raises(MisdirectedError, match="no call"):
         setup.take({}, "unknown")
@@ -468,7 +475,7 @@ async def test_the_ways_in_which_the_robot_does_not_answer() -> None:
 
 async def test_a_bad_request_of_a_peer_is_the_peers_to_know() -> None:
     setup = Setup("ServiceClientConverter", SERVICE)
-    with pytest.raises(PeerFault):
+    with pytest.raises(PeerFaultError):
         await setup.interface.serve(b"far too long for a bool")
     assert not setup.robot.reports
 
@@ -479,6 +486,6 @@ async def test_a_closed_interface_fails_its_callers() -> None:
     call = asyncio.ensure_future(setup.interface.serve(b"\x01"))
     await asyncio.sleep(0)
     await setup.interface.close()
-    with pytest.raises(PeerLost):
+    with pytest.raises(PeerLostError):
         await call
     assert setup.robot.gone == [setup.interface]

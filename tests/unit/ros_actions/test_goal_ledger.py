@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce.ros.actions import GoalEvent, GoalId, GoalState, IllegalTransitionError, UnknownGoal
+from rce.ros.actions import GoalEvent, GoalId, GoalState, IllegalTransitionError, UnknownGoalError
 from rce.ros.actions.ledger import Arrival, GoalLedger
 
 
@@ -81,7 +81,7 @@ def test_goals_that_are_over_are_remembered_for_a_while() -> None:
     assert ledger.receive(GoalId("g1", 1), 14) is Arrival.REPEATED
     assert states(ledger, 19) == {"g1": "SUCCEEDED", "g2": "PENDING"}
     assert states(ledger, 20) == {"g2": "PENDING"}
-    with pytest.raises(UnknownGoal, match="g1"):
+    with pytest.raises(UnknownGoalError, match="g1"):
         ledger.apply("g1", GoalEvent.ABORT, 20)
 
 
@@ -109,7 +109,7 @@ def test_the_ledger_is_always_sound(story: list[tuple[object, int, int, float]])
         elif what == "cancel":
             ledger.cancel(goal_id, now)
         elif isinstance(what, GoalEvent) and number:
-            with suppress(IllegalTransitionError, UnknownGoal):
+            with suppress(IllegalTransitionError, UnknownGoalError):
                 ledger.apply(goal_id.id, what, now)
         ledger.validate()
         present = {entry.goal_id.id: entry.state for entry in ledger.listed(now)}

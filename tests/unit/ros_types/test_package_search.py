@@ -13,7 +13,7 @@ import pytest
 
 from rce.ros import package_tree
 from rce.ros.package_tree import PackageTree
-from rce.ros.packages import PackageIndex, PackageNotFound
+from rce.ros.packages import PackageIndex, PackageNotFoundError
 
 LIST = """
 import json, sys, rospkg
@@ -128,7 +128,7 @@ def test_what_changes_is_noticed_and_nothing_else_is_searched_again(tmp_path: Pa
 
 def test_a_package_that_is_added_after_a_miss_is_found(tmp_path: Path) -> None:
     index = PackageIndex([tmp_path / "later"])
-    with pytest.raises(PackageNotFound):
+    with pytest.raises(PackageNotFoundError):
         index.find("p")
     added = package(tmp_path / "later" / "repository" / "p")
     assert index.find("p").path == added

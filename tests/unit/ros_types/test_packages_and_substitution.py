@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from rce.ros import packages
-from rce.ros.packages import BadPackage, ExecutableNotFound, PackageIndex, PackageNotFound
+from rce.ros.packages import BadPackageError, ExecutableNotFoundError, PackageIndex, PackageNotFoundError
 from rce.ros.substitution import SubstitutionError, split_arguments, substitute
 
 
@@ -39,7 +39,7 @@ def test_a_package_is_found_by_folder_by_itself_and_by_declared_name(tmp_path: P
     assert PackageIndex([two]).find("two").path == two
     assert PackageIndex([one]).find("one").path == one
     for name in ("folder", "four", "../one", ""):
-        with pytest.raises(PackageNotFound, match=str(tmp_path)):
+        with pytest.raises(PackageNotFoundError, match=str(tmp_path)):
             index.find(name)
 
 
@@ -66,7 +66,7 @@ def test_the_path_comes_from_the_environment(tmp_path: Path) -> None:
 )
 def test_a_bad_manifest_is_told(tmp_path: Path, text: str, part: str) -> None:
     make(tmp_path / "pkg", text=text)
-    with pytest.raises(BadPackage, match=part):
+    with pytest.raises(BadPackageError, match=part):
         PackageIndex([tmp_path]).find("pkg")
 
 
@@ -108,7 +108,7 @@ def test_what_is_not_inside_the_package_is_refused(tmp_path: Path, exe: str) -> 
     make(tmp_path / "pkg", nodes__n=0o755)
     (tmp_path / "outside").write_text("#!/bin/sh\n")
     (tmp_path / "outside").chmod(0o755)
-    with pytest.raises(ExecutableNotFound):
+    with pytest.raises(ExecutableNotFoundError):
         PackageIndex([tmp_path]).find("pkg").executable(exe)
 
 
@@ -123,7 +123,7 @@ def test_file_elsewhere_that_may_be_executed_goes_before_one_that_may_not(tmp_pa
 
 def test_a_file_that_may_not_be_executed_is_refused(tmp_path: Path) -> None:
     make(tmp_path / "pkg", nodes__n=0o644)
-    with pytest.raises(ExecutableNotFound, match="chmod"):
+    with pytest.raises(ExecutableNotFoundError, match="chmod"):
         PackageIndex([tmp_path]).find("pkg").executable("n")
 
 
@@ -157,7 +157,9 @@ def distributed(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]
 
 def test_distributions_add_nodes_that_are_functions(distributed: Callable[..., None]) -> None:
     distributed(("rce.nodes", "Clock:now.py", "time:time_ns"))
-    with pytest.raises(BadPackage, match="no file of a module time"):  # `time` is built in and has no folder
+    with pytest.raises(
+        BadPackageError, match="no file of a module time"
+    ):  # `time` is built in and has no folder
         PackageIndex([]).find("Clock")
     distributed(("rce.nodes", "Json:tool", "json.tool:main"))
     argv = PackageIndex([]).find("Json").executable("tool")
@@ -175,7 +177,7 @@ def test_distributions_add_packages_with_nodes_that_are_scripts(distributed: Cal
     assert found.path == Path(xml.__file__).parent
     script = Path(json.__file__).parent / "tool.py"
     assert found.executable("tool.py") == [sys.executable, str(script)]
-    with pytest.raises(BadPackage, match=r"entry point no\.x"):
+    with pytest.raises(BadPackageError, match=r"entry point no\.x"):
         PackageIndex([]).find("bad")
 
 
@@ -250,5 +252,5 @@ def test_a_folder_that_may_not_be_entered_spoils_no_other(
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != closed)
     index = PackageIndex([closed, tmp_path / "open"])
     assert index.find("one").path == one
-    with pytest.raises(PackageNotFound, match=f"{closed} may not be read here"):
+    with pytest.raises(PackageNotFoundError, match=f"{closed} may not be read here"):
         index.find("two")

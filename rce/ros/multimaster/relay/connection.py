@@ -8,7 +8,7 @@ from typing import cast
 
 from rce.aio.queues import BoundedQueue
 from rce.guard.lobby import Guest, Lobby, address_of
-from rce.ros.multimaster.errors import LinkBroken
+from rce.ros.multimaster.errors import LinkBrokenError
 from rce.ros.multimaster.relay.frames import (
     MAX_FRAME_SIZE,
     MAX_GREETING,
@@ -69,7 +69,7 @@ class RelayConnection(asyncio.Protocol):
         self._full = False
         self._heard = loop.time()
 
-    # ------------------------------------------------------------------ for the owner
+    # For the owner
 
     def send(self, frame: Frame) -> None:
         """Send a frame; a message waits, and may be dropped for newer ones, while the connection is full."""
@@ -85,13 +85,13 @@ class RelayConnection(asyncio.Protocol):
         """Wait for the next frame of the handshake.
 
         Raises:
-            LinkBroken: The connection ended, or something else came.
+            LinkBrokenError: The connection ended, or something else came.
         """
         found = await self._greetings.get()
         if found is None:
             self._greetings.put_nowait(None)
             await self.ended
-            raise LinkBroken("the connection is lost")
+            raise LinkBrokenError("the connection is lost")
         return found
 
     def become_known(self) -> None:
@@ -119,7 +119,7 @@ class RelayConnection(asyncio.Protocol):
             self.send(Ping())
             await asyncio.sleep(PING_PERIOD)
             if loop.time() - self._heard > SILENCE:
-                self._fail(LinkBroken("the other side fell silent"))
+                self._fail(LinkBrokenError("the other side fell silent"))
 
     def abort(self) -> None:
         """Close now."""
@@ -127,7 +127,7 @@ class RelayConnection(asyncio.Protocol):
             self._transport.abort()
         self.ended.cancel()
 
-    # ------------------------------------------------------------------ for the transport
+    # For the transport
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Count it, and send what waits."""
@@ -148,7 +148,7 @@ class RelayConnection(asyncio.Protocol):
         try:
             for frame in self._decoder.feed(data):
                 self._take(frame)
-        except LinkBroken as error:
+        except LinkBrokenError as error:
             self._fail(error)
 
     def pause_writing(self) -> None:
@@ -167,7 +167,7 @@ class RelayConnection(asyncio.Protocol):
         if self._guest is not None:
             self._guest.leave()
         self.gone.set()
-        self._fail(LinkBroken(f"the connection is lost: {error or 'the other side closed it'}"))
+        self._fail(LinkBrokenError(f"the connection is lost: {error or 'the other side closed it'}"))
 
     def _take(self, frame: Frame) -> None:
         if self._stopped:
@@ -177,7 +177,7 @@ class RelayConnection(asyncio.Protocol):
             return
         if not self._ends:
             if len(self._backlog) > MAX_BACKLOG or not (self._is_known or self._answered):
-                raise LinkBroken("the other side does not begin with a hello")
+                raise LinkBrokenError("the other side does not begin with a hello")
             self._backlog.append(frame)
         for end in self._ends:
             end(frame)
@@ -186,14 +186,14 @@ class RelayConnection(asyncio.Protocol):
         if self._is_known:
             return
         if self._greetings.qsize() >= MAX_GREETINGS:
-            raise LinkBroken("the other side says too much before the handshake is done")
+            raise LinkBrokenError("the other side says too much before the handshake is done")
         if self._lobby is None and isinstance(frame, Hello):
             # The listening side's last word of the handshake; what follows may come with it.
             self._answered = True
             self._decoder.most = MAX_FRAME_SIZE
         self._greetings.put_nowait(frame)
 
-    def _fail(self, error: LinkBroken) -> None:
+    def _fail(self, error: LinkBrokenError) -> None:
         self._greetings.put_nowait(None)
         if not self.ended.done():
             self.ended.set_exception(error)

@@ -9,7 +9,7 @@ from typing import Any
 
 from rce.aio.tasks import TaskScope
 from rce.ros.errors import MasterError, ServiceError
-from rce.ros.multimaster.errors import NothingToRelay
+from rce.ros.multimaster.errors import NothingToRelayError
 from rce.ros.multimaster.filters import SyncFilter
 from rce.ros.multimaster.relay.frames import Answer, Call, Data, Frame, Offer, Want
 from rce.ros.multimaster.relay.kinds import ServiceKind, TopicKind, learn_service, learn_topic
@@ -108,7 +108,7 @@ class Exporter:
             self._calls += 1
             self._tasks.spawn(self._call(frame), name="relayed call")
 
-    # ------------------------------------------------------------------ what there is
+    # What there is
 
     async def _look(self) -> None:
         snapshot = await self._source.read()
@@ -141,7 +141,7 @@ class Exporter:
         for topic in found.keys() - self._topics.keys():
             try:
                 learned = await learn_topic(self._master.rpc, self._node.name, topic, found[topic])
-            except NothingToRelay as error:
+            except NothingToRelayError as error:
                 _log.debug("%s", error)
                 continue
             self._topics[topic] = (self._number(topic), learned)
@@ -158,7 +158,7 @@ class Exporter:
         for service in found.keys() - self._services.keys():
             try:
                 learned = await learn_service(self._node.name, service, found[service])
-            except NothingToRelay as error:
+            except NothingToRelayError as error:
                 _log.debug("%s", error)
                 continue
             self._services[service] = (self._number(service), learned)
@@ -177,7 +177,7 @@ class Exporter:
     def _offered_name(self, name: str) -> str:
         return self._rename(name) or name
 
-    # ------------------------------------------------------------------ what is wanted
+    # What is wanted
 
     async def _serve_wants(self) -> None:
         for number in self._subscribers.keys() - (self._wanted & self._names.keys()):
@@ -201,7 +201,7 @@ class Exporter:
         try:
             response = await self._client(call.service).call_serialized(call.payload, timeout=CALL_TIMEOUT)
             self._send(Answer(call.call, ok=True, payload=response))
-        except (ServiceError, MasterError, NothingToRelay) as error:
+        except (ServiceError, MasterError, NothingToRelayError) as error:
             text = error.text if isinstance(error, ServiceError) else str(error)
             self._send(Answer(call.call, ok=False, payload=text.encode()))
         finally:
@@ -215,7 +215,7 @@ class Exporter:
                     client = self._clients[number] = self._node.service_client(service, kind.as_type())
                     break
             else:
-                raise NothingToRelay("the service is not offered any longer")
+                raise NothingToRelayError("the service is not offered any longer")
         return client
 
     async def _close(self) -> None:

@@ -23,7 +23,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from rce.ros.multimaster.errors import LinkBroken
+from rce.ros.multimaster.errors import LinkBrokenError
 from rce.ros.multimaster.relay.kinds import ServiceKind, TopicKind
 from rce.ros.tcpros.framing import MAX_FRAME
 
@@ -192,14 +192,14 @@ class Decoder:
         """Take bytes; return the frames that are complete.
 
         Raises:
-            LinkBroken: This is not the protocol.
+            LinkBrokenError: This is not the protocol.
         """
         self._buffer += data
         position = 0
         while len(self._buffer) - position >= _HEAD.size:
             length, code = _HEAD.unpack_from(self._buffer, position)
             if not 1 <= length <= self.most:
-                raise LinkBroken(f"a frame of {length} bytes")
+                raise LinkBrokenError(f"a frame of {length} bytes")
             end = position + _HEAD.size + length - 1
             if end > len(self._buffer):
                 break
@@ -226,7 +226,7 @@ def _decode(code: bytes, body: bytes) -> Frame:
             case _:
                 return _decode_json(code, json.loads(body))
     except (struct.error, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise LinkBroken(f"a frame {code!r} that cannot be read: {error}") from error
+        raise LinkBrokenError(f"a frame {code!r} that cannot be read: {error}") from error
 
 
 def _decode_json(code: bytes, values: Any) -> Frame:

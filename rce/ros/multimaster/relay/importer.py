@@ -7,7 +7,7 @@ import itertools
 import logging
 from collections.abc import Callable
 
-from rce.ros.errors import MasterError, RosError, ServiceFault
+from rce.ros.errors import MasterError, RosError, ServiceFaultError
 from rce.ros.multimaster.filters import SyncFilter
 from rce.ros.multimaster.relay.exporter import CALL_TIMEOUT, Rename
 from rce.ros.multimaster.relay.frames import Answer, Call, Data, Frame, Offer, Want
@@ -81,12 +81,12 @@ class Importer:
                 if frame.ok:
                     waiting.set_result(frame.payload)
                 else:
-                    waiting.set_exception(ServiceFault("", frame.payload.decode(errors="replace")))
+                    waiting.set_exception(ServiceFaultError("", frame.payload.decode(errors="replace")))
         elif isinstance(frame, Offer):
             self._offer = frame
             self._changed.set()
 
-    # ------------------------------------------------------------------ topics
+    # Topics
 
     def _publish(self, data: Data) -> None:
         known = self._topics.get(data.topic)
@@ -129,7 +129,7 @@ class Importer:
                 self._changed.set()
         return is_complete
 
-    # ------------------------------------------------------------------ services
+    # Services
 
     async def _keep_services(self) -> bool:
         offered = self._offer.services
@@ -170,18 +170,18 @@ class Importer:
             async with asyncio.timeout(CALL_TIMEOUT):
                 return await waiting
         except TimeoutError as error:
-            raise ServiceFault(name, "no answer came over the relay") from error
-        except ServiceFault as error:
-            raise ServiceFault(name, error.text) from error
+            raise ServiceFaultError(name, "no answer came over the relay") from error
+        except ServiceFaultError as error:
+            raise ServiceFaultError(name, error.text) from error
         finally:
             del self._calls[number]
 
-    # ------------------------------------------------------------------ the end
+    # The end
 
     async def _close(self) -> None:
         for waiting in self._calls.values():
             if not waiting.done():
-                waiting.set_exception(ServiceFault("", "the relay was closed"))
+                waiting.set_exception(ServiceFaultError("", "the relay was closed"))
         try:
             for _, _, publisher in self._topics.values():
                 await publisher.close()

@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 from rce.ros.dialing import open_peer_socket
 from rce.ros.errors import TcprosError, XmlRpcError
-from rce.ros.multimaster.errors import NothingToRelay
+from rce.ros.multimaster.errors import NothingToRelayError
 from rce.ros.tcpros.header import ANY, MAX_HEADER, decode_header, encode_header, raise_error_field
 from rce.ros.xmlrpc import RpcClient
 from rce.ros.xmlrpc.dispatch import SUCCESS
@@ -74,7 +74,7 @@ async def learn_topic(rpc: RpcClient, caller: str, topic: str, publishers: Itera
         publishers: URIs of the publishers' APIs.
 
     Raises:
-        NothingToRelay: None of them answers.
+        NothingToRelayError: None of them answers.
     """
     reason = "it has no publisher"
     for uri in publishers:
@@ -87,7 +87,7 @@ async def learn_topic(rpc: RpcClient, caller: str, topic: str, publishers: Itera
             return TopicKind(fields["type"], fields["md5sum"], fields.get("message_definition", ""))
         except (TcprosError, XmlRpcError, OSError, EOFError, KeyError) as error:
             reason = f"{uri}: {str(error) or type(error).__name__}"
-    raise NothingToRelay(f"the type of {topic} cannot be learned: {reason}")
+    raise NothingToRelayError(f"the type of {topic} cannot be learned: {reason}")
 
 
 async def learn_service(caller: str, service: str, uri: str) -> ServiceKind:
@@ -99,7 +99,7 @@ async def learn_service(caller: str, service: str, uri: str) -> ServiceKind:
         uri: The provider's ``rosrpc`` URI.
 
     Raises:
-        NothingToRelay: It does not answer.
+        NothingToRelayError: It does not answer.
     """
     header = {"callerid": caller, "service": service, "md5sum": ANY, "probe": "1"}
     try:
@@ -115,7 +115,9 @@ async def learn_service(caller: str, service: str, uri: str) -> ServiceKind:
         )
     except (TcprosError, OSError, EOFError, KeyError, ValueError) as error:
         reason = str(error) or type(error).__name__
-        raise NothingToRelay(f"the type of service {service} cannot be learned: {uri}: {reason}") from error
+        raise NothingToRelayError(
+            f"the type of service {service} cannot be learned: {uri}: {reason}"
+        ) from error
 
 
 async def _topic_address(rpc: RpcClient, caller: str, topic: str, uri: str) -> tuple[str, int]:

@@ -12,7 +12,7 @@ from rce.aio.tasks import TaskScope
 from rce.dialing import open_socket
 from rce.guard.complaints import Complaints
 from rce.guard.lobby import Lobby
-from rce.ros.multimaster.errors import LinkBroken, MultimasterError
+from rce.ros.multimaster.errors import LinkBrokenError, MultimasterError
 from rce.ros.multimaster.relay.connection import RelayConnection
 from rce.ros.multimaster.relay.exporter import Exporter
 from rce.ros.multimaster.relay.frames import Frame
@@ -91,7 +91,7 @@ class RelayLinks:
                     sock = await open_socket(host, port)
                     _, link = await loop.create_connection(RelayConnection, sock=sock)
                 await self._serve(link, self._greet_as_dialer)
-            except (OSError, LinkBroken) as error:
+            except (OSError, LinkBrokenError) as error:
                 _log.warning("relay to %s:%d: %s", host, port, str(error) or type(error).__name__)
             if loop.time() - begin > WORKED_AFTER:
                 pauses.reset()
@@ -128,7 +128,7 @@ class RelayLinks:
     async def _serve_guest(self, link: RelayConnection) -> None:
         try:
             await self._serve(link, self._greet_as_listener)
-        except LinkBroken as error:
+        except LinkBrokenError as error:
             if self._complaints.is_due(link.address, asyncio.get_running_loop().time()):
                 _log.warning("relay link from %s: %s", link.address, error)
 
@@ -136,14 +136,14 @@ class RelayLinks:
         """Run a link until it ends.
 
         Raises:
-            LinkBroken: The other side breaks the protocol, has another token or fell silent.
+            LinkBrokenError: The other side breaks the protocol, has another token or fell silent.
         """
         try:
             try:
                 async with asyncio.timeout(HELLO_TIMEOUT):
                     name = await greet(link)
             except TimeoutError as error:
-                raise LinkBroken("the other side does not say who it is") from error
+                raise LinkBrokenError("the other side does not say who it is") from error
             link.become_known()
             await self._run(link, name)
         finally:
@@ -159,8 +159,8 @@ class RelayLinks:
             link.send(handshake.prove(await link.greeting()))
             try:
                 last = await link.greeting()
-            except LinkBroken as error:
-                raise LinkBroken(f"{error}; it may have another token") from error
+            except LinkBrokenError as error:
+                raise LinkBrokenError(f"{error}; it may have another token") from error
             return handshake.finish(last)
         finally:
             self._dialing.discard(handshake.nonce)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 
-from rce.ros.multimaster.errors import NothingToRelay
+from rce.ros.multimaster.errors import NothingToRelayError
 from rce.ros.multimaster.relay.kinds import TopicKind, learn_topic
 from rce.ros.multimaster.relay.throttle import Everything, Throttle
 from rce.ros.multimaster.source import multicall
@@ -98,7 +98,7 @@ class TopicRelay:
             while True:
                 try:
                     return await learn_topic(rpc, node.name, topic, await publisher_uris(master, topic))
-                except NothingToRelay as error:
+                except NothingToRelayError as error:
                     if str(error) != reason:
                         reason = str(error)
                         _log.info("%s", reason)
