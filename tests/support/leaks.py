@@ -19,6 +19,8 @@ from rce_container.limits import files
 
 CGROUPS = Path("/sys/fs/cgroup")
 INTERFACES = Path("/sys/class/net")
+_PF_EXITING = 0x4
+"""A flag of ``/proc/PID/stat`` (Linux's ``include/linux/sched.h``)."""
 DEAD_AFTER_S = 600.0
 """An empty cell of this age is nobody's."""
 
@@ -77,7 +79,11 @@ class Traces:
             but: Processes that may stay, by pid: its programs, if they run.
         """
         self._note_names()
-        found = [f"process {_describe(one.pid)}" for one in self.processes() if one.pid not in but]
+        found = [
+            f"process {_describe(one.pid)}"
+            for one in self.processes()
+            if one.pid not in but and not _is_exiting(one.pid)
+        ]
         found += [f"cgroup {path}" for path in self.cgroups()]
         found += [f"mount {line}" for line in self._mounts()]
         found += [f"interface {path.name}" for path in INTERFACES.iterdir() if path.name[1:] in self._marks]
@@ -176,6 +182,14 @@ def _walk(folder: Path) -> Iterator[Path]:
     """All that is in a folder; what vanishes meanwhile is left out."""
     for parent, folders, names in os.walk(folder):
         yield from (Path(parent, name) for name in (*folders, *names))
+
+
+def _is_exiting(pid: int) -> bool:
+    """Whether the kernel is removing a process, which may take a while on a busy machine."""
+    with contextlib.suppress(OSError):
+        text = Path(f"/proc/{pid}/stat").read_bytes()
+        return bool(int(text[text.rindex(b")") + 2 :].split()[6]) & _PF_EXITING)
+    return True
 
 
 def _describe(pid: int) -> str:
