@@ -1,15 +1,15 @@
-"""The configs of a fleet: one for each robot, one for the operator who has the planner.
+"""The client configs of a fleet: one for each robot, and one for the operator, with the planner.
 
-Robot N has a container ``cTag_0N`` of its own, in which a move client sends it from cell to cell. The
-planner lives in the operator's container ``cTag_fleet``, whose ROS graph knows the robots by their
-namespaces. So there are three kinds of wires, all of which robot N's config makes:
+Robot N has its own container ``cTag_0N``, in which a move client sends it from cell to cell. The planner runs
+in the operator's container ``cTag_fleet``, where the robots' topics are in namespaces. Robot N's config makes
+three groups of connections:
 
-* robot - own container: poses up; the goals and states of its ``move_base`` down and up;
-* robot - planner: poses and cells that turn out to be blocked;
-* own container - planner: cells to drive on, cancellations, the map; the move client's reports back.
+* robot - own container: poses to the container; goals and states of its ``move_base``;
+* robot - planner: poses, and cells that the robot found blocked;
+* own container - planner: granted cells, cancellations and the map; back, the move client's reports.
 
-``configs/robot1.config`` to ``robot3.config`` and ``fleet.config`` are what this module makes;
-``robot1-long.config`` says the same as ``robot1.config`` without bridges, in the paper's names.
+This module made ``fleet.config`` and ``robot1.config`` to ``robot3.config`` in ``configs``. ``robot1-long.config``
+is the same as ``robot1.config`` without bridges, with the paper's names.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _CELLS = "std_msgs/Int32MultiArray"
 
 @dataclass(frozen=True, slots=True)
 class FleetAccount:
-    """Where the engine is, and whose robots these are."""
+    """The engine's address, and the user account of the robots."""
 
     url: str = "http://localhost:9000/"
     user: str = "testUser"
@@ -42,7 +42,7 @@ def robot_config(number: int, account: FleetAccount | None = None) -> dict[str, 
 
     Args:
         number: Names robot (``testRobot_1``), container (``cTag_01``) and namespace (``Robot1``).
-        account: Engine and user; the development ones if None.
+        account: Engine and user; None for those of a development engine.
     """
     account = account or FleetAccount()
     robot, container, namespace = f"{account.robot_prefix}{number}", f"cTag_{number:02}", f"Robot{number}"
@@ -72,7 +72,7 @@ def fleet_config(
     """Return the operator's config: the container with the planner.
 
     Args:
-        account: Engine and user; the development ones if None.
+        account: Engine and user; None for those of a development engine.
         parameters: The planner's parameters by name, such as ``rows``; those of an 8 x 8 floor if None.
     """
     account = account or FleetAccount()

@@ -1,4 +1,4 @@
-"""Which ROS graph each robot of a world joins."""
+"""The ROS graph that each robot of a world joins."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, slots=True)
 class Cores:
-    """URIs of ROS masters. A robot without one gets a graph of its own, where it has no namespace."""
+    """URIs of ROS masters. A robot without one gets its own graph and no namespace."""
 
     everybody: str | None = None
-    """For robots that are not named."""
+    """For robots that are not listed."""
     robots: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def read(cls, texts: Iterable[str]) -> Cores:
-        """Read ``URI`` (for everybody) and ``ROBOT=URI``."""
+        """Read ``URI`` (for all robots) and ``ROBOT=URI``."""
         everybody, robots = None, {}
         for text in texts:
             robot, separator, uri = text.partition("=")
@@ -27,5 +27,5 @@ class Cores:
         return cls(everybody, robots)
 
     def of(self, robot: str) -> str | None:
-        """The master of a robot's graph; None for one of its own."""
+        """Return the master of a robot's graph; None for its own graph."""
         return self.robots.get(robot, self.everybody)

@@ -27,18 +27,18 @@ if TYPE_CHECKING:
 REPORT_EVERY = 0.5
 """Seconds between two reports."""
 ROBOT_NODE = "robot"
-"""Name of a robot's node in its namespace, where it joins a graph that is there."""
+"""Name of a robot's node in its namespace, if it joins an existing graph."""
 
 
 class Simulation:
-    """A world in real time, each robot a node in a ROS graph.
+    """Runs a world in real time, with a ROS node for each robot.
 
     Args:
-        scene: What stands where.
+        scene: Map, boxes and robots.
         types: Where message types come from.
-        say: Gets lines for people and for programs that start this one.
+        say: Prints a line for the user and for the program that started this one.
         report: File that the report is written to; none if None.
-        watch: Hears the cells that the planner blocks; nobody blocks any if None.
+        watch: Watches the cells that the planner blocks; None if no planner does.
         cores: The ROS graphs that the robots join.
     """
 
@@ -50,7 +50,7 @@ class Simulation:
         *,
         report: Path | None = None,
         watch: CellWatch | None = None,
-        cores: Cores = Cores(),  # noqa: B008 - it cannot be changed
+        cores: Cores = Cores(),  # noqa: B008 - immutable
     ) -> None:
         self._scene = scene
         self._types = types

@@ -1,4 +1,4 @@
-"""Keeps a simulated world in step with the clock."""
+"""Runs a simulated world in real time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 PERIOD = 0.05
 """Seconds between two updates of the robots."""
 MAX_LAG = 0.5
-"""A world that is farther behind the clock than this, in seconds, lets the time go."""
+"""Maximum delay behind the clock that is caught up, seconds."""
 
 
 async def run_world(
@@ -26,13 +26,13 @@ async def run_world(
 ) -> None:
     """Run a world in real time until cancelled.
 
-    A machine that is too slow makes the world slower, not jerky: lost time is not caught up.
+    On a machine that is too slow the world runs slower; delays above MAX_LAG are not caught up.
 
     Args:
         world: The world.
         drivers: The robots in it.
-        after_update: Called after each update, for those who look at the world.
-        pace: Simulated seconds in one second.
+        after_update: Called after each update.
+        pace: Simulated seconds per second.
     """
     loop = asyncio.get_running_loop()
     robots = list(drivers)

@@ -1,6 +1,6 @@
-"""Sends a robot along the cells that it was granted, goal by goal. Runs in the robot's namespace.
+"""Sends a robot along its granted cells, goal by goal. Runs in the robot's namespace.
 
-The work is done by :mod:`rce_fleet.coordination.move_client`; this node carries messages to it and from it.
+The work is done by :mod:`rce_fleet.coordination.move_client`; this node passes messages to it and from it.
 ``share/README.md`` lists the topics.
 """
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from rce.ros.types import Message
 
 TICK = 0.25
-"""Seconds between two looks at the clock."""
+"""Seconds between two timer events."""
 REPORT_EVERY = 0.5
 """Seconds after which the progress is published again."""
 MAP_FRAME = "map"
@@ -53,7 +53,7 @@ class MoveClientNode:
         self._answers = False
 
     async def run(self) -> None:
-        """Send the robot along until the node is told to stop."""
+        """Send the robot along until the node is stopped."""
         node = self._node
         self._goals = await node.advertise("move_base/goal", "move_base_msgs/MoveBaseActionGoal")
         self._stops = await node.advertise("move_base/cancel", "actionlib_msgs/GoalID")
@@ -83,7 +83,7 @@ class MoveClientNode:
     # What comes in
 
     def _take_map(self, message: Message) -> None:
-        """Learn size and place of the cells: one pixel of the map is one cell."""
+        """Set size and position of the cells: one pixel of the map is one cell."""
         info = message.info
         grid = GridMap(
             rows=info.height,
@@ -109,7 +109,7 @@ class MoveClientNode:
         try:
             self._do(self._client.take_cells(revision, list(message.data), time.time()))
         except ValueError as error:
-            self._node.log.warning("refused a list of cells: %s", error)
+            self._node.log.warning("the list of cells was refused: %s", error)
 
     def _take_cancel(self, message: Message) -> None:
         if self._client is not None and message.data:
@@ -171,7 +171,7 @@ class MoveClientNode:
 
 
 async def main() -> None:
-    """Send a robot along until the node is told to stop."""
+    """Run the node until it is stopped."""
     async with Node("move_client") as node:
         await MoveClientNode(node).run()
 

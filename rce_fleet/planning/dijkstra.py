@@ -13,15 +13,15 @@ if TYPE_CHECKING:
 
 
 def distances(grid: GridMap, goal: int, weights: Sequence[float] | None = None) -> list[float]:
-    """Cost of the cheapest way to ``goal``, for every cell.
+    """Return the cost of the cheapest path to ``goal``, for every cell.
 
     Args:
         grid: The map; blocked cells cannot be entered.
-        goal: Where the ways end.
+        goal: Cell where the paths end.
         weights: Cost of leaving each cell, positive; 1 for all by default.
 
     Returns:
-        One number a cell; ``inf`` where no way leads to the goal. A blocked goal is reached from nowhere.
+        One number per cell; ``inf`` if no path leads to the goal. A blocked goal cannot be reached.
     """
     cost = [inf] * len(grid)
     if goal in grid.blocked:
@@ -44,7 +44,7 @@ def distances(grid: GridMap, goal: int, weights: Sequence[float] | None = None) 
 
 
 def _spread(grid: GridMap, goal: int, cost: list[float]) -> None:
-    """Count steps from the goal outwards: with equal weights a queue does what a heap does."""
+    """Return the steps from the goal, by breadth-first search: with equal weights no heap is needed."""
     ring, steps = [goal], 0.0
     while ring:
         steps += 1.0
@@ -60,9 +60,9 @@ def _spread(grid: GridMap, goal: int, cost: list[float]) -> None:
 def shortest_path(
     grid: GridMap, start: int, goal: int, weights: Sequence[float] | None = None
 ) -> list[int] | None:
-    """The cheapest way from ``start`` to ``goal``, both included; ``None`` if there is none.
+    """Return the cheapest path from ``start`` to ``goal``, both included; ``None`` if there is none.
 
-    Among equal ways the one is taken that keeps its direction longest, because every turn costs a robot time.
+    Among equal paths it prefers the one that keeps its direction longest: every turn costs a robot time.
     """
     cost = distances(grid, goal, weights)
     if cost[start] == inf:

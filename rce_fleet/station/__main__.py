@@ -31,12 +31,12 @@ from rce.web.server import HttpServer
 from rce_client.exceptions import RefusedError
 from rce_fleet.station.authentication import Authenticator, TokenAuthenticator
 from rce_fleet.station.engine_authenticator import EngineAuthenticator, StationAccount
+from rce_fleet.station.engine_planner_client import EnginePlannerClient
 from rce_fleet.station.engine_watch import EngineWatch
-from rce_fleet.station.engine_wire import EngineWire
-from rce_fleet.station.fleet_link import FleetLink, PlannerWire
+from rce_fleet.station.fleet_link import FleetLink, PlannerClient
 from rce_fleet.station.graph_watch import GraphWatch
 from rce_fleet.station.live import Broadcast
-from rce_fleet.station.ros_wire import RosWire
+from rce_fleet.station.ros_planner_client import RosPlannerClient
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
 
@@ -85,7 +85,7 @@ def ui(
     if (config is None) == (not ros_master):
         raise typer.BadParameter("give either CONFIG or --ros-master")
     try:
-        way = RosWay(ros_master) if config is None else EngineWay(load(config), authority)
+        backend = RosBackend(ros_master) if config is None else EngineBackend(load(config), authority)
         chosen = TlsChoice(
             enabled=tls,
             folder=certificates or default_folder(),
@@ -99,10 +99,10 @@ def ui(
         raise typer.Exit(2) from None
     if identity is None and (text := plain_warning("the logins of the station travel", bind)):
         logging.getLogger(__name__).warning("%s", text)
-    authenticator = _authenticator(way, bind, token, login)
+    authenticator = _authenticator(backend, bind, token, login)
     try:
         names = ServerNames(bind, public_name or ())
-        uvloop.run(serve(way, bind, port, authenticator, names, identity.server if identity else None))
+        uvloop.run(serve(backend, bind, port, authenticator, names, identity.server if identity else None))
     except* RefusedError as group:
         typer.echo(f"rce ui: {group.exceptions[0]}", err=True)
         raise typer.Exit(1) from None
@@ -111,13 +111,15 @@ def ui(
         raise typer.Exit(1) from None
 
 
-def _authenticator(way: EngineWay | RosWay, bind: str, token: str, login: bool | None) -> Authenticator:
+def _authenticator(
+    backend: EngineBackend | RosBackend, bind: str, token: str, login: bool | None
+) -> Authenticator:
     """Choose how users are authenticated.
 
     Raises:
         typer.BadParameter: The options would open the fleet to everybody, or contradict each other.
     """
-    if isinstance(way, RosWay):
+    if isinstance(backend, RosBackend):
         if login:
             raise typer.BadParameter(
                 "--login needs the user accounts of an engine; with --ros-master, give a --token"
@@ -130,7 +132,7 @@ def _authenticator(way: EngineWay | RosWay, bind: str, token: str, login: bool |
             "--token is for --ros-master; with CONFIG, programs send tokens of the engine's users (rce token)"
             " and people log in at the page"
         )
-    account = way.account
+    account = backend.account
     asks = login if login is not None else not (_is_loopback(bind) and _is_loopback(_host(account.url)))
     if not asks and not _is_loopback(bind):
         raise typer.BadParameter(
@@ -152,7 +154,7 @@ def _is_loopback(host: str) -> bool:
 
 
 class Feed:
-    """Turns changes of the view into messages for the pages."""
+    """Sends changes of the view to the pages."""
 
     def __init__(self, view: FleetView, pages: Broadcast) -> None:
         self._view = view
@@ -185,55 +187,55 @@ class Feed:
         self._pages.send(topic, json.dumps({"type": topic, **message}))
 
 
-class Way(Protocol):
-    """How the station reaches the planner, and what carries the fleet."""
+class Backend(Protocol):
+    """Where the planner runs: in the engine, or in a ROS graph."""
 
     @property
-    def wire(self) -> PlannerWire:
-        """The wire to the planner."""
+    def client(self) -> PlannerClient:
+        """The client of the planner."""
 
     async def watch(self, on_state: Callable[[dict[str, Any]], None]) -> None:
-        """Tell the state of what carries the fleet until cancelled."""
+        """Call ``on_state`` with the state of engine or graph until cancelled."""
 
 
-class EngineWay:
-    """Through the engine, which runs the planner in a container."""
+class EngineBackend:
+    """The planner runs in a container of the engine."""
 
     def __init__(self, config: ClientConfig, authority: Path | None = None) -> None:
         self._tls = client_contexts(authority or config.authority_file)
         password = config.password.get_secret_value()
         if not password:
             raise ConfigError(
-                "station", [Fault("token", "is for robots; a station needs its user's password")]
+                "station", [Fault("token", "a token is for robots; the station needs the user's password")]
             )
         self.account = StationAccount(config.url, config.user, password, self._tls)
-        self.wire = EngineWire(config, self._tls)
+        self.client = EnginePlannerClient(config, self._tls)
 
     async def watch(self, on_state: Callable[[dict[str, Any]], None]) -> None:
-        """Tell the engine's state; the wire has ended nodes started again."""
+        """Call ``on_state`` with the engine's state until cancelled; restart nodes that ended."""
 
         def take(state: dict[str, Any]) -> None:
             on_state(state)
-            self.wire.on_engine(state)
+            self.client.on_engine(state)
 
         account = self.account
         await EngineWatch(account.url, account.user, account.password, tls=self._tls, on_state=take).run()
 
 
-class RosWay:
-    """In the ROS graph of the planner."""
+class RosBackend:
+    """The planner runs in a ROS graph without the engine."""
 
     def __init__(self, master_uri: str) -> None:
-        self.wire = RosWire(master_uri, TypeRegistry(PackageIndex.from_environ()))
+        self.client = RosPlannerClient(master_uri, TypeRegistry(PackageIndex.from_environ()))
         self._master_uri = master_uri
 
     async def watch(self, on_state: Callable[[dict[str, Any]], None]) -> None:
-        """Tell the nodes of the graph."""
+        """Call ``on_state`` with the graph's nodes until cancelled."""
         await GraphWatch(self._master_uri, on_state=on_state).run()
 
 
 async def serve(
-    way: Way,
+    backend: Backend,
     bind: str,
     port: int,
     authenticator: Authenticator,
@@ -243,7 +245,7 @@ async def serve(
     """Serve until SIGINT or SIGTERM."""
     view, pages = FleetView(), Broadcast()
     feed = Feed(view, pages)
-    fleet = FleetLink(way.wire, view, on_change=feed.on_change, on_event=feed.on_event)
+    fleet = FleetLink(backend.client, view, on_change=feed.on_change, on_event=feed.on_event)
     stop = asyncio.Event()
     for number in end_signals():
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
@@ -256,11 +258,11 @@ async def serve(
         async def announce() -> None:
             typer.echo(f"rce ui ready: {server.url}")
 
-        await _until(stop.wait, lambda: fleet.run(announce), lambda: way.watch(feed.on_engine))
+        await _until(stop.wait, lambda: fleet.run(announce), lambda: backend.watch(feed.on_engine))
 
 
 async def _until(done: Callable[[], Any], *work: Callable[[], Any]) -> None:
-    """Run ``work`` until ``done`` returns, then cancel it and wait for its end."""
+    """Run ``work`` until ``done`` returns; then cancel it and wait for it to end."""
     async with asyncio.TaskGroup() as group:
         tasks = [group.create_task(each()) for each in work]
         await done()

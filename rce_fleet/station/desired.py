@@ -1,4 +1,4 @@
-"""What operators and ERP want of the planner, so that one that was restarted can be told again. Pure."""
+"""Goals and blocked cells that were requested, to send them again to a restarted planner. Pure."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class DesiredGoal:
-    """A robot is to go to a cell."""
+    """A robot shall drive to a cell."""
 
     robot: str
     cell: int
@@ -16,7 +16,7 @@ class DesiredGoal:
 
 @dataclass(frozen=True, slots=True)
 class DesiredCell:
-    """A cell is to be blocked, or free."""
+    """A cell shall be blocked, or free."""
 
     cell: int
     blocked: bool
@@ -30,21 +30,21 @@ class Desired:
         self._cells: dict[int, bool] = {}
 
     def set_goal(self, robot: str, cell: int | None) -> None:
-        """The planner took a goal for a robot; None: it has none any more."""
+        """Store a goal that the planner accepted; None removes it."""
         if cell is None:
             self._goals.pop(robot, None)
         else:
             self._goals[robot] = cell
 
     def set_cell(self, cell: int, *, blocked: bool) -> None:
-        """The planner blocked or freed a cell."""
+        """Store whether the planner blocked or freed a cell."""
         self._cells[cell] = blocked
 
     def unmet(self, state: dict[str, Any]) -> list[DesiredCell | DesiredGoal]:
-        """What a planner that says ``state`` (a fleet/FleetState in its JSON form) does not know.
+        """Return what is missing in a planner's ``state`` (a fleet/FleetState in its JSON form).
 
-        Cells come first, so that no path is planned through them. Robots that it does not know yet are left
-        out, and so are those that somebody else sends somewhere.
+        Cells come first, so that no path is planned through them. Robots that the planner does not know yet,
+        or that have another goal, are left out.
         """
         shut = {*state["blocked"], *state["pending"]}
         cells = [

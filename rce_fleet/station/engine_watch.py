@@ -1,4 +1,4 @@
-"""Watches the engine over the master's REST API, for the page."""
+"""Watches the engine through the master's REST API, for the page."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ TIMEOUT = aiohttp.ClientTimeout(total=5)
 
 
 class EngineWatch:
-    """Reads containers with what they use, nodes and connections of the operator's user again and again.
+    """Polls the containers with their usage, the nodes and the connections of the operator's user.
 
     Args:
         master: URL of the master.
         user: User ID.
         password: The user's password.
         tls: Gives the TLS settings for each connection; the system's if None.
-        on_state: Called with the engine's state whenever it changed; ``{"error": text}`` if out of reach.
+        on_state: Called with each new state of the engine; with ``{"error": text}`` if it cannot be read.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class EngineWatch:
         return RequestOptions(ssl=True if self._tls is None else self._tls(), allow_redirects=False)
 
     async def run(self) -> None:
-        """Watch until cancelled; then give the token back."""
+        """Watch until cancelled; then revoke the token."""
         connector = session_connector(None)
         async with aiohttp.ClientSession(
             timeout=TIMEOUT, raise_for_status=True, connector=connector
@@ -73,7 +73,7 @@ class EngineWatch:
             except aiohttp.ClientResponseError as error:
                 if error.status == HTTPStatus.UNAUTHORIZED:
                     self._token = ""
-                state = {"error": f"the master says {error.status}: {error.message}"}
+                state = {"error": f"the master answered {error.status}: {error.message}"}
             except (aiohttp.ClientError, TimeoutError) as error:
                 state = {"error": f"the master cannot be reached: {explain_to_client(error) or error}"}
             if state != self._last:
@@ -89,7 +89,7 @@ class EngineWatch:
             async with session.delete(self._api / "login", headers=headers, **self._request_options):
                 self._token = ""
         except (aiohttp.ClientError, TimeoutError) as error:
-            _log.info("the token of this station was not given back, it expires by itself: %s", error)
+            _log.info("the station's token could not be revoked; it expires on its own: %s", error)
 
     async def _read(self, session: aiohttp.ClientSession) -> dict[str, Any]:
         if not self._token:
@@ -117,7 +117,7 @@ class EngineWatch:
                 {key: connection[key] for key in ("tag_a", "tag_b", "established")}
                 for connection in connections
             ],
-            # Administrators see these, others none.
+            # Only administrators get machines.
             "machines": [{key: machine[key] for key in _MACHINE} for machine in usage["machines"]],
         }
 
@@ -141,7 +141,7 @@ _SHOWN = ("cpu", "cpu_limit", "memory", "memory_limit", "restarts", "oom_kills")
 
 
 def _used(usage: dict[str, Any] | None) -> dict[str, Any]:
-    """What a container uses, and what could be better; without either before the first report."""
+    """Return a container's usage and advice; neither before the first report."""
     if usage is None or not usage["memory"]:
         return {"usage": None, "advice": []}
     return {"usage": {key: usage[key] for key in _SHOWN}, "advice": usage["advice"]}

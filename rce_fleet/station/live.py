@@ -1,7 +1,7 @@
-"""Sends what changes to every open page, each at its own pace.
+"""Sends changes to every open page, each at its own pace.
 
 A message has a *topic*; a page that is slow gets only the newest message of each topic (events, which must
-not be lost, are kept in a short queue). So a page that stops reading costs some memory and nobody else.
+not be lost, are kept in a short queue). A page that stops reading costs some memory and slows no other page.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ MAX_EVENTS = 100
 
 
 class Page:
-    """One open page: what it still has to get."""
+    """The messages that an open page still has to get."""
 
     def __init__(self) -> None:
         self._newest: dict[str, str] = {}
@@ -32,7 +32,7 @@ class Page:
         self._wake.set()
 
     async def take(self) -> list[str]:
-        """Wait until there is something to send, and return it."""
+        """Wait for messages, and return them."""
         await self._wake.wait()
         self._wake.clear()
         texts = [*self._newest.values(), *self._events]
@@ -60,11 +60,11 @@ class Broadcast:
         return page
 
     def close(self, page: Page) -> None:
-        """Forget a page."""
+        """Remove a page."""
         self._pages.discard(page)
 
     def send(self, topic: str, text: str) -> None:
-        """Send a message to all pages and keep it for later ones."""
+        """Send a message to all pages, and keep it for pages that open later."""
         self._newest[topic] = text
         for page in self._pages:
             page.put(topic, text)

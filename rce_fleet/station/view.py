@@ -1,4 +1,4 @@
-"""What the station knows of the fleet: a pure model, fed with messages in their JSON form."""
+"""The station's view of the fleet: a pure model, updated with messages in their JSON form."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from math import atan2
 from typing import Any
 
 ROBOT_RADIUS = 0.22
-"""Radius that the page draws robots with, metres."""
+"""Radius of the robots as the page draws them, metres."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where a robot is, in the map frame: metres, radians, counter-clockwise from x."""
+    """Pose of a robot in the map frame: metres, radians, counter-clockwise from x."""
 
     x: float
     y: float
@@ -35,26 +35,26 @@ class FleetView:
     """The newest state of the fleet and the newest pose of each robot."""
 
     state: dict[str, Any] | None = None
-    """The newest ``fleet/FleetState``, or None before the planner has spoken."""
+    """The newest ``fleet/FleetState``, or None before the first one."""
     poses: dict[str, Pose] = field(default_factory=dict)
 
     def on_state(self, message: dict[str, Any]) -> None:
-        """Take a ``fleet/FleetState``; poses of robots that are no longer in it are dropped."""
+        """Set the state; drop poses of robots that are not in it any more."""
         self.state = message
         present = set(self.robot_ids())
         for robot in [robot for robot in self.poses if robot not in present]:
             del self.poses[robot]
 
     def on_pose(self, robot: str, message: dict[str, Any]) -> None:
-        """Take a robot's pose message."""
+        """Set a robot's pose."""
         self.poses[robot] = Pose.of_message(message)
 
     def robot_ids(self) -> list[str]:
-        """The robots that the planner knows."""
+        """Return the ids of the robots that the planner knows."""
         return [] if self.state is None else [robot["id"] for robot in self.state["robots"]]
 
     def map(self) -> dict[str, Any] | None:
-        """The grid, as the page and the API show it."""
+        """Return the grid in the form of page and API."""
         if self.state is None:
             return None
         return {
@@ -67,7 +67,7 @@ class FleetView:
         }
 
     def robots(self) -> list[dict[str, Any]]:
-        """The robots, with pose where it is known."""
+        """Return the robots, with their poses if known."""
         return [] if self.state is None else [self._robot(robot) for robot in self.state["robots"]]
 
     def _robot(self, robot: dict[str, Any]) -> dict[str, Any]:
@@ -80,11 +80,11 @@ class FleetView:
         }
 
     def blocked(self) -> list[int]:
-        """Cells that nothing may enter."""
+        """Return the blocked cells."""
         return [] if self.state is None else list(self.state["blocked"])
 
     def pending(self) -> list[int]:
-        """Cells that will be blocked once they are left."""
+        """Return the cells that will be blocked once a robot has left them."""
         return [] if self.state is None else list(self.state["pending"])
 
 

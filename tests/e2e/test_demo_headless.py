@@ -93,7 +93,7 @@ async def test_blocked_cells_never_cut_off_a_goal(tmp_path: Path, cells: int) ->
     assert all(robot["reached"] for robot in report["robots"])
 
 
-async def test_a_run_that_is_too_short_says_so() -> None:
+async def test_run_that_times_out_reports_it() -> None:
     code, report, text = await run_headless("--robots", 1, timeout=1)
     assert code == 1
     assert report["ok"] is False
@@ -137,7 +137,7 @@ async def test_sigterm_ends_a_demo_that_is_still_starting() -> None:
 
 
 @pytest.mark.parametrize("runtime", RUNTIMES)
-async def test_robots_go_on_when_parts_of_the_engine_are_killed(runtime: str) -> None:
+async def test_robots_continue_after_parts_of_the_engine_are_killed(runtime: str) -> None:
     async with running_demo("--robots", 2, "--runtime", runtime) as demo:
         (report,) = demo.folder.glob("rce-demo-*/world.json")
 
@@ -165,7 +165,7 @@ async def test_robots_go_on_when_parts_of_the_engine_are_killed(runtime: str) ->
         assert found.collisions.total == 0
 
 
-async def test_a_planner_that_is_killed_comes_back_and_knows_what_was_wanted() -> None:
+async def test_killed_planner_returns_with_goals_and_blocked_cells() -> None:
     async with (
         running_demo("--robots", 1, "--seed", 2, "--runtime", "process", "--no-auto") as demo,
         aiohttp.ClientSession() as session,

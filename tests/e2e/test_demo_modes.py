@@ -46,7 +46,7 @@ def check(code: int, report: dict[str, Any], text: str, mode: str) -> None:
 
 
 @pytest.mark.parametrize("mode", MODES, ids=" ".join)
-async def test_the_same_fleet_goes_to_the_same_goals(mode: tuple[str, ...]) -> None:
+async def test_each_mode_drives_the_same_fleet_to_the_same_goals(mode: tuple[str, ...]) -> None:
     options = ("--mode", *mode, "--robots", ROBOTS, "--seed", SEED)
     check(*await run_headless(*options, timeout=TIMEOUT_S), mode=mode[0])
 
@@ -78,7 +78,7 @@ async def test_the_page_of_a_single_core_and_its_end() -> None:
         assert news["state"]["robots"][0]["state"] == "arrived"
 
 
-async def test_machines_of_many_masters_share_only_what_they_must() -> None:
+async def test_machines_share_only_the_synced_topics() -> None:
     async with (
         running_demo("--mode", "multi", "--robots", 2, "--no-auto") as demo,
         RpcClient() as rpc,
@@ -173,7 +173,7 @@ async def _state(station: StationClient) -> str:
 
 
 @pytest.mark.parametrize("mode", ["single", "multi"])
-async def test_nothing_is_left_when_the_demo_is_killed(mode: str) -> None:
+async def test_killed_demo_leaves_no_processes(mode: str) -> None:
     before = set(psutil.net_if_addrs())
     async with running_demo(
         *("--mode", mode, "--robots", 2, "--core-port", free_port(), "--no-auto")

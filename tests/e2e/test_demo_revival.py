@@ -29,7 +29,7 @@ async def reaches(station: StationClient, robot: str, cell: int) -> None:
             await asyncio.sleep(0.5)
 
 
-async def test_killed_bridge_and_station_come_back_and_a_killed_world_is_named() -> None:
+async def test_killed_bridge_and_station_return_killed_world_is_named() -> None:
     async with running_demo("--robots", 2, "--no-auto") as demo, aiohttp.ClientSession() as session:
         station = StationClient(session, demo.page)
         fleet = await station.fleet()

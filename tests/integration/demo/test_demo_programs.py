@@ -43,7 +43,7 @@ async def test_lines_are_logged_shown_and_waited_for(tmp_path: Path) -> None:
     assert talker.child.returncode == -signal.SIGTERM
 
 
-async def test_a_program_that_dies_is_named_with_its_last_words(tmp_path: Path) -> None:
+async def test_error_names_the_ended_program_and_its_last_lines(tmp_path: Path) -> None:
     async with ProgramGroup(tmp_path, ignore) as group:
         talker = await group.start("talker", python(TALKER))
         await group.start("dying", python(DYING))
@@ -52,7 +52,7 @@ async def test_a_program_that_dies_is_named_with_its_last_words(tmp_path: Path) 
     assert not psutil.pid_exists(talker.child.pid)
 
 
-async def test_a_program_that_can_be_is_started_again(tmp_path: Path) -> None:
+async def test_restartable_program_is_restarted(tmp_path: Path) -> None:
     told: asyncio.Queue[str] = asyncio.Queue()
     async with ProgramGroup(tmp_path, ignore) as group:
         talker = await group.start("talker", python(TALKER), restartable=True)
@@ -71,7 +71,7 @@ async def test_a_program_that_can_be_is_started_again(tmp_path: Path) -> None:
     assert talker.child.returncode == -signal.SIGTERM
 
 
-async def test_a_program_that_dies_again_and_again_stays_dead(
+async def test_program_that_keeps_ending_is_not_restarted_forever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(programs_module, "MIN_RESTART_DELAY", 0.01)
@@ -84,7 +84,7 @@ async def test_a_program_that_dies_again_and_again_stays_dead(
     assert len(told) == programs_module.MAX_EARLY_EXITS - 1
 
 
-async def test_nothing_is_started_again_while_all_are_ended(
+async def test_no_program_is_restarted_while_the_group_stops(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(programs_module, "MIN_RESTART_DELAY", 100.0)
@@ -97,7 +97,7 @@ async def test_nothing_is_started_again_while_all_are_ended(
     assert dying.child is former
 
 
-async def test_a_program_that_does_not_get_ready_is_named(tmp_path: Path) -> None:
+async def test_error_names_the_program_that_is_not_ready(tmp_path: Path) -> None:
     async with ProgramGroup(tmp_path, ignore) as group:
         talker = await group.start("talker", python(TALKER))
         with pytest.raises(NotReadyError, match="talker was not ready"):
@@ -118,7 +118,7 @@ async def test_work_returns_its_result_and_its_errors(tmp_path: Path) -> None:
             await group.run_while_alive(fail())
 
 
-async def test_a_program_that_does_not_listen_is_killed(
+async def test_program_that_ignores_sigterm_is_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(programs_module, "STOP_TIMEOUT", 0.1)
@@ -147,7 +147,7 @@ async def test_all_end_when_the_work_is_cancelled(tmp_path: Path) -> None:
     assert not any(psutil.pid_exists(pid) for pid in pids)
 
 
-async def test_what_others_need_is_ended_after_them(tmp_path: Path) -> None:
+async def test_stop_last_programs_are_stopped_last(tmp_path: Path) -> None:
     ended: list[str] = []
     leaving = (
         "import signal, time\nsignal.signal(signal.SIGTERM, lambda *_: exit())\nprint('up')\ntime.sleep(600)"

@@ -72,7 +72,9 @@ async def session() -> AsyncIterator[aiohttp.ClientSession]:
         yield session
 
 
-async def test_state_and_requests(played: Played, server: TestServer, session: aiohttp.ClientSession) -> None:
+async def test_state_is_read_and_requests_are_sent(
+    played: Played, server: TestServer, session: aiohttp.ClientSession
+) -> None:
     station = StationClient(session, str(server.make_url("/")))
     assert await station.fleet() == FLEET
     await station.set_goal("Robot1", 7)
@@ -101,7 +103,7 @@ async def test_refusals(
         await StationClient(session, str(server.make_url("/"))).set_blocked(9, blocked=True)
 
 
-async def test_an_answer_that_is_no_state(
+async def test_answer_that_is_not_a_state_is_refused(
     played: Played, server: TestServer, session: aiohttp.ClientSession
 ) -> None:
     played.answer = web.json_response({"robots": 3})
@@ -109,7 +111,7 @@ async def test_an_answer_that_is_no_state(
         await StationClient(session, str(server.make_url("/"))).fleet()
 
 
-async def test_nobody_there(server: TestServer, session: aiohttp.ClientSession) -> None:
+async def test_unreachable_server_is_an_error(server: TestServer, session: aiohttp.ClientSession) -> None:
     url = str(server.make_url("/"))
     await server.close()
     with pytest.raises(StationUnavailableError):
@@ -118,7 +120,7 @@ async def test_nobody_there(server: TestServer, session: aiohttp.ClientSession) 
         await read_engine_totals(url, "u", "p")
 
 
-async def test_counters_are_summed_and_the_token_is_given_back(played: Played, server: TestServer) -> None:
+async def test_totals_are_summed_and_the_token_is_revoked(played: Played, server: TestServer) -> None:
     assert await read_engine_totals(str(server.make_url("/")), "u", "p") == MessageTotals(7, 1)
     assert played.heard == [("logout", "Bearer abc")]
 

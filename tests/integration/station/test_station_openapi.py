@@ -91,7 +91,7 @@ async def test_answers_are_those_of_the_document(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", ["9" * 5000, "2147483648", "-1", "²", "1e3"])
-async def test_number_that_no_cell_has_is_not_found(number: str) -> None:
+async def test_unknown_cell_number_is_not_found(number: str) -> None:
     app = Station(FleetView(), Planner(), Broadcast()).make_app()
     async with HttpServer(app, "127.0.0.1", 0) as server, aiohttp.ClientSession() as session:
         with Tracebacks().watching() as log:

@@ -121,7 +121,9 @@ async def test_bad_input_names_the_place(running: RunningStation, path: str, bod
 @pytest.mark.parametrize(
     ("fault", "status"), [(PlannerError("cell 7 is a wall"), 409), (PlannerUnavailableError("away"), 503)]
 )
-async def test_says_what_the_planner_says(running: RunningStation, fault: PlannerError, status: int) -> None:
+async def test_planners_refusal_is_returned(
+    running: RunningStation, fault: PlannerError, status: int
+) -> None:
     await running.start()
     running.fleet.fault = fault
     reply = await running.client.put("/api/v1/cells/7", json={"blocked": True})
@@ -136,7 +138,7 @@ async def test_pages_of_other_sites_are_refused(running: RunningStation) -> None
     assert (await running.client.put("/api/v1/cells/7", json={"blocked": True}, headers=own)).status == 200
 
 
-async def test_names_that_the_station_has_not_are_refused(running: RunningStation) -> None:
+async def test_unknown_host_name_is_refused(running: RunningStation) -> None:
     """A page whose name was made to lead here (DNS rebinding) steers nothing."""
     await running.start()
     evil = {"Host": "evil.example:9080", "Origin": "http://evil.example:9080"}
@@ -148,7 +150,7 @@ async def test_names_that_the_station_has_not_are_refused(running: RunningStatio
     assert running.fleet.desired == []
 
 
-async def test_a_token_is_asked_for_where_one_is_set(running: RunningStation) -> None:
+async def test_token_is_required_if_one_is_set(running: RunningStation) -> None:
     await running.start(token="open sesame")
     assert (await running.client.get("/api/v1/fleet")).status == 401
     bearer = {"Authorization": "Bearer open sesame"}
@@ -158,7 +160,7 @@ async def test_a_token_is_asked_for_where_one_is_set(running: RunningStation) ->
     assert (await running.client.get("/static/main.js")).status == 200, "the page's cookie lets its parts in"
 
 
-async def test_the_live_socket_tells_news(running: RunningStation) -> None:
+async def test_live_socket_sends_changes(running: RunningStation) -> None:
     await running.start()
     running.pages.send("state", json.dumps({"type": "state"}))
     async with running.client.ws_connect("/api/v1/live") as socket:

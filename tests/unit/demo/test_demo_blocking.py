@@ -41,7 +41,7 @@ def test_cells_that_were_granted_are_left_alone_if_possible() -> None:
     assert block.cell == 2
 
 
-def test_nobody_is_cut_off() -> None:
+def test_cell_that_cuts_off_a_goal_is_not_blocked() -> None:
     corridor = GridMap(rows=1, columns=6)
     block = CellBlocker(corridor, {"a": 5})
     assert (
@@ -57,7 +57,7 @@ def test_nothing_is_blocked_while_a_robot_has_no_place() -> None:
     assert block.update(fleet(robot("a", cell=0, goal=3, plan=ROW), lost), (), 0.0) is BlockAction.NOTHING
 
 
-def test_a_cell_without_effect_is_given_back_and_another_tried() -> None:
+def test_cell_without_effect_is_freed() -> None:
     block = CellBlocker(GRID, {"a": 3})
     block.update(fleet(robot("a", cell=0, goal=3, plan=ROW)), (), 0.0)
     cell = block.cell
@@ -68,7 +68,7 @@ def test_a_cell_without_effect_is_given_back_and_another_tried() -> None:
     assert not block.in_progress
 
 
-def test_a_cell_that_stays_pending_is_given_back() -> None:
+def test_cell_that_stays_pending_is_freed() -> None:
     block = CellBlocker(GRID, {"a": 3})
     block.update(fleet(robot("a", cell=0, goal=3, plan=ROW)), (), 0.0)
     held = fleet(robot("a", cell=0, goal=3, replans=1), pending=[block.cell])
@@ -76,7 +76,7 @@ def test_a_cell_that_stays_pending_is_given_back() -> None:
     assert block.update(held, (), EFFECT_TIMEOUT + 0.1) is BlockAction.FREE
 
 
-def test_a_refused_cell_is_chosen_anew() -> None:
+def test_after_a_refusal_a_cell_is_chosen_again() -> None:
     block = CellBlocker(GRID, {"a": 3})
     driving = fleet(robot("a", cell=0, goal=3, plan=ROW))
     assert block.update(driving, (), 0.0) is BlockAction.BLOCK
@@ -89,7 +89,7 @@ RING = GridMap(rows=3, columns=5, blocked=frozenset({6, 7, 8}))
 """One lane around a wall; with a cell of it blocked, robots cannot pass one another any more."""
 
 
-def test_no_cell_is_blocked_that_robots_need_to_pass_one_another() -> None:
+def test_cell_needed_to_pass_each_other_is_not_blocked() -> None:
     block = CellBlocker(RING, {"a": 14, "b": 0})
     driving = fleet(
         robot("a", cell=0, goal=14, plan=[0, 1, 2, 3, 4, 9, 14]),
@@ -103,7 +103,7 @@ def test_no_cell_is_blocked_that_robots_need_to_pass_one_another() -> None:
     )
 
 
-def test_a_cell_that_came_to_cut_off_a_goal_is_freed() -> None:
+def test_cell_that_cuts_off_a_goal_later_is_freed() -> None:
     block = CellBlocker(RING, {"a": 4, "b": 3})
     driving = (
         robot("a", cell=0, goal=4, plan=[0, 1, 2, 3, 4], granted=[0]),

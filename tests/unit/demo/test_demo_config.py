@@ -53,13 +53,13 @@ def test_received_messages_are_summed_over_topics_and_connections() -> None:
     assert received(answer) == 12
 
 
-def test_a_robots_machine_takes_nothing_of_other_robots() -> None:
+def test_robots_machine_syncs_only_its_own_topics() -> None:
     argv = sync_argv("Robot1", ["Robot1", "Robot2"])
     assert argv[argv.index("--hosts") + 1] == PLANNER
     assert argv[argv.index("--topics") + 1] == "/Robot1/goalNodesList,/Robot1/cancelGoal"
 
 
-def test_the_planners_machine_takes_little_of_every_robot() -> None:
+def test_planners_machine_syncs_two_topics_per_robot() -> None:
     argv = sync_argv(PLANNER, ["Robot1", "Robot2"])
     topics = argv[argv.index("--topics") + 1].split(",")
     assert topics == [f"/Robot{n}/{name}" for n in (1, 2) for name in ("amcl_pose", "goalNodesList")]

@@ -61,7 +61,7 @@ def test_the_operator_takes_a_robot_over() -> None:
     assert random_goals.update(later, 100.0).keys() == {"b"}
 
 
-def test_a_goal_that_was_not_heard_is_no_sign_of_an_operator() -> None:
+def test_unreported_goal_is_sent_again_not_taken_as_operators() -> None:
     random_goals = RandomGoals(Random(0))
     first = random_goals.update(fleet(robot("a", cell=0)), 0.0)["a"]
     arrived = fleet(robot("a", cell=first, goal=first, state="arrived"))
@@ -77,5 +77,5 @@ def test_a_goal_that_was_not_heard_is_no_sign_of_an_operator() -> None:
     assert random_goals.taken_over == frozenset()
 
 
-def test_a_full_floor_gives_no_goal() -> None:
+def test_full_map_gives_no_goal() -> None:
     assert RandomGoals(Random(0)).update(fleet(robot("a", cell=0), blocked=[1, 2, 3], size=2), 0.0) == {}

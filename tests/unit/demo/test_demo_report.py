@@ -25,7 +25,7 @@ def make_report(reached: set[str], problem: str = "", **world: Any) -> RunReport
     return RunReport(SCENARIO, 0, run, truth(apart=0.5, **ROBOTS, **world), MessageTotals(10, 1), problem)
 
 
-def test_a_good_run() -> None:
+def test_report_of_a_good_run() -> None:
     report = make_report(set(ROBOTS)).as_json()
     assert report["ok"] is True
     assert report["collisions"] == 0
@@ -53,7 +53,7 @@ def test_a_good_run() -> None:
         (RunReport(SCENARIO, 0, None, None, None, "no engine"), "no engine"),
     ],
 )
-def test_a_bad_run_says_why(bad: RunReport, words: str, tmp_path: Path) -> None:
+def test_report_of_a_bad_run_names_the_faults(bad: RunReport, words: str, tmp_path: Path) -> None:
     assert not bad.ok
     bad.write(tmp_path / "r.json")
     report = json.loads((tmp_path / "r.json").read_text())

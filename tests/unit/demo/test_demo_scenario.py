@@ -62,7 +62,7 @@ def test_a_benchmark_with_too_few_rows_is_refused(tmp_path: Path) -> None:
         choose_scenario(3, 0, world=tmp_path / "m.map", scen=tmp_path / "m.scen")
 
 
-def test_a_file_that_is_no_map_is_refused(tmp_path: Path) -> None:
+def test_file_that_is_not_a_map_is_refused(tmp_path: Path) -> None:
     (tmp_path / "m.map").write_text("hello")
     with pytest.raises(DemoError, match=r"m\.map: line 1"):
         choose_scenario(1, 0, world=tmp_path / "m.map")

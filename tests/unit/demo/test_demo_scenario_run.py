@@ -102,13 +102,13 @@ async def test_a_robot_is_sent_a_cell_is_blocked_and_it_arrives() -> None:
     assert run.duration == ended > 0
 
 
-async def test_a_station_that_is_away_for_a_while_is_waited_for() -> None:
+async def test_unavailable_station_is_waited_for() -> None:
     station = FakeStation()
     station.away_at = {1, 5, 6, 9}
     await asyncio.wait_for(make(station).run(), 5)
 
 
-async def test_a_planner_that_was_restarted_is_told_again() -> None:
+async def test_restarted_planner_gets_goals_and_cells_again() -> None:
     station = FakeStation()
     station.restart_at = 10
     run = make(station)
@@ -126,7 +126,7 @@ async def test_no_cell_is_blocked_when_none_is_asked_for() -> None:
     assert run.blocker.done == []
 
 
-async def test_a_refused_block_is_tried_again() -> None:
+async def test_refused_block_is_tried_again() -> None:
     station = FakeStation()
     station.refuse_blocks = 2
     run = make(station)
@@ -134,7 +134,7 @@ async def test_a_refused_block_is_tried_again() -> None:
     assert len(run.blocker.done) == 1
 
 
-async def test_the_planners_word_is_not_enough() -> None:
+async def test_arrival_needs_the_world_to_confirm_it() -> None:
     station = FakeStation()
     station.truly_at_goal = False
     run = make(station)

@@ -37,7 +37,7 @@ def test_a_cell_is_granted_in_the_order_of_the_plan() -> None:
     ledger.validate()
 
 
-def test_who_is_planned_first_goes_first_even_if_the_other_is_nearer() -> None:
+def test_robot_first_in_plan_gets_the_cell_first() -> None:
     ledger = ledger_of(a=0, b=3)
     adopt(ledger, {"a": [(0, 0), (1, 1), (2, 2), (3, 10)], "b": [(0, 3), (9, 2)]})
     assert not ledger.grant("b", 4)
@@ -46,7 +46,7 @@ def test_who_is_planned_first_goes_first_even_if_the_other_is_nearer() -> None:
     assert ledger.grant("b", 4)
 
 
-def test_no_more_is_granted_than_wanted() -> None:
+def test_grants_are_limited_to_the_given_number() -> None:
     ledger = ledger_of(a=0)
     adopt(ledger, {"a": [(step, step) for step in range(8)]})
     ledger.grant("a", 2)
@@ -90,7 +90,7 @@ def test_a_robot_cannot_arrive_where_it_was_not_granted() -> None:
         ledger.arrive("a", 1)
 
 
-def test_a_newcomer_claims_what_is_nobodys() -> None:
+def test_new_robot_claims_unclaimed_cells() -> None:
     ledger = ledger_of(a=0)
     ledger.overlap("b", {0, 1})
     assert ledger.claims("b") == {1}
@@ -101,7 +101,7 @@ def test_a_newcomer_claims_what_is_nobodys() -> None:
     ledger.validate()
 
 
-def test_removing_a_robot_lets_the_others_go_on() -> None:
+def test_removed_robot_frees_its_cells_for_others() -> None:
     ledger = ledger_of(a=0, b=2)
     adopt(ledger, {"a": [(0, 0), (1, 1)], "b": [(0, 2), (2, 1), (3, 0)]})
     ledger.remove("a")

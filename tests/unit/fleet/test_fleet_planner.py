@@ -67,7 +67,7 @@ def test_a_robot_without_goal_steps_aside_and_comes_back(make: Any) -> None:
     assert robot(fleet).state is RobotState.IDLE
 
 
-def test_a_robot_whose_cell_is_anothers_goal_makes_room_for_good(make: Any) -> None:
+def test_robot_on_anothers_goal_moves_away_and_stays_away(make: Any) -> None:
     fleet = make(GridMap(), [27, 0])
     assert fleet.ask(GoalSet("Robot2", 27)).ok
     fleet.run(lambda: robot(fleet, 2).state is RobotState.ARRIVED)
@@ -88,7 +88,7 @@ def test_blocking_a_cell_of_a_path_cancels_it_and_brings_another(make: Any) -> N
     fleet.run(fleet.all_arrived)
 
 
-def test_a_cell_that_robots_do_not_use_is_blocked_without_disturbing_them(make: Any) -> None:
+def test_blocking_an_unused_cell_changes_no_plan(make: Any) -> None:
     fleet = make(GridMap(), [0], [7])
     out = fleet.tell(CellBlocked(60))
     assert not [done for done in out if isinstance(done, SendCancel)]
@@ -123,7 +123,7 @@ def test_a_pending_cell_can_be_freed(make: Any) -> None:
     assert fleet.planner.snapshot().pending == ()
 
 
-def test_a_goal_that_is_cut_off_is_reported_and_reached_once_the_way_is_free(make: Any) -> None:
+def test_cut_off_goal_is_reported_and_reached_once_free(make: Any) -> None:
     fleet = make(GridMap(1, 5), [0, 4])
     assert fleet.ask(CellBlocked(2)).ok
     assert fleet.ask(GoalSet("Robot1", 3)).ok
@@ -134,7 +134,7 @@ def test_a_goal_that_is_cut_off_is_reported_and_reached_once_the_way_is_free(mak
     fleet.run(lambda: robot(fleet).state is RobotState.ARRIVED)
 
 
-def test_one_that_is_cut_off_does_not_keep_the_others(make: Any) -> None:
+def test_robot_cut_off_from_its_goal_does_not_block_others(make: Any) -> None:
     grid = GridMap(3, 3, blocked=frozenset({1}))
     fleet = make(grid, [0, 8])
     fleet.ask(CellBlocked(3))
@@ -144,7 +144,7 @@ def test_one_that_is_cut_off_does_not_keep_the_others(make: Any) -> None:
     assert robot(fleet).state is RobotState.UNREACHABLE
 
 
-def test_what_a_sensor_finds_is_blocked(make: Any) -> None:
+def test_cell_found_blocked_by_a_sensor_is_blocked(make: Any) -> None:
     fleet = make(GridMap(), [24])
     fleet.hidden = {28}
     fleet.ask(GoalSet("Robot1", 31))
@@ -153,14 +153,14 @@ def test_what_a_sensor_finds_is_blocked(make: Any) -> None:
     assert robot(fleet).replans == 1
 
 
-def test_what_a_sensor_finds_in_another_robots_cell_was_a_robot(make: Any) -> None:
+def test_sensor_hit_in_another_robots_cell_is_ignored(make: Any) -> None:
     fleet = make(GridMap(), [0, 1])
     fleet.tell(ObstacleSeen("Robot1", (1, 0, 999)))
     assert fleet.planner.snapshot().blocked == ()
     assert fleet.planner.snapshot().pending == ()
 
 
-def test_a_silent_robot_keeps_its_cells_and_the_others_drive_around(make: Any) -> None:
+def test_silent_robot_keeps_its_cells_others_drive_around(make: Any) -> None:
     fleet = make(GridMap(3, 5), [7, 5])
     fleet.silent = {"Robot1"}
     fleet.run(lambda: robot(fleet).state is RobotState.SILENT)
@@ -172,7 +172,7 @@ def test_a_silent_robot_keeps_its_cells_and_the_others_drive_around(make: Any) -
     fleet.run(lambda: robot(fleet).state is RobotState.IDLE)
 
 
-def test_a_robot_that_falls_silent_under_way_goes_on_when_it_is_back(make: Any) -> None:
+def test_silent_robot_continues_after_its_return(make: Any) -> None:
     fleet = make(GridMap(), [0], [63])
     fleet.silent = {"Robot1"}
     fleet.run(lambda: robot(fleet).state is RobotState.SILENT)
@@ -187,7 +187,7 @@ def test_a_new_robot_on_the_way_is_driven_around(make: Any) -> None:
     assert robot(fleet, 2).cell == 14
 
 
-def test_a_robot_in_a_blocked_cell_says_why_it_cannot_join(make_fleet: Any) -> None:
+def test_robot_in_a_blocked_cell_reports_why_it_cannot_join(make_fleet: Any) -> None:
     fleet = make_fleet(FleetPlanner(GridMap()), [], 1, loss=0.0)
     fleet.ask(CellBlocked(9))
     fleet.blocked = set()
@@ -207,7 +207,7 @@ def test_a_restarted_planner_takes_over_where_robots_are(make: Any) -> None:
     fleet.run(fleet.all_arrived)
 
 
-def test_a_restarted_move_client_is_given_cells_anew(make: Any) -> None:
+def test_restarted_move_client_gets_its_cells_again(make: Any) -> None:
     fleet = make(GridMap(), [0], [63])
     for _ in range(30):
         fleet.step()
@@ -234,7 +234,7 @@ def test_a_robot_without_its_goal_stays(make: Any) -> None:
     assert robot(fleet).cell not in (0, 63)
 
 
-def test_a_robot_that_left_its_path_is_stopped_and_placed_anew(make: Any) -> None:
+def test_robot_off_its_path_is_stopped_and_placed_again(make: Any) -> None:
     fleet = make(GridMap(), [0])
     fleet.run(lambda: fleet.clients["Robot1"].report.reached == 0)
     fleet.check = lambda: None  # The robot is where it must not be: that is the point.
@@ -269,7 +269,7 @@ def test_a_removed_robot_leaves_its_cells(make: Any) -> None:
         (RobotRemoved("Nobody"), "no robot Nobody"),
     ],
 )
-def test_what_makes_no_sense_is_refused_with_words(make: Any, event: Any, words: str) -> None:
+def test_invalid_request_is_refused_with_a_reason(make: Any, event: Any, words: str) -> None:
     fleet = make(GridMap(blocked=frozenset({10})), [0, 1])
     fleet.ask(CellBlocked(12))
     fleet.ask(GoalSet("Robot2", 63))
@@ -280,17 +280,17 @@ def test_what_makes_no_sense_is_refused_with_words(make: Any, event: Any, words:
     assert fleet.planner.snapshot() == before
 
 
-def test_freeing_a_free_cell_is_no_fault(make: Any) -> None:
+def test_freeing_a_free_cell_succeeds(make: Any) -> None:
     assert make(GridMap(), [0]).ask(CellFreed(5)).ok
 
 
-def test_poses_that_are_no_numbers_are_ignored() -> None:
+def test_pose_that_is_not_a_number_is_ignored() -> None:
     planner = FleetPlanner(GridMap())
     assert planner.handle(PoseSeen("Robot1", float("nan"), 0.0, 0.0), 0.0) == []
     assert planner.snapshot().robots == ()
 
 
-def test_lists_are_said_again_until_the_client_has_them() -> None:
+def test_cell_list_is_sent_again_until_acknowledged() -> None:
     planner = FleetPlanner(GridMap(), first_revision=40)
     assert SendCells("R", 41, ()) in planner.handle(PoseSeen("R", 0.5, 0.5, 0.0), 0.0)
     assert SendCells("R", 41, ()) not in planner.handle(Tick(), 0.5)
@@ -300,7 +300,7 @@ def test_lists_are_said_again_until_the_client_has_them() -> None:
     assert not [done for done in planner.handle(Tick(), 2.5) if isinstance(done, SendCells)]
 
 
-def test_the_life_cycle_refuses_what_is_not_in_its_table() -> None:
+def test_transition_outside_the_table_is_refused() -> None:
     for phase in Phase:
         for cause in Cause:
             record = RobotRecord("R", 0, phase=phase)

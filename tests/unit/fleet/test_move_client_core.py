@@ -45,7 +45,7 @@ def reach(client: MoveClient, goal: SendGoal, now: float = 11.0) -> list[Any]:
     return client.take_result(goal.id, GoalState.SUCCEEDED, now)
 
 
-def test_the_first_cell_is_driven_to_by_itself_then_straight_on(client: MoveClient) -> None:
+def test_first_cell_is_its_own_goal_then_straight_runs(client: MoveClient) -> None:
     goal = goal_of(client.take_cells(1, [0, 1, 2, 10, 18], 10.0))
     assert goal.cell == 0
     goal = goal_of(reach(client, goal))
@@ -158,7 +158,7 @@ def test_a_lost_cancellation_is_sent_again(client: MoveClient) -> None:
     assert client.tick(10.5 + REPEAT_AFTER) == [SendStop(10.5 + REPEAT_AFTER)]
 
 
-def test_a_goal_that_the_robot_never_got_is_over_after_a_while(client: MoveClient) -> None:
+def test_goal_that_the_robot_never_received_times_out(client: MoveClient) -> None:
     client.take_cells(1, [0, 1], 10.0)
     client.cancel(10.5)
     client.take_goal_states({}, 10.6)
@@ -167,7 +167,7 @@ def test_a_goal_that_the_robot_never_got_is_over_after_a_while(client: MoveClien
     assert client.report.state is ClientState.IDLE
 
 
-def test_a_goal_of_an_earlier_life_is_waited_for() -> None:
+def test_goal_from_before_a_restart_is_waited_for() -> None:
     client = MoveClient(GridMap(), "Robot1", 0.0)
     assert client.take_goal_states({}, 5.0) == [SendStop(5.0)]
     client.take_goal_states({"old": GoalState.ACTIVE}, 5.5)
@@ -185,7 +185,7 @@ def test_a_robot_that_gives_up_is_reported_and_can_be_sent_again(client: MoveCli
 
 
 @pytest.mark.parametrize("cells", [[0, 2], [0, 64], [-1], [7, 8]])
-def test_lists_that_are_no_path_are_refused(client: MoveClient, cells: list[int]) -> None:
+def test_cell_list_that_is_not_a_path_is_refused(client: MoveClient, cells: list[int]) -> None:
     before = client.report
     with pytest.raises(ValueError, match="no path"):
         client.take_cells(1, cells, 10.0)

@@ -276,7 +276,7 @@ def test_a_robot_that_finds_a_box_stops_and_says_where() -> None:
 # World
 
 
-def test_time_goes_on_in_whole_steps() -> None:
+def test_time_advances_in_whole_steps() -> None:
     world = World(GridMap())
     robot = world.add_robot("R", 0)
     robot.drive(Twist(1.0, 0.0))
@@ -318,14 +318,14 @@ def test_a_robot_that_drives_into_a_box_touches_it() -> None:
     assert world.collisions.robot_box == 1
 
 
-def test_no_box_is_put_onto_a_robot() -> None:
+def test_box_in_a_robots_cell_is_refused() -> None:
     world = World(GridMap())
     world.add_robot("R", 27)
-    with pytest.raises(OccupiedError, match="R is in its way"):
+    with pytest.raises(OccupiedError, match="robot R is in the way"):
         world.add_box(27)
     with pytest.raises(OccupiedError):
         world.add_robot("S", 27)
-    with pytest.raises(ValueError, match="R already"):
+    with pytest.raises(ValueError, match="R exists already"):
         world.add_robot("R", 3)
     with pytest.raises(ValueError, match="not on the map"):
         world.add_box(64)

@@ -132,7 +132,7 @@ class SimulatedFleet:
 
 
 @pytest.mark.parametrize(("robots", "seed"), [(1, 0), (3, 1), (8, 2), (8, 3)])
-def test_nobody_touches_anything_on_the_way_to_the_goals(robots: int, seed: int) -> None:
+def test_robots_reach_goals_without_collisions(robots: int, seed: int) -> None:
     check_run(SimulatedFleet(make_scenario(GridMap(), robots, seed=seed), seed))
 
 

@@ -8,7 +8,7 @@ from rce.config.client import loads
 from rce.config.documents import write_items
 from rce.protocol.messages import ConfigureComponents, RemoveNode
 from rce_fleet.station.desired import Desired, DesiredCell, DesiredGoal
-from rce_fleet.station.respawn import repairs
+from rce_fleet.station.node_restarts import node_requests
 from rce_fleet.wiring import fleet_config
 
 CONFIG = loads(write_items(fleet_config()))
@@ -25,7 +25,7 @@ def state(
     }
 
 
-def test_a_planner_that_knows_everything_is_told_nothing() -> None:
+def test_complete_planner_state_needs_no_requests() -> None:
     desired = Desired()
     desired.set_goal("a", 5)
     desired.set_cell(7, blocked=True)
@@ -33,7 +33,7 @@ def test_a_planner_that_knows_everything_is_told_nothing() -> None:
     assert desired.unmet(state(("a", 5), blocked=(7,), pending=(8,))) == []
 
 
-def test_a_planner_that_forgot_is_told_cells_first() -> None:
+def test_missing_cells_are_sent_before_goals() -> None:
     desired = Desired()
     desired.set_goal("a", 5)
     desired.set_cell(7, blocked=True)
@@ -48,20 +48,20 @@ def test_a_cell_that_was_freed_is_freed_again() -> None:
     assert desired.unmet(state()) == []
 
 
-def test_walls_are_left_alone() -> None:
+def test_walls_are_not_sent() -> None:
     desired = Desired()
     desired.set_cell(0, blocked=False)
     assert desired.unmet(state()) == []
 
 
-def test_goals_of_others_and_robots_that_are_not_there_are_left_alone() -> None:
+def test_other_goals_and_absent_robots_are_left_out() -> None:
     desired = Desired()
     desired.set_goal("a", 5)
     assert desired.unmet(state(("a", 9))) == []
     assert desired.unmet(state()) == []
 
 
-def test_a_goal_that_was_taken_back_is_forgotten() -> None:
+def test_removed_goal_is_not_sent_again() -> None:
     desired = Desired()
     desired.set_goal("a", 5)
     desired.set_goal("a", None)
@@ -75,19 +75,19 @@ def engine(state: str, *nodes: tuple[str, str]) -> dict[str, Any]:
 
 def test_a_running_node_needs_nothing() -> None:
     for status in ("running", "starting", "stopping", "unknown"):
-        assert repairs(CONFIG, engine("running", ("fleetPlanner", status))) == []
+        assert node_requests(CONFIG, engine("running", ("fleetPlanner", status))) == []
 
 
 def test_a_node_that_failed_is_removed_and_then_added() -> None:
-    (request,) = repairs(CONFIG, engine("running", ("fleetPlanner", "failed")))
+    (request,) = node_requests(CONFIG, engine("running", ("fleetPlanner", "failed")))
     assert isinstance(request, ConfigureComponents)
     assert request.remove_nodes == (RemoveNode(container_tag="cTag_fleet", node_tag="fleetPlanner"),)
-    (request,) = repairs(CONFIG, engine("running"))
+    (request,) = node_requests(CONFIG, engine("running"))
     assert isinstance(request, ConfigureComponents)
     assert [node.node_tag for node in request.add_nodes] == ["fleetPlanner"]
 
 
-def test_a_container_that_does_not_run_is_left_to_the_engine() -> None:
-    assert repairs(CONFIG, engine("starting")) == []
-    assert repairs(CONFIG, engine("failed", ("fleetPlanner", "failed"))) == []
-    assert repairs(CONFIG, {"error": "the master cannot be reached"}) == []
+def test_container_that_does_not_run_gets_no_requests() -> None:
+    assert node_requests(CONFIG, engine("starting")) == []
+    assert node_requests(CONFIG, engine("failed", ("fleetPlanner", "failed"))) == []
+    assert node_requests(CONFIG, {"error": "the master cannot be reached"}) == []

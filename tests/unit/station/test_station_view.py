@@ -35,7 +35,7 @@ def pose(x: float, y: float, yaw: float) -> dict[str, Any]:
     return {"pose": {"pose": {"position": {"x": x, "y": y, "z": 0.0}, "orientation": orientation}}}
 
 
-def test_knows_nothing_before_the_planner_has_spoken() -> None:
+def test_view_is_empty_before_the_first_state() -> None:
     view = FleetView()
     assert (view.map(), view.robots(), view.blocked(), view.pending()) == (None, [], [], [])
 
@@ -55,7 +55,7 @@ def test_reads_heading_of_a_quaternion(yaw: float) -> None:
     assert view.robots()[0]["pose"] == pytest.approx({"x": 1.0, "y": 2.0, "theta": yaw})
 
 
-def test_forgets_the_pose_of_a_robot_that_is_gone() -> None:
+def test_pose_of_an_absent_robot_is_dropped() -> None:
     view = FleetView()
     view.on_state(state(robot("Robot1"), robot("Robot2")))
     view.on_pose("Robot1", pose(0, 0, 0))

@@ -1,4 +1,4 @@
-"""The world's connection to the engine: cells that the planner blocks come through its container."""
+"""Watches the planner's blocked cells through the engine."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 OWN_TAG = "blockedCells"
 JOIN_TIMEOUT = 3.0
-"""Seconds after which the interface is asked for again."""
+"""Seconds after which the interface is requested again."""
 LOOK_EVERY = 1.0
-"""Seconds between two looks whether it is still joined."""
+"""Seconds between two checks of the connection."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,14 +36,14 @@ class WorldAccount:
     robot: str = "world"
 
 
-class BlockWatch:
-    """Hears the planner's blocked cells, for as long as it runs.
+class EngineCellWatch:
+    """Watches the planner's blocked cells through an interface of its container.
 
-    The planner's container may come later than the world, or go and come back: the wire is asked for until
-    it is there, and again when it is gone.
+    The planner's container may start later than the world, or be restarted: the interface is requested until
+    it is connected, and again when it is lost.
 
     Args:
-        account: Whose fleet it is, and where.
+        account: User and engine of the fleet.
         container: Tag of the planner's container.
     """
 
@@ -51,16 +51,16 @@ class BlockWatch:
         self._account = account
         self._container = container
         self.joined = asyncio.Event()
-        """Set once the wire was there."""
+        """Set once the interface was connected."""
 
     async def run(self, follow: Callable[[list[int]], None]) -> None:
-        """Watch until cancelled, then take back the interface.
+        """Watch until cancelled, then remove the interface.
 
         Args:
-            follow: Called with all cells that are blocked now, whenever they change.
+            follow: Called with all blocked cells whenever they change.
 
         Raises:
-            RefusedError: The engine does not take this client.
+            RefusedError: The engine refused the client.
         """
         account = self._account
 

@@ -1,4 +1,4 @@
-"""Starts the operator's nodes again when they ended: a fleet without its planner stands still. Pure."""
+"""Restarts the operator's nodes when they end: a fleet without its planner stands still. Pure."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ _ENDED = frozenset({"failed", "exited"})
 _UP = frozenset({"running", "degraded"})
 
 
-def repairs(config: ClientConfig, engine: dict[str, Any]) -> list[Request]:
-    """What is to be asked of the engine so that all nodes of ``config`` run.
+def node_requests(config: ClientConfig, engine: dict[str, Any]) -> list[Request]:
+    """Return the requests to the engine that make all nodes of ``config`` run.
 
-    A node that ended is removed; once the engine has forgotten it, it is added again.
+    A node that ended is removed first; once the engine does not report it any more, it is added again.
 
     Args:
-        config: The operator's configuration.
-        engine: The engine's state, as :class:`~rce_fleet.station.engine_watch.EngineWatch` says it.
+        config: The operator's config.
+        engine: The engine's state, as :class:`~rce_fleet.station.engine_watch.EngineWatch` reports it.
     """
     requests: list[Request] = []
     for container in engine.get("containers", ()):

@@ -1,4 +1,4 @@
-"""The station's way to the planner in the planner's own ROS graph, without the engine."""
+"""The station's client of a planner in a ROS graph, without the engine."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from rce_fleet.station.fleet_link import (
     SET_GOAL,
     STATE,
     STATE_TOPIC,
-    Ask,
-    Listener,
+    Call,
+    PlannerClient,
+    PlannerListener,
     PlannerUnavailableError,
-    PlannerWire,
     pose_topic,
 )
 
 NODE = "operator_station"
 
 
-class RosWire(PlannerWire):
-    """A node beside the planner.
+class RosPlannerClient(PlannerClient):
+    """A node in the planner's graph.
 
     Args:
-        master_uri: The ROS master of the planner's graph, which need not be up yet.
+        master_uri: The ROS master of the planner's graph, which may start later.
         types: Where message types come from.
     """
 
@@ -42,8 +42,8 @@ class RosWire(PlannerWire):
         )
         self._heard = asyncio.Event()
 
-    async def run(self, listener: Listener, ready: Callable[[], Awaitable[None]]) -> None:
-        """Be part of the graph, and keep taking what comes until cancelled."""
+    async def run(self, listener: PlannerListener, ready: Callable[[], Awaitable[None]]) -> None:
+        """Join the graph and receive messages until cancelled."""
 
         def take_state(message: Message) -> None:
             listener.take_state(plain(message))
@@ -51,21 +51,21 @@ class RosWire(PlannerWire):
 
         async with self._node as node:
             for service in (SET_GOAL, BLOCK_CELL):
-                self._asks[service] = _asking(node.service_client(service.name, service.cls))
+                self._calls[service] = _caller(node.service_client(service.name, service.type_name))
             await node.subscribe(STATE_TOPIC, STATE, take_state)
             await self._heard.wait()
             await ready()
             while True:
                 await self._follow(listener, await self._new_robots.get())
 
-    async def _follow(self, listener: Listener, robot: str) -> None:
+    async def _follow(self, listener: PlannerListener, robot: str) -> None:
         await self._node.subscribe(
             pose_topic(robot), POSE, lambda message: listener.take_pose(robot, plain(message))
         )
 
 
-def _asking(client: ServiceClient) -> Ask:
-    async def ask(request: dict[str, Any]) -> dict[str, Any]:
+def _caller(client: ServiceClient) -> Call:
+    async def call(request: dict[str, Any]) -> dict[str, Any]:
         try:
             return plain(await client(request, timeout=CALL_TIMEOUT_S))
         except ServiceError as error:
@@ -73,11 +73,11 @@ def _asking(client: ServiceClient) -> Ask:
         except RosError as error:
             raise PlannerUnavailableError(f"the planner's ROS graph cannot be reached: {error}") from error
 
-    return ask
+    return call
 
 
 def plain(message: Message) -> dict[str, Any]:
-    """A message as dictionaries and lists; times are texts that differ when the times do."""
+    """Return a message as dictionaries and lists; times become strings."""
     names: tuple[str, ...] = message.__class__.__slots__
     return {name: _plain(getattr(message, name)) for name in names}
 

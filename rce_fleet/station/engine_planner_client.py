@@ -1,4 +1,4 @@
-"""The station's way to the planner through the engine."""
+"""The station's client of a planner that runs in the engine."""
 
 from __future__ import annotations
 
@@ -19,37 +19,37 @@ from rce_fleet.station.fleet_link import (
     SET_GOAL,
     STATE,
     STATE_TOPIC,
-    Ask,
-    Listener,
+    Call,
+    PlannerClient,
+    PlannerListener,
     PlannerUnavailableError,
-    PlannerWire,
     pose_topic,
 )
-from rce_fleet.station.respawn import repairs
+from rce_fleet.station.node_restarts import node_requests
 
 _SERVICES = (("setGoal", SET_GOAL), ("blockCell", BLOCK_CELL))
 
 
-class EngineWire(PlannerWire):
-    """A connection to the fleet's container. Starts the container's nodes again when they ended.
+class EnginePlannerClient(PlannerClient):
+    """Connects to the planner's container, and restarts its nodes when they end.
 
     Args:
-        config: The operator's configuration; its first container is the planner's.
+        config: The operator's config; its first container is the planner's.
         tls: Gives the TLS settings for each connection; the system's if None.
     """
 
     def __init__(self, config: ClientConfig, tls: Context | None = None) -> None:
         if not config.containers:
-            raise ValueError("containers: the fleet's configuration names no container for the planner")
+            raise ValueError("containers: empty; the operator's config must have a container for the planner")
         super().__init__("the planner's container is not ready yet")
         self._config = config
         self._tls = tls
         self._container = config.containers[0].tag
-        self._repairs: asyncio.Queue[Request] = asyncio.Queue()
-        self._listener: Listener
+        self._node_requests: asyncio.Queue[Request] = asyncio.Queue()
+        self._listener: PlannerListener
 
-    async def run(self, listener: Listener, ready: Callable[[], Awaitable[None]]) -> None:
-        """Make the planner's container, wire it, and keep taking what comes until cancelled."""
+    async def run(self, listener: PlannerListener, ready: Callable[[], Awaitable[None]]) -> None:
+        """Create the planner's container, connect to it, and receive messages until cancelled."""
         self._listener = listener
         config = self._config
         async with Connection(
@@ -68,21 +68,21 @@ class EngineWire(PlannerWire):
                 await ready()
                 async with asyncio.TaskGroup() as group:
                     group.create_task(self._follow_robots(connection))
-                    group.create_task(self._repair(connection))
+                    group.create_task(self._restart_nodes(connection))
             finally:
                 await connection.remove_all()
 
     def on_engine(self, state: dict[str, Any]) -> None:
-        """Take the engine's state; nodes that ended are started again."""
-        for request in repairs(self._config, state):
-            self._repairs.put_nowait(request)
+        """Handle a state of the engine: restart nodes that ended."""
+        for request in node_requests(self._config, state):
+            self._node_requests.put_nowait(request)
 
     async def _join_planner(self, connection: Connection) -> None:
         await connection.subscriber("fleetState", STATE, self._listener.take_state)
         await self._join(connection, "fleetState", "SubscriberInterface", STATE, STATE_TOPIC)
         for tag, service in _SERVICES:
-            self._asks[service] = _asking(await connection.service_client(tag, service.cls))
-            await self._join(connection, tag, "ServiceClientInterface", service.cls, service.name)
+            self._calls[service] = _caller(await connection.service_client(tag, service.type_name))
+            await self._join(connection, tag, "ServiceClientInterface", service.type_name, service.name)
         for tag in ("fleetState", *(tag for tag, _ in _SERVICES)):
             await connection.wait_active(tag)
 
@@ -90,29 +90,31 @@ class EngineWire(PlannerWire):
         while True:
             await self._follow(connection, await self._new_robots.get())
 
-    async def _repair(self, connection: Connection) -> None:
+    async def _restart_nodes(self, connection: Connection) -> None:
         while True:
-            await connection.request(await self._repairs.get())
+            await connection.request(await self._node_requests.get())
 
     async def _follow(self, connection: Connection, robot: str) -> None:
-        """Wire a robot's pose to the station."""
+        """Subscribe to a robot's pose."""
         tag, listener = f"pose{robot}", self._listener
         await connection.subscriber(tag, POSE, lambda message: listener.take_pose(robot, message))
         await self._join(connection, tag, "SubscriberInterface", POSE, pose_topic(robot))
 
-    async def _join(self, connection: Connection, tag: str, kind: str, cls: str, address: str) -> None:
-        await connection.add_interface(self._container, tag, kind, cls, addr=address)
+    async def _join(
+        self, connection: Connection, tag: str, interface_type: str, type_name: str, address: str
+    ) -> None:
+        await connection.add_interface(self._container, tag, interface_type, type_name, addr=address)
         await connection.connect(f"{connection.robot_id}/{tag}", f"{self._container}/{tag}")
 
     def _on_state(self, state: State, words: str) -> None:
         if state is State.LOST:
             self._listener.take_event(f"connection to the engine lost: {words}", "bad")
         elif state is State.RESTORED:
-            self._listener.take_event("connection to the engine is back", "good")
+            self._listener.take_event("connection to the engine restored", "good")
 
 
-def _asking(client: ServiceClient[dict[str, Any]]) -> Ask:
-    async def ask(request: dict[str, Any]) -> dict[str, Any]:
+def _caller(client: ServiceClient[dict[str, Any]]) -> Call:
+    async def call(request: dict[str, Any]) -> dict[str, Any]:
         try:
             return await client(request, timeout=CALL_TIMEOUT_S)
         except CallError as error:
@@ -120,4 +122,4 @@ def _asking(client: ServiceClient[dict[str, Any]]) -> Ask:
         except ClientError as error:
             raise PlannerUnavailableError(f"the engine cannot be reached: {error}") from error
 
-    return ask
+    return call
