@@ -8,8 +8,8 @@ three groups of connections:
 * robot - planner: poses, and cells that the robot found blocked;
 * own container - planner: granted cells, cancellations and the map; back, the move client's reports.
 
-This module made ``fleet.config`` and ``robot1.config`` to ``robot3.config`` in ``configs``. ``robot1-long.config``
-is the same as ``robot1.config`` without bridges, with the paper's names.
+This module made ``fleet.config`` and ``robot1.config`` to ``robot3.config`` in ``configs``.
+``robot1-long.config`` is the same as ``robot1.config`` without bridges, with the paper's names.
 """
 
 from __future__ import annotations
