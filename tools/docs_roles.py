@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 PAGES = Path(__file__).resolve().parent.parent / "docs" / "reference"
 _SHOWN = re.compile(r"^::: ([\w.]+)$", re.MULTILINE)
 _ROLE = re.compile(r":(?:attr|class|exc|func|meth|mod):`~?([\w.]+)`")
-_LITERAL = re.compile(r"^(.*?)\s*::$(?=\n\n )", re.MULTILINE)
+_LITERAL = re.compile(r"^(.*?) *::$(?=\n\n )", re.MULTILINE)
 
 
 class Roles(griffe.Extension):

@@ -29,9 +29,11 @@ class Base:
 
 
 class Engine(Base):
-    """Runs after :meth:`run` until :meth:`stop`, told by :class:`~things.Hidden`. Like this::
+    """Runs after :meth:`run` until :meth:`stop`, told by :class:`~things.Hidden`.
 
-            engine.run()
+    Like this::
+
+        engine.run()
     """
 
     def run(self):
@@ -72,4 +74,4 @@ def test_what_no_page_shows_is_a_name(things: griffe.Module) -> None:
 
 def test_literal_blocks_lose_their_colons(things: griffe.Module) -> None:
     assert "Like this:\n\n    engine.run()" in said(things["Engine"])
-    assert said(things) == "The module.\n\n\n\n    a tree"
+    assert said(things).split("\n") == ["The module.", "", "", "", "    a tree"]
