@@ -180,7 +180,7 @@ async def test_who_has_a_robot_id_is_told_to_its_user(processes: int) -> None:
             await bridge.stop()
 
 
-async def test_interfaces_of_one_endpoint_and_a_topic_in_both_directions() -> None:
+async def test_interfaces_of_one_endpoint_connect_both_ways() -> None:
     """As in the original engine: a robot with itself, a container with itself, and no echo of a bridge."""
     async with (
         running_engine() as engine,

@@ -92,7 +92,8 @@ async def echoes(conn: Connection, ends: tuple[Publisher[Any], asyncio.Queue[Any
                     return
 
 
-async def test_containers_find_their_machine_are_resized_and_handed_over() -> None:
+async def test_containers_are_placed_resized_handed_over() -> None:
+    """Containers find their machine are resized and handed over."""
     async with (
         running_engine() as engine,
         machine(engine, "m1", "--label", "gpu", "--slots", 2),

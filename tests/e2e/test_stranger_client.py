@@ -58,7 +58,7 @@ async def test_faults_are_told_and_nothing_else_is_lost() -> None:
         await check_echo(client, "still here")
 
 
-async def test_serialized_echo_in_one_frame_beside_a_client_that_knows_two() -> None:
+async def test_echo_in_one_frame_beside_two_frame_client() -> None:
     """Both are connected to one container's topics; a client that did not ask sees nothing new."""
     text = struct.pack("<I", 5) + b"hello"
     topics = (("say", "Publisher", "/stringEchoReq"), ("hear", "Subscriber", "/stringEchoResp"))

@@ -369,7 +369,7 @@ async def test_certificate_for_another_name_is_refused(world: World) -> None:
 
 @in_world
 @pytest.mark.parametrize("certificate", ["none", "stranger's"])
-async def test_task_set_without_certificate_of_the_authority_is_refused(
+async def test_task_set_without_certificate_is_refused(
     world: World, tmp_path: Path, certificate: str
 ) -> None:
     """Although it knows the secret: the handshake ends before it can show one."""
@@ -422,7 +422,7 @@ def bring(of: CertificateFolder, own: CertificateFolder, **options: float) -> No
         (revoked, "our certificate was revoked"),
     ],
 )
-async def test_refused_task_set_says_what_is_wrong_with_its_certificate(
+async def test_refused_task_set_names_its_certificates_fault(
     world: World, tmp_path: Path, make: Callable[[World, CertificateFolder], None], words: str
 ) -> None:
     """At its own side, where the operator of that machine looks."""

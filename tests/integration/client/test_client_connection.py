@@ -53,7 +53,8 @@ async def test_publisher_and_subscriber(engine: Engine) -> None:
         assert received == ["one", "two"]
 
 
-async def test_a_program_that_is_started_again_gets_the_latched_message(engine: Engine) -> None:
+async def test_restarted_program_gets_the_latched_message(engine: Engine) -> None:
+    """A program that is started again gets the latched message."""
     async with engine.connection() as conn:
         await conn.subscriber("hear", STRING)
         await conn.wait_active("hear", 10)

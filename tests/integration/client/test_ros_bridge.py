@@ -103,9 +103,8 @@ def write(folder: Path, data: Any) -> str:
     return str(path)
 
 
-async def test_messages_and_calls_pass_both_ways_and_everything_is_removed(
-    engine: Engine, tmp_path: Path
-) -> None:
+async def test_messages_and_calls_pass_both_ways(engine: Engine, tmp_path: Path) -> None:
+    """Messages and calls pass both ways and everything is removed."""
     path = write(tmp_path, config(engine.door.url))
     async with Core(host="127.0.0.1", port=0) as core, program(path, master=core.uri) as bridge:
         assert "rce-ros ready: robot testRobot connected" in await bridge.until("ready")
@@ -174,9 +173,8 @@ async def test_a_refusal_ends_the_program(engine: Engine, tmp_path: Path) -> Non
         assert "Wrong user or password" in "".join(bridge.lines)
 
 
-async def test_a_bad_file_is_refused_with_every_fault_and_nothing_is_sent(
-    engine: Engine, tmp_path: Path
-) -> None:
+async def test_bad_file_is_refused_with_every_fault(engine: Engine, tmp_path: Path) -> None:
+    """A bad file is refused with every fault and nothing is sent."""
     data = config(engine.door.url)
     for number in (1, 2):
         data["interfaces"][number] |= {"iCls": f"no_such/Type{number}"}

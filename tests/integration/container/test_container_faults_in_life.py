@@ -196,7 +196,8 @@ async def test_a_manager_may_die_while_it_cleans(stage: Stage, monkeypatch: pyte
         await until(lambda: not machine.containers, what=lambda: machine.containers)
 
 
-async def test_nodes_and_their_fork_server_may_die_while_a_container_is_resized(stage: Stage) -> None:
+async def test_nodes_and_fork_server_may_die_during_resize(stage: Stage) -> None:
+    """Nodes and their fork server may die while a container is resized."""
     machine = stage.machine
     async with machine.engine(interrupt_timeout=0.2, terminate_timeout=0.2):
         await stage.reach("resizing")

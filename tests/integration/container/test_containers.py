@@ -232,7 +232,8 @@ async def test_without_a_manager_a_container_ends_itself(machine: Machine) -> No
     await until(lambda: not machine.left(), timeout=40, what=machine.left)
 
 
-async def test_an_environment_that_dies_without_a_manager_leaves_nothing(machine: Machine) -> None:
+async def test_environment_dying_unmanaged_leaves_nothing(machine: Machine) -> None:
+    """An environment that dies without a manager leaves nothing."""
     async with machine.managed(grace=1.0):
         await machine.put(BOX, nodes=(own("daemon.py"),))
         await machine.log_holds(BOX, "node", "daemon")

@@ -26,7 +26,8 @@ def vanish(traces: Traces) -> None:
         time.sleep(0.01)
 
 
-def test_processes_are_found_by_name_and_by_descent_and_remembered(folder: Path) -> None:
+def test_processes_are_found_by_name_and_descent(folder: Path) -> None:
+    """Processes are found by name and by descent and remembered."""
     traces = Traces(folder, "box_of_leaks")
     child = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {SLEEP!r}])"
     with (

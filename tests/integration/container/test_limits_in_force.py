@@ -187,7 +187,8 @@ async def test_no_cgroup_is_left_by_a_container_that_ended(packages: Machine) ->
     assert not machine.cell_parents()
 
 
-async def test_the_next_manager_removes_the_cgroups_of_all_that_was_killed(packages: Machine) -> None:
+async def test_next_manager_removes_cgroups_of_the_killed(packages: Machine) -> None:
+    """The next manager removes the cgroups of all that was killed."""
     machine = packages
     async with machine.managed():
         await machine.put(BOX, nodes=(NodeSpec(tag="talk", pkg="own", exe="talk.py"),))
@@ -215,7 +216,8 @@ async def test_the_next_manager_keeps_the_limits_of_what_it_adopts(packages: Mac
         assert died.detail.startswith("out of memory")
 
 
-async def test_cells_of_which_nothing_else_is_left_are_swept_with_their_processes(folder: Path) -> None:
+async def test_orphaned_cgroups_are_swept_with_processes(folder: Path) -> None:
+    """Cells of which nothing else is left are swept with their processes."""
     with StateFolder(folder / "state", folder / "run") as state:
         limiter = choose_limiter(state.token, state.cgroups)
         limiter.sweep(())
@@ -229,7 +231,8 @@ async def test_cells_of_which_nothing_else_is_left_are_swept_with_their_processe
         assert not machine.control_groups()
 
 
-async def test_nodes_die_before_their_environment_and_both_before_the_engine(packages: Machine) -> None:
+async def test_memory_kills_nodes_before_environment_and_engine(packages: Machine) -> None:
+    """Nodes die before their environment and both before the engine."""
     machine = packages
     async with machine.engine():
         await machine.put(BOX, nodes=(NodeSpec(tag="talk", pkg="own", exe="talk.py"),))

@@ -124,7 +124,8 @@ async def test_a_node_that_crashes_is_restarted_up_to_its_limit(machine: Machine
         assert machine.node(BOX, "node").restarts == 0
 
 
-async def test_nodes_start_one_after_the_other_and_say_what_they_wait_for(machine: Machine) -> None:
+async def test_nodes_start_in_order_and_say_what_they_await(machine: Machine) -> None:
+    """Nodes start one after the other and say what they wait for."""
     async with machine.engine():
         await machine.put(
             BOX,
@@ -197,7 +198,8 @@ async def test_a_node_whose_heart_stops_is_restarted(machine: Machine) -> None:
         ]
 
 
-async def test_what_is_sent_when_st_is_true_is_heard_by_nodes_that_start_late(machine: Machine) -> None:
+async def test_established_connection_reaches_late_nodes(machine: Machine) -> None:
+    """What is sent when st is true is heard by nodes that start late."""
     interface = InterfaceSpec(
         tag="req", type="PublisherInterface", message_type="std_msgs/String", addr="late"
     )
@@ -295,9 +297,10 @@ async def test_logs_outlive_their_container(machine: Machine) -> None:
         machine.check_clean()
 
 
-async def test_logs_outlive_a_manager_that_is_killed_and_a_container_that_nobody_saw_end(
+async def test_logs_outlive_killed_manager_and_unseen_end(
     machine: Machine,
 ) -> None:
+    """Logs outlive a manager that is killed and a container that nobody saw end."""
     async with machine.managed(grace=0.5):
         await machine.put(BOX, nodes=(own("talk.py"),))
         await machine.log_holds(BOX, "node", "hello")

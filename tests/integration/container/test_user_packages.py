@@ -116,7 +116,8 @@ async def test_a_package_that_comes_late_holds_up_nothing_else(shop: Machine) ->
         assert "rce package push" in shop.faults[0]
 
 
-async def test_interfaces_wait_for_types_of_a_package_that_is_still_to_come(shop: Machine) -> None:
+async def test_interfaces_wait_for_types_of_coming_package(shop: Machine) -> None:
+    """Interfaces wait for types of a package that is still to come."""
     async with shop.engine():
         box = offer(shop, "Box", hold=True, nodes__run=SAY.format(text="here"))
         (shop.folder / "source" / "1.0" / "Box" / "srv").mkdir()

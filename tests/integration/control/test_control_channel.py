@@ -314,7 +314,8 @@ async def test_other_version_is_refused(caplog: pytest.LogCaptureFixture) -> Non
             assert "upgrade the older one" in refusal
 
 
-async def test_a_task_set_of_the_release_before_works_beside_newer_ones() -> None:
+async def test_older_task_set_works_beside_newer_ones() -> None:
+    """A task set of the release before works beside newer ones."""
     master = Master()
     async with master.server, TaskSet(master.server.port).running() as robots:
         await robots.channel.wait_connected()

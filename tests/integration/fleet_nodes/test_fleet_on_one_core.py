@@ -105,7 +105,8 @@ class Fleet:
         return sum(robot.state in states for robot in self.state.robots)
 
 
-async def test_three_robots_reach_their_goals_around_a_cell_blocked_midway() -> None:
+async def test_three_robots_drive_around_a_blocked_cell() -> None:
+    """Three robots reach their goals around a cell blocked midway."""
     seed = 6
     scenario = make_scenario(GridMap(), 3, seed=seed)
     async with Core(port=0) as core, AsyncExitStack() as stack:

@@ -216,7 +216,8 @@ async def test_events_are_followed_and_resumed(site: Site) -> None:
     assert [e["kind"] for e in await waiting] == ["container_destroyed"]
 
 
-async def test_a_user_does_not_see_what_one_of_the_same_name_did_before(site: Site) -> None:
+async def test_user_does_not_see_a_predecessors_records(site: Site) -> None:
+    """A user does not see what one of the same name did before."""
     anna = {"name": "anna", "password": "one"}
     await site.api("POST", "/users", anna, status=201)
     await site.api(

@@ -219,9 +219,10 @@ async def test_a_users_packages_have_limits(
         await until(lambda: not stored(tmp_path))
 
 
-async def test_a_restarted_master_has_what_it_had_and_clears_what_it_had_begun(
+async def test_restarted_master_keeps_state_clears_begun_work(
     run_site: RunSite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """A restarted master has what it had and clears what it had begun."""
     store = MemoryStore()
     async with run_site(store, state_dir=tmp_path / "master") as site:
         log_in(site, tmp_path, monkeypatch)

@@ -136,9 +136,10 @@ async def test_a_restarted_node_is_registered_anew(network: DiscoveryNetwork) ->
                     assert (await anext(aiter(heard))).data == word
 
 
-async def test_what_a_killed_synchronization_left_is_taken_back_by_the_next(
+async def test_next_synchronization_cleans_up_after_killed_one(
     network: DiscoveryNetwork,
 ) -> None:
+    """What a killed synchronization left is taken back by the next."""
     from rce.ros.multimaster.sync import MasterSync, SyncSettings
 
     async with network.machine() as b:

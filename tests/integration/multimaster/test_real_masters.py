@@ -93,9 +93,8 @@ async def _second(is_real: bool, folder: Path) -> AsyncIterator[str | None]:
 
 
 @pytest.mark.needs("rospy")
-async def test_rospy_listens_again_after_its_talker_was_lost_for_a_while(
-    network: DiscoveryNetwork, tmp_path: Path
-) -> None:
+async def test_rospy_listens_again_after_lost_talker(network: DiscoveryNetwork, tmp_path: Path) -> None:
+    """Rospy listens again after its talker was lost for a while."""
     async with (
         real_master(tmp_path) as real,
         network.machine(real, name="real") as far,

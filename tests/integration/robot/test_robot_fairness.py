@@ -83,7 +83,8 @@ async def test_many_small_frames_of_one_user_leave_room_for_another() -> None:
                 await (await good.ping())
 
 
-async def test_a_large_message_takes_a_process_that_ends_when_it_has_nothing_to_do() -> None:
+async def test_large_message_uses_a_process_that_ends_when_idle() -> None:
+    """A large message takes a process that ends when it has nothing to do."""
     async with running_cloud(PATIENT, conversion=ConversionSettings(idle=0.1)) as cloud:
         end = await cloud.wire("tag", "SubscriberConverter", STRING)
         async with dial(cloud, "testUser", "testRobot") as robot:

@@ -132,7 +132,7 @@ async def test_all_users_together_have_a_bound_too(robot_of: Any) -> None:
         assert "none" in (await robot_of(good).get("ER")), "what the other user sent first is still there"
 
 
-async def test_latched_messages_over_the_limit_are_given_up_oldest_first() -> None:
+async def test_latched_over_limit_are_dropped_oldest_first() -> None:
     """The robot is away; 60 latched topics bring 60 MB, of which its user may hold 20."""
     async with running_cloud(PATIENT, user_memory=20 * MIB) as cloud:
         ends = [await cloud.wire(f"map{number}", "PublisherForwarder", STRING) for number in range(60)]

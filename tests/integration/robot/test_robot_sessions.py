@@ -103,7 +103,8 @@ async def test_a_dead_connection_makes_room_for_the_robots_new_one(dial: Any) ->
             await dead.recv()
 
 
-async def test_a_dead_connection_is_ended_when_its_robot_comes_elsewhere(dial: Any) -> None:
+async def test_dead_connection_ends_when_robot_moves(dial: Any) -> None:
+    """A dead connection is ended when its robot comes elsewhere."""
     settings = SessionSettings(probe_timeout=0.2, drain_timeout=1.0)
     async with running_cloud(settings) as cloud, dial(cloud) as alive, dial(cloud, robot="other") as dead:
         dead.transport.pause_reading()

@@ -200,7 +200,8 @@ async def test_unknown_methods_are_faults(core: Core) -> None:
         assert "registerPublisher" in await rpc.call(core.uri, "system.listMethods", ())
 
 
-async def test_a_node_that_knows_nothing_of_a_subscription_is_left_alone(core: Core) -> None:
+async def test_node_without_subscription_is_left_alone(core: Core) -> None:
+    """A node that knows nothing of a subscription is left alone."""
     calls: list[str] = []
     answers = [1, -1]
 

@@ -67,7 +67,8 @@ async def test_a_latched_message_reaches_later_subscribers(make_node: MakeNode) 
         assert await asyncio.wait_for(received.get(), 10) == (b"\x03\0\0\0new", True)
 
 
-async def test_a_latched_message_reaches_a_second_subscriber_of_the_same_node(make_node: MakeNode) -> None:
+async def test_latched_message_reaches_second_subscriber_of_node(make_node: MakeNode) -> None:
+    """A latched message reaches a second subscriber of the same node."""
     async with make_node("a") as a, make_node("b") as b:
         publisher = await a.advertise("t", STRING, latch=True)
         publisher.publish(data="kept")
@@ -218,7 +219,8 @@ async def test_callbacks_are_called_in_order_and_may_fail(
         assert "as planned" in caplog.text
 
 
-async def test_a_subscriber_that_stops_reading_loses_its_own_oldest_messages(make_node: MakeNode) -> None:
+async def test_stalled_subscriber_loses_its_oldest_messages(make_node: MakeNode) -> None:
+    """A subscriber that stops reading loses its own oldest messages."""
     async with make_node("a") as a, make_node("quick") as quick, RpcClient() as rpc:
         publisher = await a.advertise("t", STRING, queue_size=3)
         good = await quick.subscribe("t", STRING)

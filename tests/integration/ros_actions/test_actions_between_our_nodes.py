@@ -189,7 +189,8 @@ async def test_a_simple_server_works_on_the_newest_goal(make_node: MakeNode) -> 
         assert [goal.request.order for goal in server.goals] == [2]
 
 
-async def test_goals_that_wait_at_a_simple_server_are_replaced_and_recalled(make_node: MakeNode) -> None:
+async def test_waiting_goals_are_replaced_and_recalled(make_node: MakeNode) -> None:
+    """Goals that wait at a simple server are replaced and recalled."""
     release = asyncio.Event()
 
     async def slow(goal: ServerGoal) -> dict[str, Any]:

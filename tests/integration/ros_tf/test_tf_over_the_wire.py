@@ -62,7 +62,8 @@ async def test_what_is_told_is_heard(make_node: MakeNode) -> None:
         assert abs(now.stamp.to_sec() - Time.now().to_sec()) < 60
 
 
-async def test_static_transforms_are_there_for_later_listeners_all_of_them(make_node: MakeNode) -> None:
+async def test_late_listeners_get_all_static_transforms(make_node: MakeNode) -> None:
+    """Static transforms are there for later listeners all of them."""
     async with (
         make_node("robot") as robot,
         make_node("planner") as planner,
@@ -147,9 +148,8 @@ async def test_bad_transforms_do_not_get_far(make_node: MakeNode, caplog: pytest
             assert set(listener.buffer.frames) == {"map", "good"}
 
 
-async def test_a_simulation_that_begins_anew_begins_with_an_empty_buffer(
-    core: Core, make_node: MakeNode
-) -> None:
+async def test_restarted_simulation_has_an_empty_buffer(core: Core, make_node: MakeNode) -> None:
+    """A simulation that begins anew begins with an empty buffer."""
     core.set_param("/use_sim_time", value=True)
     async with make_node("robot") as robot, TransformBroadcaster(robot) as tf:
         clock = await robot.advertise("/clock", "rosgraph_msgs/Clock")

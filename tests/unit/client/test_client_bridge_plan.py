@@ -34,7 +34,8 @@ def test_converters_become_forwarders() -> None:
     ]
 
 
-def test_containers_come_first_and_own_interfaces_are_left_to_the_spans() -> None:
+def test_containers_first_own_interfaces_left_to_spans() -> None:
+    """Containers come first and own interfaces are left to the spans."""
     other = own("in", "PublisherInterface", "/in") | {"eTag": "c1"}
     read = config(
         own("a", "SubscriberConverter", "/a"),

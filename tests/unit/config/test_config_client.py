@@ -198,7 +198,8 @@ def test_unknown_key_gets_a_suggestion() -> None:
     ]
 
 
-def test_faults_of_items_and_of_their_relations_are_listed_together() -> None:
+def test_faults_of_items_and_relations_are_listed() -> None:
+    """Faults of items and of their relations are listed together."""
     data = good()
     data["url"] = ""
     data["containers"].append({"cTag": "cTag_01"})

@@ -136,7 +136,8 @@ def test_a_cell_with_a_process_is_not_removed(tree: Tree2, monkeypatch: pytest.M
     assert (tree.own / "rce-t0").is_dir()
 
 
-def test_the_next_manager_adopts_and_sweeps_wherever_it_is_started(tree: Tree2) -> None:
+def test_next_manager_adopts_and_sweeps_from_anywhere(tree: Tree2) -> None:
+    """The next manager adopts and sweeps wherever it is started."""
     first = limiter(tree)
     first.sweep(())
     for incarnation_id in ("m1", "m2"):
@@ -218,9 +219,8 @@ def test_a_cgroup_without_controllers_is_refused(
     assert "no controllers" in chosen.detail
 
 
-def test_a_machine_with_all_controllers_in_the_first_version_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_machine_with_cgroup1_controllers_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine with all controllers in the first version says so."""
     tree = Tree2(tmp_path, monkeypatch, controllers="", own="user.slice", of_root="hugetlb")
     with pytest.raises(LimitsUnavailableError, match="all controllers belong to version 1"):
         limiter(tree)
@@ -255,6 +255,7 @@ def test_the_root_needs_no_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert int(text(tree.root / "rce-t0", "cpu.weight")) == min(10_000, 400 * (os.cpu_count() or 1))
 
 
-def test_fractions_of_a_period_are_at_least_what_the_kernel_takes(tree: Tree2) -> None:
+def test_cpu_quota_is_at_least_the_kernels_minimum(tree: Tree2) -> None:
+    """Fractions of a period are at least what the kernel takes."""
     limiter(tree).create("m1", Limits(cpu=0.001))
     assert ControlGroupV2([tree.own / "rce-t0" / "m1"]).limits.cpu == 0.01

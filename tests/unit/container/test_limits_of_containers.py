@@ -53,7 +53,8 @@ def test_without_cgroups_each_process_limits_itself() -> None:
     assert control_group.limits.memory == 64 * MB
 
 
-def test_an_adopted_container_without_cgroups_has_the_limits_that_are_desired() -> None:
+def test_adopted_container_gets_desired_limits_sans_cgroup() -> None:
+    """An adopted container without cgroups has the limits that are desired."""
     control_group = RlimitLimiter().adopt("m")
     control_group.apply(Limits(0.0, 64 * MB, 32, 100))
     assert control_group.limits.memory == 64 * MB
@@ -130,7 +131,8 @@ def test_a_claim_in_the_meantime_is_not_told_twice(control_group: PaperCell) -> 
     assert enforcer.review() == []
 
 
-def test_memory_of_the_machine_is_told_from_that_of_the_container(control_group: PaperCell) -> None:
+def test_memory_of_machine_and_container_differ(control_group: PaperCell) -> None:
+    """Memory of the machine is told from that of the container."""
     control_group.peak = 10 * MB
     enforcer = LimitEnforcer("box", control_group, SETTINGS)
     control_group.struck = Troubles(oom_kills=3)

@@ -86,7 +86,8 @@ def test_nobody_reads_what_is_another_ones(archive: LogArchive) -> None:
     assert read(archive, id_="bob/box", since=1.0)
 
 
-def test_what_still_ends_of_a_user_who_was_removed_is_not_another_ones(archive: LogArchive) -> None:
+def test_ending_parts_of_removed_user_stay_theirs(archive: LogArchive) -> None:
+    """What still ends of a user who was removed is not another ones."""
     live(archive, "one")
     assert read(archive, living="one", since=1.0)
     for query in ({}, {"incarnation": "one"}):
@@ -127,7 +128,8 @@ def test_the_oldest_go_when_there_is_too_much(archive: LogArchive) -> None:
     assert archive.find("alive") is not None, "what lives does not count"
 
 
-def test_a_container_that_dies_again_and_again_does_not_fill_the_archive(archive: LogArchive) -> None:
+def test_dying_container_does_not_fill_the_archive(archive: LogArchive) -> None:
+    """A container that dies again and again does not fill the archive."""
     for number in range(MAX_INCARNATIONS + 5):
         live(archive, f"m{number}")
         archive.end(BOX, f"m{number}", "", 10.0 + number)

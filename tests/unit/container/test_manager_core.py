@@ -78,7 +78,8 @@ def test_put_while_it_stops_starts_it_anew_and_never_says_gone() -> None:
     assert out == [events.Start(ID)]
 
 
-def test_an_unexpected_end_is_told_and_mended_with_growing_pauses() -> None:
+def test_unexpected_end_is_repaired_with_growing_pauses() -> None:
+    """An unexpected end is told and mended with growing pauses."""
     manager = running()
     pauses = []
     faults = []

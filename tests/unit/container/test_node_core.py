@@ -205,7 +205,8 @@ def test_a_node_that_ran_well_counts_anew() -> None:
     assert world.status().state is NodeState.FAILED
 
 
-def test_what_cannot_be_started_is_not_tried_again_if_that_would_not_help() -> None:
+def test_unstartable_node_is_not_retried_in_vain() -> None:
+    """What cannot be started is not tried again if that would not help."""
     world = World(spec(restart=RestartPolicy.ALWAYS))
     world.refuse()
     assert world.status().state is NodeState.FAILED
@@ -227,7 +228,8 @@ def test_a_changed_node_is_ended_and_started_anew() -> None:
     assert world.launched == ["a", "a"]
 
 
-def test_a_change_that_is_taken_back_while_it_ends_still_starts_it_anew() -> None:
+def test_change_taken_back_while_ending_restarts_node() -> None:
+    """A change that is taken back while it ends still starts it anew."""
     world = World(spec())
     world.desire(spec(args="new"))
     world.desire(spec())
@@ -328,7 +330,8 @@ def test_an_impossible_order_is_told_once_and_can_be_mended(specs: list[NodeSpec
     assert "a" in world.launched
 
 
-def test_nodes_end_in_the_reverse_of_their_order_and_together_where_there_is_none() -> None:
+def test_nodes_end_in_reverse_order() -> None:
+    """Nodes end in the reverse of their order and together where there is none."""
     world = World(spec("a"), spec("b", after=("a",)), spec("c", after=("a",)), spec("d", after=("b", "c")))
     for tag in "abcd":
         world.register(tag)
@@ -597,7 +600,8 @@ def test_the_limit_of_restarts_is_never_exceeded(steps: list[str], limit: int) -
             break
 
 
-def test_a_node_that_lacks_its_package_waits_and_one_that_runs_is_left_alone() -> None:
+def test_node_without_package_waits_running_one_stays() -> None:
+    """A node that lacks its package waits and one that runs is left alone."""
     world = World()
     world.do(e.Lack({"a": "waits for its package nav 1.0"}))
     world.desire(spec("a"), spec("b"), spec("c", after=("a",)))

@@ -202,9 +202,10 @@ def rosout(tmp_path: Path, log: NodeLog) -> Rosout:
     return Rosout(tmp_path, log)
 
 
-def test_records_go_to_their_nodes_and_to_one_log_like_ros_has_it(
+def test_records_go_to_node_logs_and_rosout_log(
     tmp_path: Path, rosout: Rosout, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """Records go to their nodes and to one log like ros has it."""
     rosout.log.take(payload("/known", "hello"))
     rosout.log.take(payload("/another", "hi"))
     rosout.log.take(b"nonsense")

@@ -84,7 +84,8 @@ def test_what_is_not_named_does_not_exist(program: bytes) -> None:
     assert run(program, unheard_of) == INVISIBLE
 
 
-def test_threads_and_processes_are_allowed_and_namespaces_are_not(program: bytes) -> None:
+def test_threads_are_allowed_namespaces_are_not(program: bytes) -> None:
+    """Threads and processes are allowed and namespaces are not."""
     assert verdict(program, "clone", THREAD) == ALLOW
     assert verdict(program, "unshare", 0x400) == ALLOW
     for kind in (*Namespaces, 0x80):

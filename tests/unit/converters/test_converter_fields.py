@@ -85,7 +85,8 @@ def test_every_field_type_comes_back_as_it_went(value: Any) -> None:
 
 
 @given(OBJECTS)
-def test_values_survive_json_text_with_base64_in_place_of_binary_values(value: Any) -> None:
+def test_values_survive_json_with_base64_binaries(value: Any) -> None:
+    """Values survive json text with base64 in place of binary values."""
     codec = CONVERTERS.of(EVERYTHING)
     payload, _ = codec.decode(value)
     assert codec.decode(msgspec.json.decode(msgspec.json.encode(value)))[0] == payload
@@ -110,7 +111,8 @@ JSON_VALUES = st.recursive(
 
 
 @given(st.data(), JSON_VALUES)
-def test_a_strange_value_in_any_field_is_taken_or_refused_by_name(data: Any, strange: Any) -> None:
+def test_strange_value_is_taken_or_refused_by_name(data: Any, strange: Any) -> None:
+    """A strange value in any field is taken or refused by name."""
     field = data.draw(st.sampled_from(EVERYTHING.fields))
     codec = CONVERTERS.of(EVERYTHING)
     try:
@@ -199,7 +201,8 @@ def test_what_does_not_fit_is_refused_by_the_name_of_its_field(name: str, value:
         converter(name).decode(value)
 
 
-def test_fixed_octets_are_taken_in_three_forms_of_the_right_length() -> None:
+def test_fixed_octets_are_taken_in_three_forms() -> None:
+    """Fixed octets are taken in three forms of the right length."""
     codec = CONVERTERS.of(TYPES.from_definition("mine/Id", "uint8[4] id\nchar[] more\n"))
     for form in (b"abcd", memoryview(b"abcd"), "YWJjZA==", [97, 98, 99, 100]):
         assert codec.decode({"id": form, "more": form})[0] == b"abcd\x04\0\0\0abcd"

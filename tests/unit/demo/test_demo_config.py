@@ -47,7 +47,8 @@ def test_only_the_demos_own_nodes_are_counted() -> None:
     }
 
 
-def test_received_messages_are_summed_over_topics_and_connections() -> None:
+def test_received_counts_sum_topics_and_connections() -> None:
+    """Received messages are summed over topics and connections."""
     pose = ["/Robot1/amcl_pose", [[1, 999, 7, -1, True], [2, 999, 5, -1, True]]]
     answer = [1, "bus stats", [[["/map", 10, [[9, 10, 1, True]]]], [pose, ["/map", []]], []]]
     assert received(answer) == 12

@@ -54,7 +54,8 @@ def test_grants_are_limited_to_the_given_number() -> None:
     assert not ledger.grant("a", 2)
 
 
-def test_overlapped_cells_are_claimed_until_the_robot_has_arrived() -> None:
+def test_overlapped_cells_are_claimed_until_arrival() -> None:
+    """Overlapped cells are claimed until the robot has arrived."""
     ledger = ledger_of(a=0, b=2)
     ledger.place("a", 0, {0, 1})
     adopt(ledger, {"b": [(0, 2), (1, 1)]})

@@ -66,7 +66,8 @@ def test_a_longer_list_moves_the_goal_ahead_while_driving(client: MoveClient) ->
     assert goal_of(reach(client, farther)).cell == 12
 
 
-def test_a_list_that_begins_with_the_target_does_not_slow_the_robot_down(client: MoveClient) -> None:
+def test_list_from_target_on_does_not_slow_robot(client: MoveClient) -> None:
+    """A list that begins with the target does not slow the robot down."""
     reach(client, goal_of(client.take_cells(1, [0, 1, 2], 10.0)))
     assert cells_sent(client.take_cells(2, [2, 3, 4], 12.0)) == [4]
 
@@ -123,7 +124,8 @@ def test_an_empty_list_is_a_cancellation(client: MoveClient) -> None:
     assert client.report.revision == 2
 
 
-def test_a_list_that_comes_while_stopping_waits_until_the_robot_stands(client: MoveClient) -> None:
+def test_list_while_stopping_waits_for_standstill(client: MoveClient) -> None:
+    """A list that comes while stopping waits until the robot stands."""
     goal = goal_of(client.take_cells(1, [0, 1], 10.0))
     client.cancel(10.5)
     assert cells_sent(client.take_cells(2, [8, 9], 10.6)) == []

@@ -199,7 +199,8 @@ async def test_local_carrier_ends_at_broken_rules() -> None:
     assert len(a.lost) == 1
 
 
-async def test_requests_are_held_until_they_are_answered_and_given_up_oldest_first() -> None:
+async def test_unanswered_requests_are_dropped_oldest_first() -> None:
+    """Requests are held until they are answered and given up oldest first."""
     release = asyncio.Event()
 
     async def serve(payload: bytes) -> bytes:

@@ -56,7 +56,7 @@ def drain(lanes: Lanes) -> list[tuple[FrameType, int, int]]:
 # Queues
 
 
-def test_a_full_queue_keeps_the_last_latched_message_of_each_source() -> None:
+def test_full_queue_keeps_last_latched_of_each_source() -> None:
     """The newest of every source, and the newest list of sources, leave in order; the rest makes room."""
     queue = topic(max_messages=3)
     for source, text in ((1, b"old"), (2, b"of 2"), (0, b"a"), (1, b"of 1"), (0, b"b"), (3, b"of 3")):

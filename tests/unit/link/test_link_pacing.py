@@ -114,7 +114,8 @@ def test_small_messages_go_ahead_of_bulk_at_once() -> None:
         pacer.spend(4_096, urgent=True)
 
 
-def test_flood_of_small_messages_is_limited_and_leaves_half_to_bulk() -> None:
+def test_flood_of_small_messages_leaves_half_to_bulk() -> None:
+    """Flood of small messages is limited and leaves half to bulk."""
     clock = Clock()
     pacer = clock.pacer(RATE)
     bulk, flood = Sender(pacer, pacer.part), Sender(pacer, 500, urgent=True)

@@ -70,9 +70,10 @@ def test_who_waits_is_told_at_once_and_again_when_there_is_room(world: World) ->
     assert [notice.text for notice in changes.notices] == ["container 'b' has a machine now: m"]
 
 
-def test_those_that_wait_are_served_in_order_and_a_small_one_passes_only_one_that_fits_nowhere(
+def test_waiting_are_served_in_order_unless_unplaceable(
     world: World,
 ) -> None:
+    """Those that wait are served in order and a small one passes only one that fits nowhere."""
     world.container_set("c1", slots=4)
     world.container("full", size=4)
     world.container("big", size=3, wait=True)
@@ -117,7 +118,8 @@ def test_the_same_again_is_not_counted_twice(world: World) -> None:
         world.container(size=2)
 
 
-def test_a_container_made_again_at_a_full_machine_waits_for_its_former_self_only(world: World) -> None:
+def test_remade_container_waits_only_for_its_predecessor(world: World) -> None:
+    """A container made again at a full machine waits for its former self only."""
     world.container_set("c1", slots=1)
     world.container()
     world.do(commands.DestroyContainer(user="anna", tag="c"))
@@ -127,7 +129,8 @@ def test_a_container_made_again_at_a_full_machine_waits_for_its_former_self_only
     assert world.phase() == "placed"
 
 
-def test_a_container_that_a_machine_cannot_hold_is_not_taken_back(world: World) -> None:
+def test_oversized_container_is_not_taken_back(world: World) -> None:
+    """A container that a machine cannot hold is not taken back."""
     world.container_set("c1", slots=2)
     world.container()
     world.run()
@@ -142,7 +145,8 @@ def test_a_container_that_a_machine_cannot_hold_is_not_taken_back(world: World) 
 # What one user may ask for
 
 
-def test_a_users_containers_have_limits_and_an_administrators_have_none() -> None:
+def test_users_have_limits_administrators_have_none() -> None:
+    """A users containers have limits and an administrators have none."""
     world = World(StateSettings(max_slots=3, max_cpu=1.5, max_memory=100 * MB))
     world.user("root", UserRole.ADMIN)
     world.container("a", size=2, cpu=1.0, memory=64 * MB)
@@ -259,7 +263,8 @@ def test_shrinking_makes_room_for_those_that_wait(world: World) -> None:
     assert world.phase("next") == "placed"
 
 
-def test_a_client_that_comes_back_may_ask_for_the_size_before_or_after(world: World) -> None:
+def test_returning_client_may_ask_for_either_size(world: World) -> None:
+    """A client that comes back may ask for the size before or after."""
     world.container(cpu=1.0)
     resize(world, cpu=0.5)
     world.container(cpu=1.0)

@@ -116,7 +116,8 @@ def test_a_draining_machine_takes_nothing_new(two: World) -> None:
         drain(two, "m3")
 
 
-def test_what_has_room_nowhere_stays_and_the_operator_is_told_once(two: World) -> None:
+def test_unplaceable_container_stays_operator_told_once(two: World) -> None:
+    """What has room nowhere stays and the operator is told once."""
     two.container("large", size=4)
     assert at(two, "large") == "c2"
     changes = drain(two)
@@ -172,7 +173,8 @@ def test_a_container_that_is_destroyed_takes_its_copy_along(two: World) -> None:
     assert {(w.process, w.id) for w in changes.withdrawals} == {("c1", "anna/c"), ("c2", "anna/c")}
 
 
-def test_a_machine_that_is_shut_down_meanwhile_leaves_what_moves_to_its_copy(two: World) -> None:
+def test_machine_shut_down_midway_leaves_the_copy(two: World) -> None:
+    """A machine that is shut down meanwhile leaves what moves to its copy."""
     drain(two)
     two.do(commands.EndpointGone(process="c1", id="anna/c"))
     assert (at(two, "c"), two.phase("c")) == ("c2", "placed")

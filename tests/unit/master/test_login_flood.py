@@ -75,7 +75,7 @@ async def door() -> AsyncIterator[Door]:
     made.auth.close()
 
 
-async def test_a_flood_from_one_address_holds_up_another_by_its_own_checks_only(door: Door) -> None:
+async def test_flood_delays_other_address_by_own_checks_only(door: Door) -> None:
     """Whoever is known comes in without a turn; who is not has the next one, though the queue is full."""
     await door.auth.verify("zoe", RIGHT, "home")
     door.hasher.go.clear()
@@ -106,7 +106,8 @@ async def test_many_addresses_share_what_there_is(door: Door) -> None:
     assert door.hasher.verified.index(RIGHT) <= begun + CROWDS + HASH_WORKERS
 
 
-async def test_wrong_passwords_that_wait_together_are_counted_all_the_same(door: Door) -> None:
+async def test_wrong_passwords_checked_together_are_counted(door: Door) -> None:
+    """Wrong passwords that wait together are counted all the same."""
     door.hasher.go.clear()
     async with asyncio.TaskGroup() as group:
         for number in range(20):
@@ -118,9 +119,7 @@ async def test_wrong_passwords_that_wait_together_are_counted_all_the_same(door:
 
 
 @pytest.mark.parametrize("names", ["unknown", "zoe"])
-async def test_a_flood_from_the_same_address_holds_up_a_first_login_by_few_checks(
-    door: Door, names: str
-) -> None:
+async def test_flood_delays_first_login_by_few_checks(door: Door, names: str) -> None:
     """A fleet and its attacker behind one router: the queue is full of guesses, and of nothing else."""
     door.hasher.go.clear()
     async with asyncio.TaskGroup() as group:

@@ -92,7 +92,8 @@ async def test_of_a_container_that_is_gone_the_last_life_counts() -> None:
         await Cloud(a=Machine()).read()
 
 
-async def test_an_earlier_life_is_looked_for_where_the_container_is_and_then_elsewhere() -> None:
+async def test_earlier_log_is_searched_here_then_elsewhere() -> None:
+    """An earlier life is looked for where the container is and then elsewhere."""
     cloud = Cloud(at="a", a=Machine("here", ended=5.0), b=Machine("there", ended=9.0))
     assert await cloud.read("removed", PREVIOUS) == "here"
     cloud.machines["a"].text = ""

@@ -81,7 +81,8 @@ def test_a_conversion_that_was_interrupted_is_done_again() -> None:
     assert [one.tag for one in state.spec("anna/rob").interfaces] == ["out"]
 
 
-async def test_the_store_of_an_earlier_release_is_converted_when_it_is_opened() -> None:
+async def test_earlier_store_is_converted_when_opened() -> None:
+    """The store of an earlier release is converted when it is opened."""
     store = MemoryStore()
     store.tables = {name: dict(rows) for name, rows in ROWS.items()}
     service = await StateService.open(store)

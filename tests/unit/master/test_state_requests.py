@@ -116,7 +116,8 @@ def test_two_interfaces_of_one_endpoint_are_connected(world: World) -> None:
     assert [link.peer for link in world.spec("c").links if link.peer == spec.id] == []
 
 
-def test_a_service_of_an_endpoint_for_itself_takes_one_connection(world: World) -> None:
+def test_own_service_takes_one_connection(world: World) -> None:
+    """A service of an endpoint for itself takes one connection."""
     world.wired()
     for name in ("a_ask", "z_ask"):
         world.interface(f"c/{name}", "ServiceProviderInterface", cls="std_srvs/Empty")
@@ -146,7 +147,8 @@ def test_disconnecting_what_is_not_connected_is_told(world: World) -> None:
         world.do(commands.Disconnect(user="anna", tag_a="rob/out", tag_b="c/other"))
 
 
-def test_removing_an_interface_removes_its_connections_at_both_ends(world: World) -> None:
+def test_removing_interface_removes_connections_both_ends(world: World) -> None:
+    """Removing an interface removes its connections at both ends."""
     world.wired()
     changes = world.do(commands.RemoveInterface(user="anna", endpoint="rob", tag="out"))
     assert set(changes.touched) == {"anna/rob", "anna/c"}
@@ -252,7 +254,8 @@ def test_one_link_for_all_connections_of_two_endpoints(world: World) -> None:
     assert (mine.links[0].peer, theirs.links[0].peer) == ("anna/c", "anna/rob")
 
 
-def test_the_robot_dials_the_container_and_the_smaller_id_its_equal(world: World) -> None:
+def test_robot_dials_container_smaller_id_dials_equal(world: World) -> None:
+    """The robot dials the container and the smaller id its equal."""
     world.wired()
     world.run()
     world.login("abel")

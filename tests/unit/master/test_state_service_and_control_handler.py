@@ -341,7 +341,8 @@ async def test_a_robot_that_is_connected_elsewhere_is_looked_after(cloud: Cloud)
     assert (await second.login()).status == 200
 
 
-async def test_a_robot_that_leaves_while_it_logs_in_is_not_connected_for_ever(cloud: Cloud) -> None:
+async def test_robot_leaving_during_login_is_disconnected(cloud: Cloud) -> None:
+    """A robot that leaves while it logs in is not connected for ever."""
     robots = cloud.robots()
     await robots.hello()
     await robots.say(Login(request=1, user="anna", robot="rob", password=PASSWORD))
@@ -432,7 +433,8 @@ async def test_a_task_set_that_left_hears_nothing_until_it_is_back(cloud: Cloud)
     assert cloud.state_service.tables.is_connected("c1"), "the former channel's end is not a loss"
 
 
-async def test_a_container_made_again_is_put_when_its_former_self_is_gone(cloud: Cloud) -> None:
+async def test_remade_container_is_put_after_its_predecessor(cloud: Cloud) -> None:
+    """A container made again is put when its former self is gone."""
     robots, containers = cloud.robots(), cloud.containers()
     await robots.hello()
     await containers.hello()

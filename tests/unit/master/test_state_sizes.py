@@ -32,7 +32,8 @@ def size(world: World, container: str = "c") -> int:
     return found.size
 
 
-def test_an_endpoint_holds_so_much_and_room_that_is_freed_can_be_used_again(world: World) -> None:
+def test_freed_room_of_endpoint_can_be_used_again(world: World) -> None:
+    """An endpoint holds so much and room that is freed can be used again."""
     put(world, "a")
     put(world, "b")
     with pytest.raises(LimitReachedError, match="'c' would hold more than 100000 bytes"):

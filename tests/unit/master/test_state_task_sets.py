@@ -53,7 +53,8 @@ def test_lifecycles_refuse_what_cannot_happen() -> None:
 # Placement
 
 
-def test_a_container_waits_for_a_machine_and_its_user_is_told_once(world: World) -> None:
+def test_waiting_container_tells_its_user_once(world: World) -> None:
+    """A container waits for a machine and its user is told once."""
     world.container()
     assert world.phase() == "requested"
     assert world.tick(9).notices == []
@@ -88,7 +89,8 @@ def test_features_and_memory_are_respected(world: World) -> None:
     assert [world.phase(tag) for tag in ("gpu", "bigger")] == ["placed", "placed"]
 
 
-def test_a_container_made_again_waits_until_its_former_self_is_gone(world: World) -> None:
+def test_remade_container_waits_for_its_predecessor(world: World) -> None:
+    """A container made again waits until its former self is gone."""
     world.wired()
     world.run()
     (drop,) = world.do(commands.DestroyContainer(user="anna", tag="c")).withdrawals
@@ -163,7 +165,8 @@ def test_faults_reach_the_user(world: World) -> None:
 # Robots
 
 
-def test_a_robot_is_kept_for_its_grace_time_and_finds_everything_again(world: World) -> None:
+def test_robot_within_grace_time_finds_everything(world: World) -> None:
+    """A robot is kept for its grace time and finds everything again."""
     world.wired()
     before = world.spec("rob")
     world.do(commands.RobotLeft(process="r1", id="anna/rob"))
@@ -280,7 +283,8 @@ def test_containers_of_a_machine_that_stays_away_move(world: World) -> None:
     assert world.state.tables.endpoints["anna/c"].task_set == "c2"
 
 
-def test_a_lost_container_is_bound_again_if_its_machine_comes_back_first(world: World) -> None:
+def test_lost_container_is_bound_to_returning_machine(world: World) -> None:
+    """A lost container is bound again if its machine comes back first."""
     world.wired()
     world.run()
     before = world.spec("c")
@@ -416,7 +420,8 @@ def test_nodes_that_start_again_are_events(world: World) -> None:
     assert kinds(stuck) == ["node_stuck"]
 
 
-def test_a_container_that_its_machine_ended_is_stopped_until_there_is_another(world: World) -> None:
+def test_container_ended_by_machine_waits_for_another(world: World) -> None:
+    """A container that its machine ended is stopped until there is another."""
     world.wired()
     world.do(commands.SetDraining(machine="c1", draining=True))
     world.do(commands.EndpointGone(process="c1", id="anna/c"))
@@ -425,7 +430,8 @@ def test_a_container_that_its_machine_ended_is_stopped_until_there_is_another(wo
     assert world.phase() == "placed"
 
 
-def test_a_container_of_the_same_name_that_ran_before_is_not_taken_for_this_one() -> None:
+def test_earlier_container_of_same_name_is_another_one() -> None:
+    """A container of the same name that ran before is not taken for this one."""
     world = World()
     world.container_set("c1")
     world.container("c")

@@ -21,7 +21,8 @@ def fail(throttle: FailureThrottle, count: int, address: str = "a", user: str = 
     return [throttle.admit(address, user, 0.0) for _ in range(count)]
 
 
-def test_failures_are_slowed_down_and_refused_only_when_that_takes_too_long() -> None:
+def test_failures_are_slowed_then_refused() -> None:
+    """Failures are slowed down and refused only when that takes too long."""
     throttle = FailureThrottle()
     assert fail(throttle, FREE + 1) == [0.0] * FREE + [PACE_S]
     for _ in range(3):

@@ -36,7 +36,8 @@ def test_a_whole_character_in_two_escapes_is_read_beside_a_nan() -> None:
     assert message.msg["b"] == "\U0001f600"
 
 
-def test_a_request_that_is_too_long_is_refused_and_a_data_message_is_not() -> None:
+def test_long_request_is_refused_long_data_is_not() -> None:
+    """A request that is too long is refused and a data message is not."""
     stream = ProtocolStream.for_engine(Limits(max_request=1000))
     item = {"containerTag": "c", "name": "p", "value": "x" * 1000}
     (fault,) = stream.feed(json.dumps({"type": "CN", "data": {"setParam": [item]}}), 0.0)

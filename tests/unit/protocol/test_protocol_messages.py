@@ -203,7 +203,8 @@ def test_wrong_message_is_refused_with_its_place(frame: str | bytes, problem: st
     assert str(caught.value).startswith(problem)
 
 
-def test_nesting_within_the_limit_is_fine_even_among_many_brackets() -> None:
+def test_nesting_within_limit_is_fine_among_brackets() -> None:
+    """Nesting within the limit is fine even among many brackets."""
     msg = {"deep": json.loads("[" * 61 + "]" * 61), "wide": [[] for _ in range(1000)]}
     assert decode(text("DM", {"iTag": "i", "type": "a/B", "msg": msg})) == m.DataMessage("i", "a/B", msg)
 

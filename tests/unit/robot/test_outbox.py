@@ -186,7 +186,8 @@ def test_a_latched_message_takes_the_place_of_the_one_before() -> None:
     assert outbox.dropped["map"] == 1
 
 
-def test_a_latched_message_that_is_kept_elsewhere_is_not_counted_twice() -> None:
+def test_latched_message_kept_elsewhere_counts_once() -> None:
+    """A latched message that is kept elsewhere is not counted twice."""
     outbox = Outbox()
     outbox.put_latched("map", "1", Outgoing(b"m" * 90), shared=True)
     assert outbox.bytes == 0

@@ -249,7 +249,8 @@ def test_a_forwarded_payload_is_not_copied() -> None:
     assert len(id_) == 32
 
 
-def test_the_last_latched_message_waits_for_a_robot_that_comes_back() -> None:
+def test_last_latched_message_waits_for_returning_robot() -> None:
+    """The last latched message waits for a robot that comes back."""
     setup = Setup("PublisherConverter")
     setup.interface.on_active(True)
     setup.interface.receive(ros_string("map"), latched=True)
@@ -347,7 +348,8 @@ async def test_a_large_message_is_converted_elsewhere_and_in_order() -> None:
     assert setup.port.sent[2:] == [ros_string("third")]
 
 
-async def test_a_large_message_that_is_wrong_is_told_and_harms_no_other() -> None:
+async def test_wrong_large_message_harms_no_other() -> None:
+    """A large message that is wrong is told and harms no other."""
     setup = Setup("SubscriberConverter")
     setup.interface.take_large(large('{"data":5}'))
     setup.interface.take_large(large("[" * 100 + "]" * 100))
@@ -361,7 +363,8 @@ async def test_a_large_message_that_is_wrong_is_told_and_harms_no_other() -> Non
     assert many.startswith("tag: a message of 200010 objects, lists and members is over the limit of 200000")
 
 
-async def test_a_large_message_that_refers_to_binary_values_waits_for_them() -> None:
+async def test_large_message_waits_for_its_binary_values() -> None:
+    """A large message that refers to binary values waits for them."""
     setup = Setup("SubscriberConverter", "sensor_msgs/CompressedImage")
     id_ = "ab" * 16
     message = large(f'{{"format":"jpeg","data*":"{id_}"}}', cls="sensor_msgs/CompressedImage")

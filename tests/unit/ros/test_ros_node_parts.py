@@ -21,7 +21,8 @@ async def test_defaults() -> None:
     assert (settings.host, settings.bind) == ("127.0.0.1", "127.0.0.1")
 
 
-def test_the_command_line_wins_over_the_program_and_the_environment() -> None:
+def test_command_line_wins_over_program_and_environment() -> None:
+    """The command line wins over the program and the environment."""
     environ = {"ROS_NAMESPACE": "env", "ROS_MASTER_URI": "http://10.0.0.9:1/", "ROS_IP": "10.0.0.2"}
     assert gather(environ=environ).resolver.node_name == "/env/node"
     assert gather(environ=environ, namespace="own").resolver.node_name == "/own/node"
@@ -41,7 +42,8 @@ def test_a_log_file_is_in_the_folder_of_logs() -> None:
     assert gather(("__log:=/elsewhere/a.log",), environ).log_file == Path("/elsewhere/a.log")
 
 
-def test_a_host_that_others_can_reach_is_served_on_all_interfaces() -> None:
+def test_reachable_host_is_served_on_all_interfaces() -> None:
+    """A host that others can reach is served on all interfaces."""
     settings = gather(environ={"ROS_HOSTNAME": "robot.local", "ROS_IP": "10.0.0.2"})
     assert settings.host == "robot.local"
     assert settings.bind == "0.0.0.0"

@@ -64,7 +64,8 @@ def test_a_cancellation_may_overtake_its_goal() -> None:
     assert states(ledger, 6.1) == {}
 
 
-def test_goals_older_than_a_cancellation_are_cancelled_when_they_come() -> None:
+def test_goals_older_than_cancellation_are_cancelled() -> None:
+    """Goals older than a cancellation are cancelled when they come."""
     ledger = GoalLedger()
     ledger.cancel(GoalId("", 5), 0)
     assert ledger.receive(GoalId("old", 5), 0) is Arrival.CANCELLED

@@ -63,7 +63,8 @@ def test_a_goal_cancelled_at_once_is_not_lost_by_an_older_list() -> None:
     assert goal.not_listed(0) == ()
 
 
-def test_a_goal_whose_result_is_on_the_way_may_be_missing_in_the_list() -> None:
+def test_goal_with_result_under_way_may_be_unlisted() -> None:
+    """A goal whose result is on the way may be missing in the list."""
     goal = tracker()
     goal.listed(GoalState.SUCCEEDED, "", 1)
     assert goal.not_listed(2) == ()

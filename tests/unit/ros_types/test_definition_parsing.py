@@ -65,7 +65,8 @@ def test_a_fault_is_told_with_file_and_line(line: str, part: str) -> None:
     assert part in str(caught.value)
 
 
-def test_a_service_is_a_request_and_a_response_with_lines_of_the_file() -> None:
+def test_service_errors_name_lines_of_the_file() -> None:
+    """A service is a request and a response with lines of the file."""
     request, response = parse_service("p/S", "int64 a\n  ---  \nint64 sum\n")
     assert [field.name for field in request.fields] == ["a"]
     assert [(field.name, field.line) for field in response.fields] == [("sum", 3)]

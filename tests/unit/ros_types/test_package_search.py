@@ -109,7 +109,8 @@ def test_loops_of_links_end_and_each_folder_is_searched_once(tmp_path: Path) -> 
     assert found["linked"].resolve() == real
 
 
-def test_what_changes_is_noticed_and_nothing_else_is_searched_again(tmp_path: Path) -> None:
+def test_only_changed_packages_are_searched_again(tmp_path: Path) -> None:
+    """What changes is noticed and nothing else is searched again."""
     a = package(tmp_path / "x" / "a")
     searched = tree(tmp_path)
     for _ in range(3):

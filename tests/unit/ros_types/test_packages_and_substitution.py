@@ -27,7 +27,8 @@ def make(folder: Path, manifest: str = "package.yaml", text: str = "", **files: 
     return folder
 
 
-def test_a_package_is_found_by_folder_by_itself_and_by_declared_name(tmp_path: Path) -> None:
+def test_package_is_found_by_folder_and_declared_name(tmp_path: Path) -> None:
+    """A package is found by folder by itself and by declared name."""
     one = make(tmp_path / "one", text="description: first\n")
     two = make(tmp_path / "folder", text="name: two\n")
     three = make(tmp_path / "three", "package.xml", "<package><name>three</name></package>")
@@ -112,7 +113,8 @@ def test_what_is_not_inside_the_package_is_refused(tmp_path: Path, exe: str) -> 
         PackageIndex([tmp_path]).find("pkg").executable(exe)
 
 
-def test_file_elsewhere_that_may_be_executed_goes_before_one_that_may_not(tmp_path: Path) -> None:
+def test_executable_elsewhere_wins_over_plain_file(tmp_path: Path) -> None:
+    """File elsewhere that may be executed goes before one that may not."""
     folder = make(tmp_path / "pkg", "package.xml", "<package><name>pkg</name></package>", nodes__n=0o644)
     file = folder / "test" / "tools" / "n"
     file.parent.mkdir(parents=True)
@@ -225,7 +227,8 @@ def test_a_bad_substitution_is_told(tmp_path: Path, text: str, part: str) -> Non
     assert part in str(caught.value)
 
 
-def test_arguments_are_split_as_a_shell_splits_and_values_stay_in_their_word(tmp_path: Path) -> None:
+def test_arguments_split_like_a_shell_values_stay_whole(tmp_path: Path) -> None:
+    """Arguments are split as a shell splits and values stay in their word."""
     folder = make(tmp_path / "pkg")
     words = split_arguments(
         """a "b c" 'd e' f\\ g $(env X) "$(find pkg)/m.yaml" x:=$(env X); ls""",
