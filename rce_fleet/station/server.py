@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable
+from functools import partial
 from pathlib import Path
 
 from aiohttp import WSCloseCode, WSMsgType, hdrs, web
@@ -12,8 +13,9 @@ from pydantic import BaseModel, ValidationError
 
 from rce.aio.tasks import cancel_and_wait
 from rce.web.bodies import read_whole
-from rce.web.openapi import PREFIX, Operation, build_document
+from rce.web.openapi import PREFIX, build_document
 from rce.web.origin import ServerNames
+from rce.web.routes import Route, RouteTable
 from rce_fleet.station.access import COOKIE, USER, AccessControl, problem, set_cookie, token_of
 from rce_fleet.station.api import (
     MAX_CELL,
@@ -49,6 +51,11 @@ _VIEW_ERRORS = (401, 403, 421, 503)
 _CONTROL_ERRORS = (*_VIEW_ERRORS, 400, 404, 408, 409, 413)
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+Method = Callable[["Station", web.Request], Awaitable[web.StreamResponse]]
+"""A handler as it is written in :class:`Station`."""
+
+ROUTES: RouteTable[Route[Method]] = RouteTable("fleet", Route)
+"""The API for an ERP and the page."""
 
 
 class Station:
@@ -80,10 +87,10 @@ class Station:
     def make_app(self) -> web.Application:
         """Build the application."""
         app = web.Application(middlewares=[_problems, self._access.check], client_max_size=MAX_BODY)
-        for known, handler in self._operations():
-            app.router.add_route(known.method, PREFIX + known.path, handler)
+        for route in ROUTES:
+            app.router.add_route(route.method, PREFIX + route.path, partial(route.handler, self))
         document = build_document(
-            [known for known, _ in self._operations()],
+            [route.operation for route in ROUTES],
             title="RCE operator station",
             description="Control a fleet of robots: set goals, block cells. Used by the page and by an ERP.",
             error=Problem,
@@ -100,98 +107,6 @@ class Station:
         app.router.add_static("/static", STATIC)
         return app
 
-    def _operations(self) -> list[tuple[Operation, Handler]]:
-        return [
-            (
-                Operation(
-                    name="get_fleet",
-                    method="GET",
-                    path="/fleet",
-                    summary="The whole fleet",
-                    group="fleet",
-                    reply=FleetModel,
-                    errors=_VIEW_ERRORS,
-                ),
-                self.get_fleet,
-            ),
-            (
-                Operation(
-                    name="log_in",
-                    method="POST",
-                    path="/login",
-                    summary="Log in as a user of the engine; the token comes as a cookie",
-                    group="login",
-                    body=LoginRequest,
-                    status=204,
-                    open=True,
-                    errors=(400, 401, 403, 404, 408, 413, 421, 429, 503),
-                ),
-                self.log_in,
-            ),
-            (
-                Operation(
-                    name="log_out",
-                    method="DELETE",
-                    path="/login",
-                    summary="Revoke the token of this request",
-                    group="login",
-                    status=204,
-                    errors=(403, 421),
-                ),
-                self.log_out,
-            ),
-            (
-                Operation(
-                    name="get_person",
-                    method="GET",
-                    path="/me",
-                    summary="The user of this request and their permissions",
-                    group="fleet",
-                    reply=UserModel,
-                    errors=_VIEW_ERRORS,
-                ),
-                self.get_user,
-            ),
-            (
-                Operation(
-                    name="get_robot",
-                    method="GET",
-                    path="/robots/{robot}",
-                    summary="One robot",
-                    group="fleet",
-                    reply=RobotModel,
-                    errors=(*_VIEW_ERRORS, 404),
-                ),
-                self.get_robot,
-            ),
-            (
-                Operation(
-                    name="put_goal",
-                    method="PUT",
-                    path="/robots/{robot}/goal",
-                    summary="Send a robot to a cell",
-                    group="fleet",
-                    body=GoalRequest,
-                    reply=Answer,
-                    errors=_CONTROL_ERRORS,
-                ),
-                self.put_goal,
-            ),
-            (
-                Operation(
-                    name="put_cell",
-                    method="PUT",
-                    path="/cells/{cell}",
-                    summary="Block or free a cell",
-                    group="fleet",
-                    body=CellRequest,
-                    reply=Answer,
-                    errors=_CONTROL_ERRORS,
-                ),
-                self.put_cell,
-            ),
-        ]
-
     # Handlers
 
     async def page(self, request: web.Request) -> web.StreamResponse:
@@ -204,6 +119,16 @@ class Station:
         del request
         return web.FileResponse(STATIC / "login.html", headers={hdrs.CACHE_CONTROL: "no-cache"})
 
+    @ROUTES.route(
+        "POST",
+        "/login",
+        "Log in as a user of the engine; the token comes as a cookie",
+        group="login",
+        body=LoginRequest,
+        status=204,
+        open=True,
+        errors=(400, 401, 403, 404, 408, 413, 421, 429, 503),
+    )
     async def log_in(self, request: web.Request) -> web.StreamResponse:
         """Check a password at the engine; the token goes into a cookie, never to the page."""
         login = LoginRequest.model_validate_json(await read_whole(request))
@@ -212,6 +137,9 @@ class Station:
         set_cookie(response, token, secure=request.secure)
         return response
 
+    @ROUTES.route(
+        "DELETE", "/login", "Revoke the token of this request", group="login", status=204, errors=(403, 421)
+    )
     async def log_out(self, request: web.Request) -> web.StreamResponse:
         """Revoke the request's token and delete the cookie."""
         await self._authenticator.log_out(token_of(request))
@@ -219,6 +147,14 @@ class Station:
         response.del_cookie(COOKIE)
         return response
 
+    @ROUTES.route(
+        "GET",
+        "/me",
+        "The user of this request and their permissions",
+        name="get_person",
+        reply=UserModel,
+        errors=_VIEW_ERRORS,
+    )
     async def get_user(self, request: web.Request) -> web.StreamResponse:
         """Return the user of the request."""
         user = request[USER]
@@ -231,6 +167,7 @@ class Station:
             )
         )
 
+    @ROUTES.route("GET", "/fleet", "The whole fleet", reply=FleetModel, errors=_VIEW_ERRORS)
     async def get_fleet(self, request: web.Request) -> web.StreamResponse:
         """Return the state of the fleet."""
         del request
@@ -244,6 +181,7 @@ class Station:
             )
         )
 
+    @ROUTES.route("GET", "/robots/{robot}", "One robot", reply=RobotModel, errors=(*_VIEW_ERRORS, 404))
     async def get_robot(self, request: web.Request) -> web.StreamResponse:
         """Return one robot."""
         wanted = request.match_info["robot"]
@@ -253,6 +191,14 @@ class Station:
         known = ", ".join(self._view.robot_ids()) or "none yet"
         return problem(404, f"robot {wanted!r} is unknown; known robots: {known}")
 
+    @ROUTES.route(
+        "PUT",
+        "/robots/{robot}/goal",
+        "Send a robot to a cell",
+        body=GoalRequest,
+        reply=Answer,
+        errors=_CONTROL_ERRORS,
+    )
     async def put_goal(self, request: web.Request) -> web.StreamResponse:
         """Send a robot to a cell."""
         robot = request.match_info["robot"]
@@ -264,6 +210,14 @@ class Station:
         self._access.audit(request, "set_goal", robot, "stop" if asked.cell is None else f"cell {asked.cell}")
         return _reply(Answer(message=message))
 
+    @ROUTES.route(
+        "PUT",
+        "/cells/{cell}",
+        "Block or free a cell",
+        body=CellRequest,
+        reply=Answer,
+        errors=_CONTROL_ERRORS,
+    )
     async def put_cell(self, request: web.Request) -> web.StreamResponse:
         """Block or free a cell."""
         number = request.match_info["cell"]

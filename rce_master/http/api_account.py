@@ -5,13 +5,13 @@ from __future__ import annotations
 from rce_master.auth import client_digest
 from rce_master.exceptions import ForbiddenError, InvalidRequestError, NotFoundError, WrongCredentialsError
 from rce_master.http import models
-from rce_master.http.routes import Call, RouteTable
+from rce_master.http.routes import Call, route_table
 from rce_master.http.views import Views
 from rce_master.state import commands
 from rce_master.state.records import User, UserRole
 from rce_master.tokens import new_token, token_digest
 
-routes = RouteTable("account")
+routes = route_table("account")
 
 
 @routes.route("POST", "/login", "Get a bearer token", body=models.LoginIn, reply=models.TokenOut, open=True)

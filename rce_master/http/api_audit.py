@@ -7,10 +7,10 @@ from msgspec.structs import asdict
 from rce.web.openapi import Query
 from rce_master.exceptions import ForbiddenError
 from rce_master.http import models
-from rce_master.http.routes import Call, RouteTable
+from rce_master.http.routes import Call, route_table
 from rce_master.state.records import UserRole
 
-routes = RouteTable("audit")
+routes = route_table("audit")
 
 MAX_RECORDS = 1000
 

@@ -9,9 +9,9 @@ from rce.web.openapi import Query
 from rce_master import requests
 from rce_master.exceptions import InvalidRequestError
 from rce_master.http import models
-from rce_master.http.routes import OF_USER, Call, RouteTable
+from rce_master.http.routes import OF_USER, Call, route_table
 
-routes = RouteTable("control")
+routes = route_table("control")
 
 _QUERY = (OF_USER,)
 _FAULT = re.compile(r"^([A-Z]{2}): data\.(?:\w+\[\d+\]\.|containerData\.)?(\w+)")

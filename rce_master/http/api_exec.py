@@ -13,14 +13,14 @@ from websockets.exceptions import ConnectionClosed
 from rce.aio.tasks import cancel_and_wait
 from rce.control.execution import MAX_COMMAND, NOT_RUN, ended_frame, read_command
 from rce_master.exceptions import InvalidRequestError, MasterError
-from rce_master.http.routes import OF_USER, Call, RouteTable
+from rce_master.http.routes import OF_USER, Call, route_table
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
 
     from rce.control.execution import Command
 
-routes = RouteTable("exec")
+routes = route_table("exec")
 
 FIRST_MESSAGE_S = 10.0
 HEARTBEAT_S = 15.0

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from rce_master.exceptions import ForbiddenError, NotFoundError
 from rce_master.http import models
-from rce_master.http.routes import Call, RouteTable
+from rce_master.http.routes import Call, route_table
 from rce_master.http.views import Views
 from rce_master.limit_values import read_limit
 from rce_master.state import commands, limits
 
-routes = RouteTable("account")
+routes = route_table("account")
 
 
 @routes.route(

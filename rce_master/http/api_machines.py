@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from rce_master.http import models
-from rce_master.http.routes import Call, RouteTable
+from rce_master.http.routes import Call, route_table
 from rce_master.http.views import Views
 from rce_master.state import commands
 
-routes = RouteTable("machines")
+routes = route_table("machines")
 
 
 @routes.route(

@@ -11,7 +11,7 @@ from rce.web.bodies import read_pieces
 from rce.web.openapi import Query
 from rce_master.exceptions import InvalidRequestError, NotFoundError
 from rce_master.http import package_models as models
-from rce_master.http.routes import OF_USER, Call, RouteTable
+from rce_master.http.routes import OF_USER, Call, route_table
 from rce_master.packages.service import PushRequest
 from rce_master.state import commands
 from rce_master.state.packages import find, uses
@@ -20,7 +20,7 @@ from rce_master.state.records import PackageKey, UserPackage, user_package_key
 if TYPE_CHECKING:
     from rce_master.state.tables import Tables
 
-routes = RouteTable("packages")
+routes = route_table("packages")
 
 _QUERY = (OF_USER,)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rce_master.http import models
-from rce_master.http.routes import OF_USER, Call, RouteTable
+from rce_master.http.routes import OF_USER, Call, route_table
 from rce_master.http.views import Views
 
 if TYPE_CHECKING:
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rce_master.state.records import Endpoint
     from rce_master.state.wiring_records import Link
 
-routes = RouteTable("fleet")
+routes = route_table("fleet")
 
 
 @routes.route("GET", "/robots", "List robots", reply=models.RobotsOut, query=(OF_USER,))

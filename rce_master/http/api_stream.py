@@ -16,9 +16,9 @@ from rce.web.openapi import Query
 from rce_master.events import Event
 from rce_master.exceptions import InvalidRequestError
 from rce_master.http import models
-from rce_master.http.routes import ENDED, OF_USER, Call, RouteTable
+from rce_master.http.routes import ENDED, OF_USER, Call, route_table
 
-routes = RouteTable("stream")
+routes = route_table("stream")
 
 MAX_LOG = 1 << 20
 HEARTBEAT_S = 15.0

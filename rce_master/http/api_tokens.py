@@ -5,12 +5,12 @@ from __future__ import annotations
 from rce.model.names import is_name
 from rce_master.exceptions import ForbiddenError, InvalidRequestError
 from rce_master.http import models
-from rce_master.http.routes import OF_USER, Call, RouteTable
+from rce_master.http.routes import OF_USER, Call, route_table
 from rce_master.state import commands
 from rce_master.state.records import METRICS_SCOPE, ROBOT_SCOPE, Token
 from rce_master.tokens import new_token, token_digest
 
-routes = RouteTable("tokens")
+routes = route_table("tokens")
 
 _DAY_S = 24 * 3600.0
 

@@ -6,11 +6,11 @@ from aiohttp import web
 
 from rce.web.openapi import Query
 from rce_master.exceptions import InvalidRequestError
-from rce_master.http.routes import ENDED, OF_USER, Call, RouteTable
+from rce_master.http.routes import ENDED, OF_USER, Call, route_table
 from rce_master.http.usage_models import UsageOut
 from rce_master.http.usage_views import UsageViews
 
-routes = RouteTable("usage")
+routes = route_table("usage")
 
 LEAST_INTERVAL_S, MOST_INTERVAL_S = 1, 3600
 

@@ -1,4 +1,4 @@
-"""A table of REST routes: each says what it takes and gives, so that server and document are made of one."""
+"""The routes of the REST API: who may use them, and what their handlers are given."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rce.guard.proxies import TrustedProxies
-from rce.web.openapi import Operation, Query
+from rce.web import routes
+from rce.web.openapi import Query
 from rce_master.exceptions import ForbiddenError, InvalidRequestError, NotFoundError, WrongCredentialsError
 from rce_master.state.records import UserRole
 
@@ -179,51 +180,21 @@ Handler = Callable[[Call], Awaitable["BaseModel | StreamResponse | None"]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Route:
-    """A method of a path."""
+class Route(routes.Route[Handler]):
+    """A method of a path, and who may use it."""
 
-    method: str
-    path: str
-    """Below ``/api/v1``, with ``{name}`` for its parts."""
-    handler: Handler
-    summary: str
-    group: str
-    body: type[BaseModel] | None = None
-    reply: type[BaseModel] | None = None
-    """None: no content, unless ``media`` says that the handler streams something."""
-    media: str = "application/json"
-    status: int = 200
     admin: bool = False
     everybody: bool = False
     """Whether who may only look may use it all the same."""
-    open: bool = False
-    """Whether it can be used without a token."""
     acts: bool = False
     """Whether it changes something though it is a GET."""
-    query: tuple[Query, ...] = ()
-    upload: str = ""
-    """Media type of a body that the handler reads itself."""
-    errors: tuple[int, ...] = ()
-    """Statuses beside those that follow from the rest."""
 
-    @property
-    def operation(self) -> Operation:
-        """What the OpenAPI document tells of it."""
-        return Operation(
-            name=getattr(self.handler, "__name__", self.summary),
-            method=self.method,
-            path=self.path,
-            summary=self.summary + (" (administrators only)" if self.admin else ""),
-            group=self.group,
-            body=self.body,
-            reply=self.reply,
-            media=self.media,
-            status=self.status,
-            open=self.open,
-            query=self.query,
-            upload=self.upload,
-            errors=tuple(set(self._errors())),
-        )
+    def told(self) -> dict[str, Any]:
+        """Say who may use it, and the errors that follow from what it takes."""
+        return {
+            "summary": self.summary + (" (administrators only)" if self.admin else ""),
+            "errors": tuple(set(self._errors())),
+        }
 
     def _errors(self) -> Iterator[int]:
         """The statuses of what may go wrong."""
@@ -239,26 +210,9 @@ class Route:
         yield from self.errors
 
 
-@dataclass(slots=True)
-class RouteTable:
-    """Routes of one group."""
-
-    group: str
-    routes: list[Route] = field(default_factory=list)
-
-    def __iter__(self) -> Iterator[Route]:
-        return iter(self.routes)
-
-    def route(self, method: str, path: str, summary: str, **options: Any) -> Callable[[Handler], Handler]:
-        """Decorate a handler."""
-
-        def add(handler: Handler) -> Handler:
-            self.routes.append(
-                Route(method=method, path=path, handler=handler, summary=summary, group=self.group, **options)
-            )
-            return handler
-
-        return add
+def route_table(group: str) -> routes.RouteTable[Route]:
+    """Return an empty table of routes of the master."""
+    return routes.RouteTable(group, Route)
 
 
 OF_USER = Query(name="user", description="Whose; administrators only. Default: own, in lists all users'.")
