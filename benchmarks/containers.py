@@ -113,7 +113,7 @@ def _kind(process: psutil.Process, kinds: Mapping[str, str]) -> str:
     if first == "bwrap":
         return first
     text = " ".join(line) if first.startswith(("python", "sh")) else ""
-    return next((kind for kind, needle in reversed(kinds.items()) if needle in text), "")
+    return next((kind for kind, needle in reversed(list(kinds.items())) if needle in text), "")
 
 
 async def _create(client: Robot, containers: list[str]) -> None:

@@ -22,7 +22,7 @@ import uvloop
 from benchmarks.engine import RunningEngine, engine, words
 from benchmarks.figures import save, show
 from benchmarks.wire import Robot, robot, serialized_string, wire_echo
-from tests.support.leaks import Traces, footprint
+from tools.leaks import Traces, footprint
 
 BATCHES = 10
 MAX_GROWTH_MB = 32.0

@@ -230,7 +230,7 @@ def _shares_with_its_module(item: pytest.Item) -> bool:
 
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Remove the cgroups of test runs that were killed, once a run."""
-    from support.leaks import sweep_dead_cgroups
+    from tools.leaks import sweep_dead_cgroups
 
     if not _is_worker(session.config):
         sweep_dead_cgroups()

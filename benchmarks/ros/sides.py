@@ -68,7 +68,7 @@ def result_of(process: subprocess.Popen[str]) -> Any:
     for line in process.stdout:
         if line.startswith("{"):
             return json.loads(line)
-    raise RuntimeError(f"{process.args} printed no result")
+    raise RuntimeError(f"{process.args!r} printed no result")
 
 
 def end(process: subprocess.Popen[str]) -> None:

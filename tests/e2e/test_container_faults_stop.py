@@ -13,9 +13,10 @@ from pathlib import Path
 
 import pytest
 from support.engine import Program, running_engine, until
-from support.leaks import Traces, sweep_cgroups
 from support.ports import free_ports
 from support.stranger import ask_for_echo, stranger
+
+from tools.leaks import Traces, sweep_cgroups
 
 pytestmark = [pytest.mark.e2e]
 

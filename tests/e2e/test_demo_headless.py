@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import signal
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -145,7 +146,10 @@ async def test_robots_continue_after_parts_of_the_engine_are_killed(runtime: str
             found = read_report(report)
             return sum(robot.distance_m for robot in found.robots) if found else 0.0
 
-        await until(lambda: driven() > 0.5, timeout=30, what="robots drive")
+        def has_driven(metres: float) -> bool:
+            return driven() > metres
+
+        await until(lambda: has_driven(0.5), timeout=30, what="robots drive")
         for part in ("rce_robot", "rce_master", "rce_container.environment", "rce_container"):
             victims = [
                 process
@@ -156,7 +160,7 @@ async def test_robots_continue_after_parts_of_the_engine_are_killed(runtime: str
             victims[0].kill()
             before = driven()
             await until(
-                lambda before=before: driven() > before + 1.5,
+                partial(has_driven, before + 1.5),
                 timeout=60,
                 what=f"robots drive on after {part} was killed",
             )

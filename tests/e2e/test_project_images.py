@@ -12,7 +12,8 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from support.engine import Program, free_ports
+from support.engine import Program
+from support.ports import free_ports
 from support.rootfs import image_of
 
 ROOT = Path(__file__).parents[2]

@@ -19,10 +19,12 @@ from typing import Any
 import aiohttp
 import pytest
 import pytest_asyncio
-from support.engine import command_line, engine_processes, free_ports, until
+from support.engine import command_line, engine_processes, until
+from support.ports import free_ports
 
 from rce.ros.core import Core
 from rce.tls import authority
+from rce.tls.authority import CERTIFICATE_DAYS
 from rce.tls.folder import CertificateFolder
 from rce_client import Connection
 from rce_client.exceptions import RefusedError
@@ -407,8 +409,8 @@ def revoked(world: World, own: CertificateFolder) -> None:
     world.certificates.revoke("machine")
 
 
-def bring(of: CertificateFolder, own: CertificateFolder, **options: float) -> None:
-    of.issue("machine", **options)
+def bring(of: CertificateFolder, own: CertificateFolder, days: float = CERTIFICATE_DAYS) -> None:
+    of.issue("machine", days=days)
     for name in ("machine.pem", "machine.key"):
         (own.path / name).write_bytes((of.path / name).read_bytes())
 
@@ -572,17 +574,18 @@ async def test_rce_ros_outlives_faults_of_the_certificate(
             stderr=asyncio.subprocess.PIPE,
             env=world.env,
         )
-        assert process.stdout is not None
-        assert process.stderr is not None
+        stdout, stderr = process.stdout, process.stderr
+        assert stdout is not None
+        assert stderr is not None
 
         async def told(words: str) -> None:
             async with asyncio.timeout(60):
-                while words not in (line := (await process.stderr.readline()).decode()):
+                while words not in (line := (await stderr.readline()).decode()):
                     assert line, f"rce-ros ended before it said {words!r}"
 
         try:
             async with asyncio.timeout(60):
-                assert b"rce-ros ready: robot patient" in await process.stdout.readline()
+                assert b"rce-ros ready: robot patient" in await stdout.readline()
             folder.issue("engine", hosts, days=-1)
             (endpoint,) = (
                 found for found in engine_processes(world.folder) if "rce_robot" in command_line(found)

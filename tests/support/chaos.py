@@ -13,13 +13,14 @@ import signal
 import sys
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rce_container.environment import proc
 from support.engine import Engine, running_engine, until
-from support.leaks import Traces, footprint
 from support.stranger import ROBOT_TAGS, Stranger, ask_for_echo, check_echo, stranger
+from tools.leaks import Traces, footprint
 
 CONTAINERS = 3
 LONGEST_PAUSE_S = 0.4
@@ -137,7 +138,7 @@ class Chaos:
         """Ask for what is wanted, as clients do, until it is there."""
         for one in self.customers:
             if one.wants:
-                await until(lambda one=one: self._is_served(one), timeout=SETTLE_S, what=one.container)
+                await until(partial(self._is_served, one), timeout=SETTLE_S, what=one.container)
 
     async def _is_served(self, one: Customer) -> bool:
         await one.create()

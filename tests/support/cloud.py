@@ -9,7 +9,7 @@ import tempfile
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
@@ -52,6 +52,8 @@ if TYPE_CHECKING:
     from rce.control.peer import Peer
     from rce.link import Buffer, Port
 
+T = TypeVar("T")
+
 SECRET = Secret("secret of the tests")
 PASSWORD = "testUser"
 DIGEST = hashlib.sha256(PASSWORD.encode()).hexdigest()
@@ -68,7 +70,7 @@ class Signal:
     def set(self) -> None:
         self._event.set()
 
-    async def until(self, condition: Callable[[], Any]) -> Any:
+    async def until(self, condition: Callable[[], T | None]) -> T:
         async with asyncio.timeout(15):
             while not (found := condition()):
                 self._event.clear()
@@ -195,6 +197,10 @@ class PeerInterface(Interface):
         self.losses += not active
         self.active.set()
 
+    async def until_active(self) -> None:
+        """Wait until it has a connection that is established."""
+        await self.active.until(lambda: self.is_active)
+
 
 class Cloud:
     """The master, one robot task set, one container."""
@@ -247,7 +253,7 @@ class Cloud:
     ) -> PeerInterface:
         """Wire, and wait until the connection is established."""
         end = await self.wire(tag, type_, message_type, robot=robot)
-        await end.active.until(lambda: end.is_active)
+        await end.until_active()
         return end
 
 

@@ -8,7 +8,7 @@ import os
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import pytest
@@ -31,10 +31,12 @@ from rce.control.model import (
     ConnectionSpec,
     EndpointKind,
     EndpointSpec,
+    EndpointState,
     EndpointStatus,
     LinkAddress,
     LinkSpec,
     NodeState,
+    NodeStatus,
 )
 from rce.link import Buffer, Endpoint, Interface, LinkHub, Port
 from rce.link.handover import LinkAcceptor
@@ -112,9 +114,15 @@ NODES = {
 }
 
 
+T = TypeVar("T")
+
+
 async def until(
-    condition: Callable[[], Any], *, timeout: float = 60.0, what: str | Callable[[], object] = "condition"
-) -> Any:
+    condition: Callable[[], T | None],
+    *,
+    timeout: float = 60.0,
+    what: str | Callable[[], object] = "condition",
+) -> T:
     """Wait until ``condition`` gives something true, and return it."""
     deadline = time.monotonic() + timeout
     while not (found := condition()):
@@ -220,11 +228,23 @@ class Machine:
     def status(self, id_: str) -> EndpointStatus | None:
         return next((status for status in self.manager.statuses if status.id == id_), None)
 
-    def node(self, id_: str, tag: str) -> Any:
+    def reported(self, id_: str) -> EndpointStatus:
+        """The newest status of a container that has one."""
+        status = self.status(id_)
+        assert status is not None, f"{id_} has no status"
+        return status
+
+    def node(self, id_: str, tag: str) -> NodeStatus | None:
         status = self.status(id_)
         return next((node for node in status.nodes if node.tag == tag), None) if status else None
 
-    def of(self, kind: type) -> list[Any]:
+    def reported_node(self, id_: str, tag: str) -> NodeStatus:
+        """The newest status of a node that has one."""
+        node = self.node(id_, tag)
+        assert node is not None, f"{id_}/{tag} has no status"
+        return node
+
+    def of(self, kind: type[T]) -> list[T]:
         return [message for message in self.told if isinstance(message, kind)]
 
     @property
@@ -245,8 +265,8 @@ class Machine:
         await self.manager.handle(Drop(id=id_, revision=revision))
         await until(lambda: any(m.id == id_ for m in self.of(Gone)), what=f"{id_} is gone")
 
-    async def node_is(self, id_: str, tag: str, state: NodeState) -> Any:
-        def found() -> Any:
+    async def node_is(self, id_: str, tag: str, state: NodeState) -> NodeStatus:
+        def found() -> NodeStatus | None:
             node = self.node(id_, tag)
             return node if node and node.state is state else None
 
@@ -255,7 +275,7 @@ class Machine:
     async def node_pid(self, id_: str, tag: str) -> int:
         """Wait until the pid of a node's process is reported. It may start yet: not all nodes register."""
         return await until(
-            lambda: (node := self.node(id_, tag)) and node.pid, what=f"the pid of {id_}/{tag} is told"
+            lambda: node.pid if (node := self.node(id_, tag)) else 0, what=f"the pid of {id_}/{tag} is told"
         )
 
     async def log(self, id_: str, node: str, offset: int = 0) -> str:
@@ -362,6 +382,11 @@ class Machine:
 
     def check_clean(self) -> None:
         assert self.left() == []
+
+
+def is_in(machine: Machine, id_: str, state: EndpointState) -> bool:
+    """Whether a container's newest status says this state."""
+    return machine.reported(id_).state is state
 
 
 def container(

@@ -19,9 +19,9 @@ import psutil
 
 from rce_fleet.demo.resources import Ports, option_of
 from support.engine import command_line, engine_processes, until
-from support.leaks import sweep_cgroups
 from support.ports import free_ports
 from support.processes import finish
+from tools.leaks import sweep_cgroups
 
 STOP_TIMEOUT_S = 120.0
 

@@ -17,8 +17,8 @@ from typing import Any
 
 import psutil
 
-from support.leaks import sweep_cgroups
 from support.ports import free_ports
+from tools.leaks import sweep_cgroups
 
 READY_TIMEOUT_S = 90.0
 STOP_TIMEOUT_S = 90.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rce_fleet.drivers.report import Contacts, RobotTruth, WorldReport
@@ -33,7 +33,7 @@ def fleet(
 
 
 def truth(
-    *, boxes: Sequence[int] = (), collisions: int = 0, apart: float | None = None, **cells: int
+    cells: Mapping[str, int], *, boxes: Sequence[int] = (), collisions: int = 0, apart: float | None = None
 ) -> WorldReport:
     """A world in which robots stand in ``cells`` and have driven a metre each."""
     contacts = Contacts(robot_robot=collisions, robot_box=0, robot_wall=0, total=collisions)

@@ -269,6 +269,7 @@ def answers_of(document: dict[str, Any], url: str, token: str) -> int:
     headers = {"Authorization": f"Bearer {token}"}
     answered = 0
     for result in schema.get_all_operations():
+        assert isinstance(result, Ok), result
         operation = result.ok()
         for mode in (GenerationMode.POSITIVE, GenerationMode.NEGATIVE):
 
@@ -281,7 +282,7 @@ def answers_of(document: dict[str, Any], url: str, token: str) -> int:
                 suppress_health_check=list(HealthCheck),
             )
             @given(case=operation.as_strategy(generation_mode=mode))
-            def run(case: schemathesis.Case) -> None:
+            def run(case: schemathesis.Case[Any, Any, Any]) -> None:
                 nonlocal answered
                 response = case.call(base_url=url, headers=headers, timeout=60)
                 case.validate_response(response, checks=CHECKS)

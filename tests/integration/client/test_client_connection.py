@@ -230,7 +230,9 @@ async def test_a_robot_id_in_use_is_told_at_once_and_again(
     engine: Engine, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Who has it is told, and the second client comes in when the first is gone."""
-    monkeypatch.setattr(Reminder.__init__, "__defaults__", (0.1, *Reminder.__init__.__defaults__[1:]))
+    defaults = Reminder.__init__.__defaults__
+    assert defaults is not None
+    monkeypatch.setattr(Reminder.__init__, "__defaults__", (0.1, *defaults[1:]))
 
     def told() -> list[str]:
         return [record.message for record in caplog.records if "robotID is free" in record.message]

@@ -85,7 +85,7 @@ async def _speak(engine: Engine) -> None:
     while True:
         for tag, end in list(engine.cloud.ends.items()):
             if tag not in spoken and "Subscriber" in end.port.spec.type:
-                await end.active.until(lambda end=end: end.is_active)
+                await end.until_active()
                 end.port.send(payload)
                 spoken.add(tag)
         await asyncio.sleep(0.01)

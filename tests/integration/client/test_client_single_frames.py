@@ -44,7 +44,7 @@ async def test_raw_topics_and_services(engine: Engine, monkeypatch: pytest.Monke
         monkeypatch.setattr(gate, "read_features", lambda _query: frozenset())
     got: asyncio.Queue[bytes] = asyncio.Queue()
 
-    async def reverse(request: memoryview) -> bytes:
+    async def reverse(request: bytes) -> bytes:
         return bytes(request)[::-1]
 
     async def double(payload: bytes) -> bytes:

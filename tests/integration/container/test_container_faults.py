@@ -15,10 +15,10 @@ from typing import Any
 
 import pytest
 from support.containers import ECHO, Machine, until
-from support.leaks import footprint
 
 from rce.control.model import EndpointState, NodeState
 from rce.model.specs import NodeSpec, RestartPolicy
+from tools.leaks import footprint
 
 BOX = "user/box"
 MB = 1 << 20

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 from support.engine import Program, until
-from support.leaks import Traces, sweep_cgroups
 
 from rce_container.environment import proc
+from tools.leaks import Traces, sweep_cgroups
 
 BIN = Path(sys.executable).parent
 WITHOUT_USER_NAMESPACES = (

@@ -7,17 +7,18 @@ import json
 import os
 import signal
 import socket
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
-from support.containers import ECHO, ECHO_INTERFACES, MACHINE, Machine, joined, until
+from support.containers import ECHO, ECHO_INTERFACES, MACHINE, Machine, is_in, joined, until
 
 from rce.control.model import EndpointState, LinkAddress, NodeState
 from rce.model.specs import InterfaceSpec, NodeSpec, ParameterSpec
 from rce.ros.types import TypeRegistry
 from rce_container.environment import proc
-from rce_container.runtimes.namespace import HOME
+from rce_container.forkserver.mounts import HOME
 
 BOX = "user/box"
 STRING = TypeRegistry().message("std_msgs/String")
@@ -49,10 +50,8 @@ async def test_a_peer_talks_to_a_node(machine: Machine, way: str) -> None:
             await peer.active()
             for number in range(20):
                 await echo(peer, f"number {number}")
-            status = machine.status(BOX)
-            assert status is not None
-            await until(lambda: machine.status(BOX).interfaces == {"req": True, "resp": True, "srv": True})
-            assert machine.status(BOX).connections == (1, 2, 3)
+            await until(lambda: machine.reported(BOX).interfaces == {"req": True, "resp": True, "srv": True})
+            assert machine.reported(BOX).connections == (1, 2, 3)
 
             def counted() -> bool:
                 if not machine.usage:
@@ -67,7 +66,7 @@ async def test_a_peer_talks_to_a_node(machine: Machine, way: str) -> None:
             assert usage.processes >= 3
             payload = usage.interfaces["req"].bytes_in
             assert usage.link_in > payload > 0, "headers count too"
-        await until(lambda: not any(machine.status(BOX).interfaces.values()), what="inactive interfaces")
+        await until(lambda: not any(machine.reported(BOX).interfaces.values()), what="inactive interfaces")
         assert machine.faults == []
         await machine.drop(BOX)
         machine.check_clean()
@@ -78,14 +77,14 @@ async def test_a_killed_environment_is_noticed_and_made_again(machine: Machine) 
         address = await start_echo(machine)
         async with joined(address) as peer:
             await peer.active()
-            first = machine.status(BOX)
+            first = machine.reported(BOX)
             machine.note_processes()
             os.kill(machine.environment().pid, signal.SIGKILL)
-            await until(lambda: machine.status(BOX).incarnation != first.incarnation)
+            await until(lambda: machine.reported(BOX).incarnation != first.incarnation)
             await until(lambda: False in peer.ends["req"].history, what="its peer notices")
-            await until(lambda: machine.status(BOX).state is EndpointState.RUNNING)
+            await until(lambda: machine.reported(BOX).state is EndpointState.RUNNING)
             assert all(not proc.alive(pid, start) for pid, start in machine.pids.items())
-            await peer.wire(machine.status(BOX).address, ECHO_INTERFACES, 2)
+            await peer.wire(machine.reported(BOX).address, ECHO_INTERFACES, 2)
             await peer.active()
             await echo(peer, "again")
             history = peer.ends["req"].history
@@ -99,11 +98,11 @@ async def test_every_outer_process_may_be_killed(machine: Machine) -> None:
         await machine.put(BOX, nodes=(own("talk.py"),))
         for _ in range(2):
             await machine.node_is(BOX, "node", NodeState.STARTING)
-            incarnation = machine.status(BOX).incarnation
+            incarnation = machine.reported(BOX).incarnation
             machine.note_processes()
             old = dict(machine.pids)
             os.kill(machine.shims()[0].pid, signal.SIGKILL)
-            await until(lambda: machine.status(BOX).incarnation not in ("", incarnation))  # noqa: B023
+            await until(lambda: machine.reported(BOX).incarnation not in ("", incarnation))  # noqa: B023
             assert not [pid for pid, start in old.items() if proc.alive(pid, start)]
 
 
@@ -156,8 +155,8 @@ async def test_invalid_request_is_reported_and_spoils_nothing_else(machine: Mach
             "a container has no PublisherConverter",
         ):
             assert part in text
-        await until(lambda: "good" in machine.status(BOX).interfaces)
-        assert machine.status(BOX).revision == 1
+        await until(lambda: "good" in machine.reported(BOX).interfaces)
+        assert machine.reported(BOX).revision == 1
 
 
 async def test_parameters_arguments_and_environment(machine: Machine) -> None:
@@ -175,7 +174,7 @@ async def test_a_stubborn_node_is_killed(machine: Machine) -> None:
         await machine.put(BOX, nodes=(own("stubborn.py"),))
         await machine.log_holds(BOX, "node", "ready")
         await machine.put(BOX, 2)
-        await until(lambda: not machine.status(BOX).nodes)
+        await until(lambda: not machine.reported(BOX).nodes)
         assert "no " in await machine.log(BOX, "node")
         assert machine.faults == []
 
@@ -187,10 +186,10 @@ async def test_what_a_node_left_behind_dies_with_it(machine: Machine) -> None:
         await machine.log_holds(BOX, "other", "hello")
         before = {one.pid for one in machine.processes()}
         await machine.put(BOX, 2, nodes=(own("talk.py", tag="other"),))
-        await until(lambda: not [n for n in machine.status(BOX).nodes if n.tag == "node"])
+        await until(lambda: not [n for n in machine.reported(BOX).nodes if n.tag == "node"])
         left = {one.pid for one in machine.processes()}
         assert len(before) - len(left) == 2
-        assert machine.node(BOX, "other").pid in left
+        assert machine.reported_node(BOX, "other").pid in left
 
 
 async def test_a_flood_of_output_is_bounded(machine: Machine) -> None:
@@ -208,18 +207,18 @@ async def test_a_new_manager_adopts_its_containers(machine: Machine) -> None:
         address = await start_echo(machine)
         async with joined(address) as peer:
             await peer.active()
-            before = machine.status(BOX)
+            before = machine.reported(BOX)
             node = await machine.node_is(BOX, "echo", NodeState.RUNNING)
     async with machine.engine() as manager:
         assert [status.incarnation for status in manager.hello().endpoints] == [before.incarnation]
         assert manager.hello().endpoints[0].revision == 1
-        assert machine.node(BOX, "echo").pid == node.pid
+        assert machine.reported_node(BOX, "echo").pid == node.pid
         await machine.put(BOX, 2, nodes=(ECHO,), interfaces=ECHO_INTERFACES, peer="user/robot")
-        async with joined(machine.status(BOX).address, "another") as peer:
+        async with joined(machine.reported(BOX).address, "another") as peer:
             await peer.active()
             await echo(peer, "by tcp through the new manager")
-        assert machine.status(BOX).incarnation == before.incarnation
-        assert machine.node(BOX, "echo").pid == node.pid
+        assert machine.reported(BOX).incarnation == before.incarnation
+        assert machine.reported_node(BOX, "echo").pid == node.pid
 
 
 async def test_without_a_manager_a_container_ends_itself(machine: Machine) -> None:
@@ -286,9 +285,9 @@ async def test_containers_talk_to_each_other(machine: Machine) -> None:
     )
     async with machine.engine():
         await machine.put("user/far", nodes=(ECHO,), interfaces=(answer,), peer="user/box")
-        address = machine.status("user/far").address
+        address = machine.reported("user/far").address
         await machine.put(BOX, interfaces=(request,), peer="user/far", dial=address)
-        await until(lambda: machine.status(BOX).interfaces == {"srv": True}, what="connected")
+        await until(lambda: machine.reported(BOX).interfaces == {"srv": True}, what="connected")
 
 
 async def test_only_so_many_containers_start_at_a_time(machine: Machine) -> None:
@@ -300,9 +299,7 @@ async def test_only_so_many_containers_start_at_a_time(machine: Machine) -> None
         assert len(machine.shims()) == 1
         await machine.drop(boxes[1])
         for box in (boxes[0], boxes[2]):
-            await until(
-                lambda box=box: machine.status(box).state is EndpointState.RUNNING, what=f"{box} is running"
-            )
+            await until(partial(is_in, machine, box, EndpointState.RUNNING), what=f"{box} is running")
         assert len(machine.shims()) == 2, "a container was made that was dropped before its turn came"
         assert machine.faults == []
 

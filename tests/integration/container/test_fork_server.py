@@ -14,6 +14,7 @@ from support.containers import ECHO, Machine, program_of, until
 from rce.control.model import EndpointState, NodeState
 from rce.model.specs import NodeSpec
 from rce_container.environment import proc
+from rce_container.incarnation import Incarnation
 from rce_container.runtimes.held import HeldHandle
 from rce_container.runtimes.namespace import NamespaceRuntime
 
@@ -35,8 +36,8 @@ def fork_server(machine: Machine) -> int:
     return machine.runtime._fork_server.pid
 
 
-async def running(machine: Machine, id_: str = BOX, **parts: object) -> None:
-    await machine.put(id_, **parts)
+async def running(machine: Machine, id_: str = BOX, nodes: tuple[NodeSpec, ...] = ()) -> None:
+    await machine.put(id_, nodes=nodes)
     await until(lambda: (s := machine.status(id_)) is not None and s.state is EndpointState.RUNNING)
 
 
@@ -46,7 +47,7 @@ async def test_a_container_that_lost_a_part_is_made_again(namespaces: Machine, v
     async with machine.engine():
         await running(machine, nodes=(ECHO,))
         await machine.node_is(BOX, "echo", NodeState.RUNNING)
-        first = machine.status(BOX)
+        first = machine.reported(BOX)
         (incarnation,) = machine.manager._incarnations.values()
         handle = incarnation.handle
         assert isinstance(handle, HeldHandle)
@@ -62,7 +63,7 @@ async def test_a_container_that_lost_a_part_is_made_again(namespaces: Machine, v
         }
         assert len(set(pids.values())) == 4
         os.kill(pids[victim], signal.SIGKILL)
-        await until(lambda: machine.status(BOX).incarnation not in ("", first.incarnation))
+        await until(lambda: machine.reported(BOX).incarnation not in ("", first.incarnation))
         assert [pid for pid, start in machine.pids.items() if proc.alive(pid, start)] == []
         await machine.node_is(BOX, "echo", NodeState.RUNNING)
 
@@ -71,12 +72,12 @@ async def test_containers_do_not_need_the_fork_server(namespaces: Machine) -> No
     machine = namespaces
     async with machine.engine():
         await running(machine, nodes=(TALK,))
-        before = machine.status(BOX)
+        before = machine.reported(BOX)
         old = fork_server(machine)
         os.kill(old, signal.SIGKILL)
         await running(machine, "user/other")
         assert fork_server(machine) not in (0, old)
-        assert machine.status(BOX).incarnation == before.incarnation
+        assert machine.reported(BOX).incarnation == before.incarnation
         await machine.put(BOX, 2, nodes=(TALK, ECHO))
         await machine.node_is(BOX, "echo", NodeState.RUNNING)
         assert machine.faults == []
@@ -90,7 +91,7 @@ async def test_a_start_survives_the_fork_server(namespaces: Machine) -> None:
         await machine.put(BOX)
         await until(lambda: _waits_for_request(machine), what="the fork server has got its order")
         os.kill(old, signal.SIGKILL)
-        await until(lambda: machine.status(BOX).state is EndpointState.RUNNING)
+        await until(lambda: machine.reported(BOX).state is EndpointState.RUNNING)
         assert machine.faults == []
         assert len(machine.marks | {path.name for path in machine.containers}) == 1
 
@@ -102,7 +103,7 @@ def _waits_for_request(machine: Machine) -> bool:
     )
 
 
-def _incarnations(machine: Machine) -> list[object]:
+def _incarnations(machine: Machine) -> list[Incarnation]:
     return list(machine.manager._incarnations.values())
 
 
@@ -151,4 +152,4 @@ async def test_nobody_waits_for_bubblewrap_that_fails(namespaces: Machine) -> No
         assert "its namespaces cannot be made" in machine.faults[0]
         machine.runtime._bwrap = "/usr/bin/bwrap"
         async with asyncio.timeout(20):
-            await until(lambda: machine.status(BOX).state is EndpointState.RUNNING)
+            await until(lambda: machine.reported(BOX).state is EndpointState.RUNNING)

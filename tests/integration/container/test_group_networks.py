@@ -184,7 +184,7 @@ async def test_an_address_is_given_out_once_and_again(machine: Machine) -> None:
         fault = await until(lambda: machine.of(Fault), what="a fault")
         assert fault[0].id == "user/b"
         assert "the groupIp 10.0.0.1 belongs to container a of the same group; take another" in fault[0].text
-        assert machine.status("user/b").state is EndpointState.FAILED
+        assert machine.reported("user/b").state is EndpointState.FAILED
         await machine.drop("user/a")
         await until(lambda: machine.node("user/b", "node"), what="b")
         await machine.log_holds("user/b", "node", "serving")
@@ -211,11 +211,11 @@ async def test_a_killed_container_comes_back_to_its_group(machine: Machine) -> N
     async with machine.engine():
         await serving(machine, "user/a", group(address="10.0.0.1"))
         await serving(machine, "user/b", group(address="10.0.0.2"))
-        first = machine.status("user/a").incarnation
+        first = machine.reported("user/a").incarnation
         record = next(one for one in machine.containers if one.name == first)
         machine.note_processes()
         os.kill(json.loads((record / "record.json").read_text())["pid"], 9)
-        await until(lambda: machine.status("user/a").incarnation not in ("", first), what="a new life")
+        await until(lambda: machine.reported("user/a").incarnation not in ("", first), what="a new life")
         await until(lambda: machine.node("user/a", "node"), what="its node")
         await machine.log_holds("user/a", "node", "serving")
         found = await reached(machine, "user/b", f"a:{PORT}")

@@ -8,9 +8,9 @@ import time
 from pathlib import Path
 
 import pytest
-from support.leaks import CGROUPS, Traces, sweep_cgroups
 
 from rce_container.environment import proc
+from tools.leaks import CGROUPS, Traces, sweep_cgroups
 
 MARK = "0123456789ab"
 TOKEN = "feedbeef"

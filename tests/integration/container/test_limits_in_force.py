@@ -108,7 +108,7 @@ async def test_a_process_of_a_node_that_ran_out_of_memory_is_told_of(packages: M
         await packages.put(BOX, resources=SMALL, nodes=(greedy("spawn"),))
         await packages.log_holds(BOX, "spawn", "child ended with -9")
         await until(lambda: any("a process that a node started was killed" in f for f in packages.faults))
-        assert packages.node(BOX, "spawn").state in (NodeState.STARTING, NodeState.RUNNING)
+        assert packages.reported_node(BOX, "spawn").state in (NodeState.STARTING, NodeState.RUNNING)
 
 
 async def test_a_container_that_cannot_live_at_all_says_why(packages: Machine) -> None:

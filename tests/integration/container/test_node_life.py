@@ -112,7 +112,7 @@ async def test_a_node_that_crashes_is_restarted_up_to_its_limit(machine: Machine
             "exit code 3; its last words: it is broken; it was started again 2 times"
         )
         assert [one for one in states(machine) if one is NodeState.WAITING] == [NodeState.WAITING] * 2
-        assert machine.status(BOX).state is EndpointState.DEGRADED
+        assert machine.reported(BOX).state is EndpointState.DEGRADED
         text = (await read(machine, "node")).text
         assert text.count("it is broken\n") == text.count("to stdout\n") == 3
         ended = "-- ended: exit code 3; its last words: it is broken --\n"
@@ -120,8 +120,8 @@ async def test_a_node_that_crashes_is_restarted_up_to_its_limit(machine: Machine
         assert (await read(machine, "node", LogStream.ENGINE)).text == pauses + ended
         assert len([text for text in machine.faults if "node node" in text]) == 2
         await machine.put(BOX, 2, nodes=(own("talk.py"), own("talk.py", tag="other")))
-        await until(lambda: machine.status(BOX).state is EndpointState.RUNNING, what="all is well again")
-        assert machine.node(BOX, "node").restarts == 0
+        await until(lambda: machine.reported(BOX).state is EndpointState.RUNNING, what="all is well again")
+        assert machine.reported_node(BOX, "node").restarts == 0
 
 
 async def test_nodes_start_in_order_and_say_what_they_await(machine: Machine) -> None:
@@ -139,13 +139,13 @@ async def test_nodes_start_in_order_and_say_what_they_await(machine: Machine) ->
             ),
         )
         assert (await machine.node_is(BOX, "last", NodeState.WAITING)).detail.startswith("waits for slow")
-        assert machine.node(BOX, "a").detail.startswith("waits for itself (a after b after a)")
-        assert machine.node(BOX, "c").detail.startswith("waits for 'nobody'")
+        assert machine.reported_node(BOX, "a").detail.startswith("waits for itself (a after b after a)")
+        assert machine.reported_node(BOX, "c").detail.startswith("waits for 'nobody'")
         await machine.node_is(BOX, "last", NodeState.RUNNING)
-        assert machine.node(BOX, "slow").state is NodeState.RUNNING
-        assert machine.node(BOX, "once").state is NodeState.EXITED
+        assert machine.reported_node(BOX, "slow").state is NodeState.RUNNING
+        assert machine.reported_node(BOX, "once").state is NodeState.EXITED
         for tag in "abc":
-            assert machine.node(BOX, tag).state is NodeState.WAITING
+            assert machine.reported_node(BOX, tag).state is NodeState.WAITING
             assert any(f"node {tag} waits for" in fault for fault in machine.faults)
 
 
@@ -176,7 +176,7 @@ async def test_a_node_whose_heart_stops_is_restarted(machine: Machine) -> None:
         await until(lambda: NodeState.STUCK in states(machine), what="the node is stuck")
         first = await machine.node_is(BOX, "node", NodeState.RUNNING)
         assert first.restarts == 1
-        await until(lambda: machine.status(BOX).state is EndpointState.RUNNING, what="all is well again")
+        await until(lambda: machine.reported(BOX).state is EndpointState.RUNNING, what="all is well again")
         found = states(machine)
         stuck = found.index(NodeState.STUCK)
         assert found[stuck : stuck + 5] == [
@@ -266,8 +266,7 @@ async def test_a_killed_node_says_by_what(machine: Machine) -> None:
     async with machine.engine():
         await machine.put(BOX, nodes=(own("talk.py"),))
         await machine.log_holds(BOX, "node", "hello")
-        node = await until(lambda: (one := machine.node(BOX, "node")) and one.pid and one)
-        os.kill(node.pid, signal.SIGSEGV)
+        os.kill(await machine.node_pid(BOX, "node"), signal.SIGSEGV)
         await machine.node_is(BOX, "node", NodeState.FAILED)
         text = (await read(machine, "node", LogStream.ENGINE)).text
         assert text.startswith("-- ended: killed by SIGSEGV")
@@ -277,10 +276,10 @@ async def test_logs_outlive_their_container(machine: Machine) -> None:
     async with machine.engine():
         await machine.put(BOX, nodes=(own("talk.py", "one"),))
         await machine.log_holds(BOX, "node", "hello one")
-        first = machine.status(BOX).incarnation
+        first = machine.reported(BOX).incarnation
         machine.note_processes()
         os.kill(machine.environment().pid, signal.SIGKILL)
-        await until(lambda: machine.status(BOX).incarnation not in ("", first))
+        await until(lambda: machine.reported(BOX).incarnation not in ("", first))
         await machine.log_holds(BOX, "node", "hello one")
         before = await read(machine, "node", previous=True)
         assert (before.incarnation, "hello one" in before.text) == (first, True)

@@ -6,6 +6,7 @@ import asyncio
 import errno
 import os
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 from support.user_packages import pack, sign, write_package
@@ -14,6 +15,7 @@ from rce.control.contents import Piece
 from rce.control.exceptions import ContentError
 from rce.control.model import PackageSpec
 from rce.packages.limits import ArchiveLimits
+from rce.packages.unpacking import unpack
 from rce_container.packages import cache as cache_module
 from rce_container.packages import disk, shelf
 from rce_container.packages.cache import PackageCache
@@ -135,10 +137,9 @@ async def test_a_full_disk_is_told_and_leaves_nothing(
 ) -> None:
     cache = opened(depot, tmp_path / "cache")
     nav = depot.make("nav")
-    original = cache_module.unpack
 
-    def full(*arguments: object) -> object:
-        original(*arguments)  # type: ignore[arg-type]
+    def full(file: BinaryIO, into: Path, limits: ArchiveLimits) -> None:
+        unpack(file, into, limits)
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(cache_module, "unpack", full)

@@ -101,8 +101,8 @@ async def test_a_revision_that_the_master_did_not_give_is_not_believed(machine: 
         (status,) = [one for one in machine.manager.statuses if one.id == BOX]
         assert status.revision <= given
         await rogue.say(report(BOX, NodeStatus(tag="seen", state=NodeState.RUNNING), revision=2**52))
-        await until(lambda: machine.status(BOX).nodes, what="the second report")
-        assert machine.status(BOX).revision <= given
+        await until(lambda: machine.reported(BOX).nodes, what="the second report")
+        assert machine.reported(BOX).revision <= given
 
 
 async def test_who_never_stops_talking_keeps_nobody_waiting(machine: Machine) -> None:

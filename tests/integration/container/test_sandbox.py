@@ -9,7 +9,7 @@ import pytest
 from support.persons import Person
 
 from rce_container.environment.process import OF_NODES
-from rce_container.runtimes.namespace import HOME
+from rce_container.forkserver.mounts import HOME
 from rce_container.uids import FIRST_UID, UIDS
 
 HOME_BYTES = 4 << 20

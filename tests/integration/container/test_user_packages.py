@@ -147,7 +147,7 @@ async def test_a_new_version_comes_while_nodes_run(shop: Machine) -> None:
         await shop.put(BOX, 2, nodes=nodes, packages=(old, new))
         await shop.log_holds(BOX, "newer", "new")
         await shop.log_holds(BOX, "fixed", "old")
-        assert shop.node(BOX, "node").pid == before
+        assert shop.reported_node(BOX, "node").pid == before
 
 
 async def test_a_new_manager_goes_on_where_the_old_one_was(shop: Machine) -> None:
@@ -165,7 +165,7 @@ async def test_a_new_manager_goes_on_where_the_old_one_was(shop: Machine) -> Non
         shop.contents[late.sha256] = pack(shop.folder / "source" / "1.0" / "late")
         await shop.put(BOX, nodes=nodes, packages=(nav, late))
         await shop.log_holds(BOX, "late", "late")
-        assert shop.node(BOX, "node").pid == before
+        assert shop.reported_node(BOX, "node").pid == before
         assert not (shop.folder / "bundles" / "incoming" / "half").exists()
 
 
@@ -209,8 +209,8 @@ async def test_requirements_are_installed_where_it_is_allowed(shop: Machine) -> 
         hand = offer(shop, "hand", nodes__run=USE, requirements="gripper_math ~= 1.0  # for the fingers\n")
         bad = offer(shop, "bad", nodes__run=USE, requirements="nowhere_to_be_found\n")
         path = offer(shop, "path", nodes__run=USE, requirements="-e /etc\n")
-        nodes = (node("hand"), node("bad", tag="bad"), node("path", tag="path"))
-        nodes += (NodeSpec(tag="own", pkg="own", exe="end.py"),)
+        theirs = (node("hand"), node("bad", tag="bad"), node("path", tag="path"))
+        nodes = (*theirs, NodeSpec(tag="own", pkg="own", exe="end.py"))
         await shop.put(BOX, nodes=nodes, packages=(hand, bad, path))
         await shop.log_holds(BOX, "node", "forty-two")
         await until(lambda: len(shop.faults) >= 2, what=lambda: shop.faults)

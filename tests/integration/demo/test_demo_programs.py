@@ -158,9 +158,9 @@ async def test_stop_last_programs_are_stopped_last(tmp_path: Path) -> None:
             await group.wait_line(program, "up", 20)
             stop = program.child.stop
 
-            async def noted(name: str = name, stop: Any = stop, **options: float) -> None:
+            async def noted(name: str = name, stop: Callable[..., Awaitable[None]] = stop, **options: float) -> None:
                 await stop(**options)
                 ended.append(name)
 
-            program.child.stop = noted  # type: ignore[assignment]
+            program.child.stop = noted  # type: ignore[method-assign]  # to see when it is called
     assert ended == ["node", "core", "network"]

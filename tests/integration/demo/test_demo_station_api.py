@@ -62,7 +62,8 @@ def played() -> Played:
 
 @pytest.fixture
 async def server(played: Played) -> AsyncIterator[TestServer]:
-    async with TestServer(played.app()) as server:
+    server = TestServer(played.app())
+    async with server:
         yield server
 
 

@@ -14,7 +14,7 @@ from rce.link.socket_carrier import SocketCarrier
 from rce.model.specs import Resources
 
 if TYPE_CHECKING:
-    from conftest import Party, Rig
+    from integration.link.conftest import Party, Rig
 
 RATE = 1_000_000
 ENDS = [("SubscriberInterface", "PublisherConverter"), ("SubscriberInterface", "PublisherConverter")]

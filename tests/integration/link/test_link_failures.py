@@ -38,7 +38,7 @@ def kill_link(party: Party) -> None:
         link.carrier.close()
         link.carrier_lost(link.carrier, LinkLostError("killed"))
     else:
-        link.carrier.abort(LinkLostError("killed"))  # type: ignore[attr-defined]
+        link.carrier.abort(LinkLostError("killed"))
 
 
 @pytest.mark.parametrize("side", [0, 1])

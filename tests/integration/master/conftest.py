@@ -2,10 +2,10 @@ from __future__ import annotations
 
 import asyncio
 import tempfile
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import aiohttp
 import pytest
@@ -30,8 +30,23 @@ from rce_master.master import Master, RunningMaster
 from rce_master.settings import MasterSettings
 from rce_master.store import MemoryStore, Store
 
+T = TypeVar("T")
+
 SECRET = Secret("a secret for the tests")
 HASHER = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
+
+
+class RunSite(Protocol):
+    """Runs a master; see :func:`running_site`."""
+
+    def __call__(
+        self,
+        store: Store | None = None,
+        state_dir: Path | None = None,
+        *,
+        log_in: bool = True,
+        **options: Any,
+    ) -> AbstractAsyncContextManager[Site]: ...
 
 
 class TaskSet:
@@ -68,7 +83,7 @@ class TaskSet:
         else:
             self.inbox.put_nowait(message)
 
-    async def get(self, kind: type[Any]) -> Any:
+    async def get(self, kind: type[T]) -> T:
         async with asyncio.timeout(10):
             while True:
                 message = await self.inbox.get()
@@ -160,7 +175,7 @@ async def running_site(
 
 
 @pytest.fixture
-def run_site() -> Callable[..., AbstractAsyncContextManager[Site]]:
+def run_site() -> RunSite:
     return running_site
 
 

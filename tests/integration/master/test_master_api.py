@@ -19,10 +19,7 @@ from rce.control.model import (
 from rce_master.auth import client_digest
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from contextlib import AbstractAsyncContextManager
-
-    from conftest import Site
+    from integration.master.conftest import RunSite, Site
 
 INTERFACE = {"tag": "in", "type": "PublisherInterface", "cls": "std_msgs/String", "addr": "/in"}
 
@@ -255,7 +252,7 @@ async def test_the_document_describes_every_route(site: Site) -> None:
 
 
 async def test_a_master_that_ends_lets_go_of_streams(
-    run_site: Callable[..., AbstractAsyncContextManager[Site]],
+    run_site: RunSite,
 ) -> None:
     async with run_site() as site:
         headers = {"Authorization": f"Bearer {site.token}"}

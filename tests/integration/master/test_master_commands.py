@@ -17,7 +17,7 @@ from rce_master.cli.exceptions import ApiError, CliError, NotLoggedInError
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from conftest import Site
+    from integration.master.conftest import Site
 
 
 def printed(renderable: object) -> str:

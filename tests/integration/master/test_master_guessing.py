@@ -18,13 +18,11 @@ from rce_master.state.records import User, UserRole
 from rce_master.throttle import FREE, FREE_OF_ADDRESS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from contextlib import AbstractAsyncContextManager
+    from collections.abc import Iterator
     from pathlib import Path
 
-    from conftest import Site
+    from integration.master.conftest import RunSite
 
-    RunSite = Callable[..., AbstractAsyncContextManager[Site]]
 
 GUESSES = 40
 HASHER = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)

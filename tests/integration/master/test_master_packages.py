@@ -8,7 +8,6 @@ import hashlib
 import io
 import stat
 from collections.abc import AsyncIterator, Callable
-from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,9 +27,7 @@ from rce_master.state.settings import StateSettings
 from rce_master.store import MemoryStore
 
 if TYPE_CHECKING:
-    from conftest import Site
-
-RunSite = Callable[..., AbstractAsyncContextManager["Site"]]
+    from integration.master.conftest import RunSite, Site
 
 
 @pytest.fixture
@@ -158,15 +155,22 @@ async def test_another_user_neither_sees_nor_uses_it(shop: Site, tmp_path: Path)
 
 
 async def send(
-    site: Site, folder: Path, key: SigningKey, *, user: str = "testUser", spoil: bool = False, **told: str
+    site: Site,
+    folder: Path,
+    key: SigningKey,
+    *,
+    user: str = "testUser",
+    spoil: bool = False,
+    signature: str | None = None,
 ) -> tuple[int, str]:
     """Push as a program of one's own would, with something else told than what is true."""
     source = look_into(folder)
     archive = io.BytesIO()
     source.pack(archive)
     body = archive.getvalue()
-    signature = key.sign(statement(user, "nav", "1.0", hashlib.sha256(body).hexdigest()))
-    query = {"key": key.public, "signature": signature, **told}
+    if signature is None:
+        signature = key.sign(statement(user, "nav", "1.0", hashlib.sha256(body).hexdigest()))
+    query = {"key": key.public, "signature": signature}
     headers = {"Authorization": f"Bearer {site.token}"}
     body = body[:-9] + bytes([body[-9] ^ 1]) + body[-8:] if spoil else body
     async with site.session.put(
@@ -181,8 +185,8 @@ async def test_what_was_not_signed_by_a_known_key_is_refused(shop: Site, tmp_pat
     assert status == 403
     assert "not registered" in text
     await shop.api("POST", "/package-keys", {"key": key.public, "label": "x"}, status=201)
-    for told in ({"signature": "00" * 64}, {"signature": "xyz"}):
-        status, text = await send(shop, package, key, **told)
+    for wrong in ("00" * 64, "xyz"):
+        status, text = await send(shop, package, key, signature=wrong)
         assert (status, "does not fit the key" in text) == (422, True), text
     status, _ = await send(shop, package, key, user="eve")
     assert status == 422

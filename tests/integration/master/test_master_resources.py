@@ -25,10 +25,9 @@ from rce_master.store import MemoryStore
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-    from contextlib import AbstractAsyncContextManager
     from pathlib import Path
 
-    from conftest import Site, TaskSet
+    from integration.master.conftest import RunSite, Site, TaskSet
 
     from rce_master.store import Row
 
@@ -210,7 +209,7 @@ async def test_only_administrators_drain(site: Site) -> None:
     assert (await site.api("GET", "/usage", token=anna))["machines"] == []
 
 
-async def test_a_drain_outlives_a_restart(run_site: Callable[..., AbstractAsyncContextManager[Site]]) -> None:
+async def test_a_drain_outlives_a_restart(run_site: RunSite) -> None:
     store = MemoryStore()
     async with run_site(store) as site, site.containers(machine=small()):
         await site.api("PUT", "/machines/m1/drain")
@@ -366,7 +365,7 @@ class BrokenStore(MemoryStore):
 
 
 async def test_health_tells_of_a_broken_store(
-    run_site: Callable[..., AbstractAsyncContextManager[Site]],
+    run_site: RunSite,
 ) -> None:
     store = BrokenStore()
 

@@ -13,12 +13,10 @@ from rce_master.auth import client_digest
 from rce_master.quotas import QuotaSettings
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-    from contextlib import AbstractAsyncContextManager
+    from collections.abc import AsyncIterator
 
-    from conftest import Site, TaskSet
+    from integration.master.conftest import RunSite, Site, TaskSet
 
-    RunSite = Callable[..., AbstractAsyncContextManager[Site]]
 
 SMALL = QuotaSettings(requests=1, request_burst=20, streams=3, log_reads=2)
 HEADERS = {"Content-Type": "application/gzip"}

@@ -36,6 +36,7 @@ async def test_a_core_of_the_same_process_is_watched(network: DiscoveryNetwork) 
                     async for _ in events:
                         if discovery.info is not None and "/said" in discovery.info.publishers:
                             break
+            assert discovery.info is not None
             assert discovery.info.nodes["/n"].is_local
 
 

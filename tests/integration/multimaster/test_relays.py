@@ -233,6 +233,7 @@ async def test_a_broken_link_takes_back_and_comes_back() -> None:
         await cloud.wait_until(lambda graph: "/said" in graph.topic_types, timeout=20)
         with cloud.watch() as events:
             (link,) = one._links._running
+            assert link._transport is not None
             link._transport.abort()
             gone = back = False
             async with asyncio.timeout(20):

@@ -17,7 +17,8 @@ from typing import Any
 
 import aiohttp
 import pytest
-from support.engine import Program, free_ports
+from support.engine import Program
+from support.ports import free_ports
 
 from rce_master.backup import MANIFEST
 from rce_master.store.sqlite import SCHEMA_VERSION

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from contextlib import AsyncExitStack, asynccontextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -138,19 +139,20 @@ async def test_latched_over_limit_are_dropped_oldest_first() -> None:
         ends = [await cloud.wire(f"map{number}", "PublisherForwarder", STRING) for number in range(60)]
         async with dial(cloud, "testUser", "testRobot"):
             for end in ends:
-                await end.active.until(lambda end=end: end.is_active)
+                await end.until_active()
 
-        def arrived() -> int:
+        def have_arrived(count: int) -> bool:
             usage = cloud.master.usage
             found = {} if usage is None else usage.endpoints["testUser/testRobot"].interfaces
-            return sum(interface.messages_in for interface in found.values())
+            return sum(interface.messages_in for interface in found.values()) >= count
 
         for count in range(10, 61, 10):
             for end in ends[count - 10 : count]:
                 end.port.send(bytes(MIB), latched=True)
-            await cloud.master.changed.until(lambda count=count: arrived() >= count)
+            await cloud.master.changed.until(partial(have_arrived, count))
             assert cloud.master.usage is not None
             assert cloud.master.usage.held <= 20 * MIB
+        assert cloud.master.usage is not None
         assert cloud.master.usage.held > 15 * MIB
 
 
@@ -161,7 +163,7 @@ async def test_a_burst_of_latched_messages_reaches_a_robot_that_reads() -> None:
         ends = [await cloud.wire(f"map{number}", "PublisherForwarder", STRING) for number in range(count)]
         async with dial(cloud, "testUser", "testRobot"):
             for end in ends:
-                await end.active.until(lambda end=end: end.is_active)
+                await end.until_active()
         for end in ends:
             end.port.send(bytes(size), latched=True)
         await cloud.master.changed.until(
@@ -169,7 +171,7 @@ async def test_a_burst_of_latched_messages_reaches_a_robot_that_reads() -> None:
         )
         query = f"userID=testUser&robotID=testRobot&password={DIGEST}"
         async with connect(f"{cloud.ws_url}?{query}", proxy=None, compression=None, max_size=None) as robot:
-            tags = set()
+            tags: set[str] = set()
             binaries = 0
             async with asyncio.timeout(60):
                 while len(tags) < count or binaries < count:
@@ -190,7 +192,7 @@ async def test_a_latched_burst_over_the_limit_does_not_end_the_link() -> None:
         after = await cloud.wire("after", "PublisherForwarder", STRING)
         async with dial(cloud, "testUser", "testRobot") as robot:
             for end in (*ends, after):
-                await end.active.until(lambda end=end: end.is_active)
+                await end.until_active()
             for end in ends:
                 end.port.send(bytes(size), latched=True)
 
@@ -199,10 +201,8 @@ async def test_a_latched_burst_over_the_limit_does_not_end_the_link() -> None:
                 if usage is None or usage.held > limit or "testUser/testRobot" not in usage.endpoints:
                     return False
                 interfaces = usage.endpoints["testUser/testRobot"].interfaces
-                came, dropped = (
-                    sum(getattr(interface, name) for interface in interfaces.values())
-                    for name in ("messages_in", "dropped")
-                )
+                came = sum(interface.messages_in for interface in interfaces.values())
+                dropped = sum(interface.dropped for interface in interfaces.values())
                 return came > 0 and dropped > 0 and came + dropped >= count
 
             await cloud.master.changed.until(moved)
@@ -221,7 +221,7 @@ async def test_a_call_dropped_while_it_comes_in_ends_at_its_caller() -> None:
     async with running_cloud(PATIENT, user_memory=16 * MIB) as cloud:
         end = await cloud.wire("serve", "ServiceClientForwarder", "std_srvs/SetBool")
         async with dial(cloud, "testUser", "testRobot"):
-            await end.active.until(lambda: end.is_active)
+            await end.until_active()
             with pytest.raises(OverloadedError, match="the request was dropped: memory is short"):
                 await end.port.call(bytes(30 * MIB))
             assert end.losses == 0

@@ -83,7 +83,7 @@ async def test_timers_and_rates_when_time_jumps_back(core: Core, make_node: Make
         await publisher.wait_for_subscribers(2, timeout=10)
         await tick(publisher, a, 100.0)
         calls: list[tuple[float, float, float | None]] = []
-        a.timer(2.0, lambda event: calls.append(tuple(event)))
+        a.timer(2.0, lambda event: calls.append((event.expected, event.now, event.last)))
         once = a.timer(3.0, lambda event: None, oneshot=True)
         beats: list[float] = []
 

@@ -89,7 +89,8 @@ async def service_answers(graph: Graph) -> dict[str, Any]:
     where = urlsplit(await graph.service("/peer_set"))
     assert where.hostname
     assert where.port
-    return {case: await answer(where.hostname, where.port, it) for case, it in SERVICE_HEADERS.items()}
+    host, port = where.hostname, where.port
+    return {case: await answer(host, port, fields) for case, fields in SERVICE_HEADERS.items()}
 
 
 @pytest.mark.parametrize("language", ["rospy", pytest.param("roscpp", marks=pytest.mark.needs("roscpp"))])

@@ -265,7 +265,7 @@ async def test_roslaunch(graph: Graph, make_node: MakeNode) -> None:
         publisher = await node.advertise("launched_in", STRING)
         async with graph.program("roslaunch", "--wait", str(graph.home / "a.launch"), node="/robot/relay"):
             await publisher.wait_for_subscribers(timeout=40)
-            heard = asyncio.create_task(anext(aiter(out)))  # type: ignore[arg-type]
+            heard = asyncio.create_task(out.__anext__())
             async with asyncio.timeout(40):
                 while not heard.done():
                     publisher.publish(data="through it")

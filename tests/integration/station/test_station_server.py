@@ -6,6 +6,7 @@ import json
 from collections.abc import AsyncIterator
 
 import pytest
+from aiohttp import web
 from aiohttp.test_utils import TestClient, TestServer
 
 from rce_fleet.station.authentication import TokenAuthenticator
@@ -40,7 +41,7 @@ class RunningStation:
 
     def __init__(self) -> None:
         self.view, self.fleet, self.pages = FleetView(), RecordingFleet(), Broadcast()
-        self.client: TestClient
+        self.client: TestClient[web.Request, web.Application]
 
     async def start(self, token: str = "") -> None:
         app = Station(self.view, self.fleet, self.pages, authenticator=TokenAuthenticator(token)).make_app()

@@ -90,7 +90,7 @@ def test_action_is_five_topics(type_: str) -> None:
 
 def test_interfaces_of_the_file_are_used_again() -> None:
     own = {"eTag": "R1", "iTag": "mine", "iType": "SubscriberConverter", "iCls": POSE, "addr": "/pose"}
-    bridges = [
+    bridges: list[dict[str, Any]] = [
         {"topic": "/pose", "type": POSE, "from": "robot", "to": "c1"},
         {"topic": "pose", "type": POSE, "from": "robot", "to": ["c1", "c2"]},
     ]

@@ -182,7 +182,8 @@ def test_the_task_set_s_folder_is_there_while_it_has_containers(tree: Tree2) -> 
 
 def test_a_folder_that_vanishes_meanwhile_is_made_again(tree: Tree2, monkeypatch: pytest.MonkeyPatch) -> None:
     made = limiter(tree)
-    make, spoiled = tree.make, []
+    make = tree.make
+    spoiled: list[Path] = []
 
     def spoil(folder: Path) -> None:
         if folder.name == "m1" and not spoiled:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import msgspec
 from hypothesis import given
 from hypothesis import strategies as st
@@ -11,6 +13,8 @@ from rce.control.model import EndpointKind, EndpointSpec, EndpointState, Endpoin
 from rce_container import core, events
 from rce_container.core import ManagerCore
 from rce_container.life import CONTAINER_LIFE, Phase
+
+T = TypeVar("T")
 
 ID = "user/box"
 ADDRESS = LinkAddress(machine="m", unix="/run/x")
@@ -32,7 +36,7 @@ def running(incarnation_id: str = "one", revision: int = 1) -> ManagerCore:
     return manager
 
 
-def told(out: list[events.Instruction], kind: type) -> list:
+def told(out: list[events.Instruction], kind: type[T]) -> list[T]:
     return [one.message for one in out if isinstance(one, events.Tell) and isinstance(one.message, kind)]
 
 

@@ -33,7 +33,7 @@ def program() -> bytes:
 
 
 def number(call: str) -> int:
-    return ctypes.CDLL(LIBRARY).seccomp_syscall_resolve_name(call.encode())
+    return int(ctypes.CDLL(LIBRARY).seccomp_syscall_resolve_name(call.encode()))
 
 
 def run(program: bytes, data: bytes) -> int:

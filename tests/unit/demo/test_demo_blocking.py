@@ -22,8 +22,7 @@ def test_the_middle_of_the_path_is_blocked_and_its_effect_seen() -> None:
     assert block.update(fleet(around, blocked=[cell]), (), 0.7) is BlockAction.NOTHING
     assert not block.done, "the box is not there yet"
     assert block.update(fleet(around, blocked=[cell]), (cell,), 0.9) is BlockAction.NOTHING
-    assert block.done == [cell]
-    assert not block.in_progress
+    assert (block.done, block.in_progress) == ([cell], False)
     assert block.update(fleet(robot("a", cell=0, goal=3, plan=ROW)), (), 9.0) is BlockAction.NOTHING
 
 

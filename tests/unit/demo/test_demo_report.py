@@ -22,7 +22,7 @@ def make_report(reached: set[str], problem: str = "", **world: Any) -> RunReport
     unused: Any = None
     run = ScenarioRun(unused, SCENARIO, lambda: None, lambda _: None)
     run.reached = reached
-    return RunReport(SCENARIO, 0, run, truth(apart=0.5, **ROBOTS, **world), MessageTotals(10, 1), problem)
+    return RunReport(SCENARIO, 0, run, truth(ROBOTS, apart=0.5, **world), MessageTotals(10, 1), problem)
 
 
 def test_report_of_a_good_run() -> None:

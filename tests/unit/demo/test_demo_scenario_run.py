@@ -75,7 +75,7 @@ class FakeStation:
 
     def truth(self) -> WorldReport:
         at_goal = self._driven >= 12 and self.truly_at_goal
-        return truth(boxes=self.blocked, Robot1=3 if at_goal else 1)
+        return truth({"Robot1": 3 if at_goal else 1}, boxes=self.blocked)
 
 
 @pytest.fixture(autouse=True)

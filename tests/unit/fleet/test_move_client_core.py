@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from math import pi
-from typing import Any
 
 import pytest
 
@@ -13,6 +12,7 @@ from rce_fleet.coordination.move_client import (
     ClientReport,
     ClientState,
     GoalState,
+    Instruction,
     MoveClient,
     SendGoal,
     SendStop,
@@ -32,16 +32,20 @@ def client() -> MoveClient:
     return made
 
 
-def goal_of(instructions: list[Any]) -> SendGoal:
+def goal_of(instructions: list[Instruction]) -> SendGoal:
     (found,) = [done for done in instructions if isinstance(done, SendGoal)]
     return found
 
 
-def cells_sent(instructions: list[Any]) -> list[int]:
+def state_of(client: MoveClient) -> ClientState:
+    return client.report.state
+
+
+def cells_sent(instructions: list[Instruction]) -> list[int]:
     return [done.cell for done in instructions if isinstance(done, SendGoal)]
 
 
-def reach(client: MoveClient, goal: SendGoal, now: float = 11.0) -> list[Any]:
+def reach(client: MoveClient, goal: SendGoal, now: float = 11.0) -> list[Instruction]:
     return client.take_result(goal.id, GoalState.SUCCEEDED, now)
 
 
@@ -51,7 +55,8 @@ def test_first_cell_is_its_own_goal_then_straight_runs(client: MoveClient) -> No
     goal = goal_of(reach(client, goal))
     assert (goal.cell, goal.heading) == (2, 0.0)
     goal = goal_of(reach(client, goal))
-    assert (goal.cell, goal.heading) == (18, pytest.approx(pi / 2))
+    assert goal.cell == 18
+    assert goal.heading == pytest.approx(pi / 2)
     done = reach(client, goal)
     assert cells_sent(done) == []
     assert client.report == ClientReport(1, ClientState.IDLE, (0, 1, 2, 10, 18), 18, None)
@@ -115,7 +120,7 @@ def test_a_cancellation_stops_the_robot_and_drops_the_list(client: MoveClient) -
     assert client.report == ClientReport(1, ClientState.CANCELLING, (), None, None)
     assert client.take_goal_states({goal.id: GoalState.PREEMPTING}, 10.6) == []
     client.take_result(goal.id, GoalState.PREEMPTED, 10.7)
-    assert client.report.state is ClientState.IDLE
+    assert state_of(client) is ClientState.IDLE
 
 
 def test_an_empty_list_is_a_cancellation(client: MoveClient) -> None:
@@ -164,9 +169,9 @@ def test_goal_that_the_robot_never_received_times_out(client: MoveClient) -> Non
     client.take_cells(1, [0, 1], 10.0)
     client.cancel(10.5)
     client.take_goal_states({}, 10.6)
-    assert client.report.state is ClientState.CANCELLING
+    assert state_of(client) is ClientState.CANCELLING
     client.take_goal_states({}, 10.6 + QUIET_TIME)
-    assert client.report.state is ClientState.IDLE
+    assert state_of(client) is ClientState.IDLE
 
 
 def test_goal_from_before_a_restart_is_waited_for() -> None:
@@ -174,9 +179,9 @@ def test_goal_from_before_a_restart_is_waited_for() -> None:
     assert client.take_goal_states({}, 5.0) == [SendStop(5.0)]
     client.take_goal_states({"old": GoalState.ACTIVE}, 5.5)
     client.take_goal_states({"old": GoalState.PREEMPTED}, 6.0)
-    assert client.report.state is ClientState.CANCELLING
+    assert state_of(client) is ClientState.CANCELLING
     client.take_goal_states({"old": GoalState.PREEMPTED}, 6.0 + QUIET_TIME)
-    assert client.report.state is ClientState.IDLE
+    assert state_of(client) is ClientState.IDLE
 
 
 def test_a_robot_that_gives_up_is_reported_and_can_be_sent_again(client: MoveClient) -> None:

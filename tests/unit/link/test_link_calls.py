@@ -165,6 +165,9 @@ class Ping:
         else:
             self.carrier.control(frame)
 
+    def grew(self) -> None:
+        pass
+
     def carrier_lost(self, carrier: Carrier, reason: Exception) -> None:
         self.lost.append(reason)
         self.enough.set()

@@ -214,16 +214,16 @@ def test_copies_count_where_they_are_made(two: World) -> None:
 
 
 def test_a_group_moves_as_a_whole(world: World) -> None:
-    machine = {"networks": ("none", "group")}
-    world.container_set("c1", name="m1", slots=4, **machine)
+    networks = ("none", "group")
+    world.container_set("c1", name="m1", slots=4, networks=networks)
     for tag in "ab":
         world.container(tag, network=Network.GROUP, group="g")
         report(world, tag, "c1")
-    world.container_set("c2", name="m2", slots=1, **machine)
+    world.container_set("c2", name="m2", slots=1, networks=networks)
     changes = drain(world)
     texts = [h.text for h in changes.events if h.kind == "container_stays"]
     assert "it moves with 1 others of its group; no machine has room for all of them" in texts[0]
-    world.container_set("c3", name="m3", slots=2, **machine)
+    world.container_set("c3", name="m3", slots=2, networks=networks)
     world.tick(1)
     assert moves(world) == {"a": "c3", "b": "c3"}
     report(world, "a", "c3")

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Any, Self
 
 import pytest
+from rce_master.cli.client import ApiClient
 
 from rce.control.logs import LogLevel
-from rce_master.cli import follow
+from rce_master.cli import credentials, follow
 from rce_master.cli.exceptions import ApiError
 
 
@@ -48,8 +49,8 @@ class Server:
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch) -> Server:
     server = Server(one="first life", two="second life")
-    monkeypatch.setattr(follow.credentials, "load", lambda: None)
-    monkeypatch.setattr(follow.ApiClient, "of", lambda _: server)
+    monkeypatch.setattr(credentials, "load", lambda: None)
+    monkeypatch.setattr(ApiClient, "of", lambda _: server)
     monkeypatch.setattr(follow, "POLL_S", 0.0)
     return server
 

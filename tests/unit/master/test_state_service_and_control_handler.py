@@ -11,6 +11,7 @@ import pytest
 from argon2 import PasswordHasher
 
 from rce.control.exceptions import PeerTimeoutError
+from rce.control.logs import LogQuery
 from rce.control.messages import (
     CONTROL_VERSION,
     ClientReply,
@@ -76,11 +77,19 @@ class FakePeer:
         self.inbox: asyncio.Queue[ToTaskSet] = asyncio.Queue()
         self.log = LogChunk(request=0, offset=5, text="hello")
         self.requests = 0
+        self.features: frozenset[str] = frozenset()
 
     def send(self, message: ToTaskSet) -> None:
         self.inbox.put_nowait(message)
 
-    async def read_log(self, id: str, node: str, offset: int = 0, limit: int = 65536, **_: Any) -> LogChunk:  # noqa: A002
+    async def read_log(
+        self,
+        id: str,  # noqa: A002 - wire name
+        node: str,
+        offset: int = 0,
+        limit: int = 65536,
+        query: LogQuery = LogQuery(),  # noqa: B008 - it is frozen
+    ) -> LogChunk:
         if self.log.text == "away":
             raise PeerTimeoutError(self.process, 1.0)
         return self.log

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Collection, Coroutine, Sequence
 from typing import Any
 
 import pytest
@@ -12,6 +12,7 @@ import pytest
 from rce.aio.queues import OverflowPolicy
 from rce.guard.holdings import Holding, Holdings
 from rce.link import (
+    Buffer,
     CallTimeoutError,
     InterfaceError,
     NotConnectedError,
@@ -33,7 +34,7 @@ from rce_robot.factory import FormFactory
 from rce_robot.interface import RobotInterface
 from rce_robot.interfaces import make_interface
 from rce_robot.outbox import Queued
-from rce_robot.outgoing import Outgoing, Serialized
+from rce_robot.outgoing import Outgoing, Rendered, Serialized
 from rce_robot.services import AnsweredByRobot
 
 STRING = "std_msgs/String"
@@ -50,15 +51,15 @@ class FakePort:
         self.latched: dict[str, bytes] = {}
         self.answer: bytes | Exception | asyncio.Future[bytes] = b""
 
-    def send(self, payload: Any, *, latched: bool = False, source: str = "") -> None:
+    def send(self, payload: Buffer, *, latched: bool = False, source: str = "") -> None:
         self.sent.append(bytes(payload))
         if latched:
             self.latched[source] = bytes(payload)
 
-    def keep_latched(self, sources: Sequence[str]) -> None:
+    def keep_latched(self, sources: Collection[str]) -> None:
         self.latched = {source: self.latched[source] for source in sources if source in self.latched}
 
-    async def call(self, payload: Any, *, timeout: float | None = None) -> bytes:
+    async def call(self, payload: Buffer, *, timeout: float | None = None) -> bytes:
         self.sent.append(bytes(payload))
         if isinstance(self.answer, Exception):
             raise self.answer
@@ -69,8 +70,8 @@ class FakeRobot:
     def __init__(self) -> None:
         self.connected = True
         self.room = True
-        self.data: list[tuple[Outgoing, OverflowPolicy]] = []
-        self.urgent: list[Outgoing] = []
+        self.data: list[tuple[Rendered, OverflowPolicy]] = []
+        self.urgent: list[Rendered] = []
         self.reports: list[str] = []
         self.states: list[bool] = []
         self.dropped = 0
@@ -152,8 +153,9 @@ class Setup:
         )
 
 
-def shown(outgoing: Outgoing) -> Any:
-    return json.loads(outgoing.text)["data"]
+def shown(message: Rendered) -> Any:
+    assert isinstance(message, Outgoing)
+    return json.loads(bytes(message.text))["data"]
 
 
 def ros_string(text: str) -> bytes:
@@ -312,6 +314,7 @@ async def test_pictures_are_converted_elsewhere_and_in_order() -> None:
     await asyncio.gather(*setup.robot.work)
     assert len(setup.robot.data) == 3
     for message, _ in setup.robot.data:
+        assert isinstance(message, Outgoing)
         ((_, frame),) = message.binaries
         assert bytes(frame)[32:40] == b"\x89PNG\r\n\x1a\n"
 

@@ -203,7 +203,8 @@ MD5_OF_HEADER = re.compile(r"struct MD5Sum<.*?return \"([0-9a-f]{32})\"", re.DOT
 def test_installed_definitions_have_ros_checksums() -> None:
     """Each ``.msg`` and ``.srv`` in ``/usr/share`` is compared with genpy's class and gencpp's header."""
     types, classes = TypeRegistry(PackageIndex(["/usr/share"])), _system_ros()
-    compared, alone = set(), set()
+    compared: set[str] = set()
+    alone: set[str] = set()
     for kind, of in (("msg", types.message), ("srv", types.service)):
         for file in Path("/usr/share").glob(f"*/{kind}/*.{kind}"):
             name = f"{file.parts[-3]}/{file.stem}"

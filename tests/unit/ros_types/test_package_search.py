@@ -7,6 +7,7 @@ import logging
 import os
 import random
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
@@ -145,7 +146,7 @@ def test_a_large_tree_is_looked_at_seldom(tmp_path: Path, monkeypatch: pytest.Mo
         clock[0] += 0.001
         return clock[0]
 
-    monkeypatch.setattr(package_tree.time, "monotonic", now)
+    monkeypatch.setattr(time, "monotonic", now)
     searched = tree(tmp_path)
     for _ in range(10_000):
         searched.packages()
