@@ -23,12 +23,15 @@ import uvloop
 from benchmarks.figures import percentile, save, show
 from benchmarks.summary import main as summarize
 from rce_fleet.coordination.events import (
+    BlockedChanged,
     Event,
     GoalSet,
     MakePlan,
     PlanMade,
     PoseSeen,
+    Reply,
     ReportSeen,
+    SendCancel,
     SendCells,
     Tick,
 )
@@ -70,6 +73,8 @@ class Fleet:
                     self.requests.append(request)
                 case SendCells(robot, revision, cells):
                     self.revisions[robot] = revision, cells
+                case SendCancel() | Reply() | BlockedChanged():
+                    pass
 
     def pose(self, robot: str) -> PoseSeen:
         """The pose that a robot sends next."""

@@ -381,9 +381,7 @@ class Hunger:
     @contextlib.asynccontextmanager
     async def _robot(self, interfaces: tuple[InterfaceSpec, ...]) -> AsyncIterator[None]:
         """A robot of the attacker's, wired to its container."""
-        await until(
-            lambda: (one := self._machine.status(self._id)) and one.state is EndpointState.RUNNING
-        )
+        await until(lambda: (one := self._machine.status(self._id)) and one.state is EndpointState.RUNNING)
         status = self._machine.reported(self._id)
         robot = Peer(MACHINE)
         await robot.wire(status.address, interfaces, id_=self._id)

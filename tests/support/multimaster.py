@@ -80,7 +80,7 @@ class Machine:
         assert self.core is not None
         return self.core.graph
 
-    async def until(self, condition: Callable[..., bool], timeout: float = 20) -> None:
+    async def until(self, condition: Callable[[Graph], bool], timeout: float = 20) -> None:
         assert self.core is not None
         await self.core.wait_until(condition, timeout=timeout)
 

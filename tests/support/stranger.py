@@ -65,6 +65,8 @@ class Stranger:
                     self.errors.append(data)
                 case "DM":
                     self.queue(data["iTag"]).put_nowait(data)
+                case _:
+                    pass  # a message of a later engine
             self._changed.notify_all()
 
     def queue(self, tag: str) -> asyncio.Queue[dict[str, Any]]:

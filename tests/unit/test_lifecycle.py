@@ -97,7 +97,8 @@ def test_the_table_cannot_be_changed() -> None:
 
 @given(st.lists(st.sampled_from(Act), max_size=50))
 def test_a_state_machine_goes_where_the_table_says(acts: list[Act]) -> None:
-    machine, state, done = DOOR.start(Door.OPEN), Door.OPEN, []
+    machine, state = DOOR.start(Door.OPEN), Door.OPEN
+    done: list[Act] = []
     for act in acts:
         if machine.allows(act):
             state = DOOR.table[state][act]

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-TREES = ("rce", "rce_client", "rce_container", "rce_fleet", "rce_master", "rce_robot")
-TREES += ("benchmarks", "examples", "tests", "tools")
+PACKAGES = ("rce", "rce_client", "rce_container", "rce_fleet", "rce_master", "rce_robot")
+TREES = (*PACKAGES, "benchmarks", "examples", "tests", "tools")
 ENGINE = ("rce", "rce_client", "rce_container", "rce_master", "rce_robot")
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z0-9]+")
 
@@ -162,7 +162,8 @@ def _names_of_node(node: ast.AST) -> list[tuple[str, Kind]]:
             return [(name, Kind.VARIABLE)]
         case ast.ExceptHandler(name=str(name)):
             return [(name, Kind.VARIABLE)]
-    return []
+        case _:
+            return []
 
 
 @cache

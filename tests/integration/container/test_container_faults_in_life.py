@@ -70,8 +70,10 @@ class Stage:
             case "stopping":
                 await self.reach("running")
                 await machine.manager.handle(Drop(id=BOX, revision=9))
-                await until(lambda: machine.status(BOX).state is EndpointState.STOPPING)  # type: ignore[union-attr]
+                await until(lambda: machine.reported(BOX).state is EndpointState.STOPPING)
                 await machine.log_holds(BOX, "node", "no ")
+            case _:
+                raise ValueError(step)
         machine.note_processes()
 
     def pid_of(self, part: str) -> int:
@@ -141,12 +143,12 @@ async def test_what_is_wanted_comes_to_life_again(stage: Stage, step: str, part:
         stage.go_on()
         if part != "fork server":
             await until(
-                lambda: machine.status(BOX).incarnation not in ("", incarnation_id),
+                lambda: machine.reported(BOX).incarnation not in ("", incarnation_id),
                 what="another incarnation",
-            )  # type: ignore[union-attr]
+            )
             assert [pid for pid, start in old.items() if proc.alive(pid, start)] == []
             assert not [path for path in machine.containers if path.name == incarnation_id]
-        await until(lambda: machine.status(BOX).state is EndpointState.RUNNING)  # type: ignore[union-attr]
+        await until(lambda: machine.reported(BOX).state is EndpointState.RUNNING)
         assert len(machine.containers) == 1
 
 

@@ -6,8 +6,8 @@ import asyncio
 import os
 import signal
 import sys
+from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any
 
 import psutil
 import pytest
@@ -15,6 +15,8 @@ import pytest
 from rce_fleet.demo import programs as programs_module
 from rce_fleet.demo.exceptions import DemoError, NotReadyError, ProgramEndedError
 from rce_fleet.demo.programs import ProgramGroup
+
+Stop = Callable[..., Awaitable[None]]
 
 TALKER = "import time\nprint('talker ready: 42')\ntime.sleep(600)"
 DEAF = "import signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\nprint('up')\ntime.sleep(600)"
@@ -158,7 +160,9 @@ async def test_stop_last_programs_are_stopped_last(tmp_path: Path) -> None:
             await group.wait_line(program, "up", 20)
             stop = program.child.stop
 
-            async def noted(name: str = name, stop: Callable[..., Awaitable[None]] = stop, **options: float) -> None:
+            async def noted(
+                name: str = name, stop: Callable[..., Awaitable[None]] = stop, **options: float
+            ) -> None:
                 await stop(**options)
                 ended.append(name)
 

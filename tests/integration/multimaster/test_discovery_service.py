@@ -112,7 +112,7 @@ async def test_robot_hosts_find_each_other_without_multicast(network: DiscoveryN
                 listen_mcast=False,
                 robot_hosts=(f"127.0.0.1:{other}",),
             )
-            for core, name, own, other in ((a, "a", *ports), (b, "b", *reversed(ports)))
+            for core, name, own, other in ((a, "a", ports[0], ports[1]), (b, "b", ports[1], ports[0]))
         )
         async with Discovery(first) as one, Discovery(second) as two, asyncio.timeout(20):
             for discovery in (one, two):

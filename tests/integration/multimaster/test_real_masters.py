@@ -7,6 +7,7 @@ import signal
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 
 import psutil
@@ -15,6 +16,7 @@ from support.engine import command_line
 from support.multimaster import STRING, DiscoveryNetwork, node, process, real_master, ros_environment
 from support.ports import free_port, free_ports
 
+from rce.ros.core import Graph
 from rce.ros.node import Publisher
 
 TALKER = """
@@ -186,7 +188,7 @@ async def test_a_machine_that_vanished_comes_back_at_other_ports(network: Discov
                 _discovery_process(core.uri, network.port, "--name", "far") as program,
             ):
                 publisher = await far.advertise("said", STRING)
-                await near.until(lambda graph, uri=far.uri: graph.publishers("/said") == {"/n": uri})  # type: ignore[misc]
+                await near.until(partial(_is_published_by, far.uri))
                 await publisher.wait_for_subscribers(timeout=20)
                 publisher.publish(data=life)
                 async with asyncio.timeout(20):
@@ -196,6 +198,10 @@ async def test_a_machine_that_vanished_comes_back_at_other_ports(network: Discov
             await near.until(lambda graph: "/n" not in graph.nodes)
         assert len(seen) == 2
         assert not any(master.online for master in near.discovery.masters if master.name == "far")
+
+
+def _is_published_by(uri: str, graph: Graph) -> bool:
+    return graph.publishers("/said") == {"/n": uri}
 
 
 @asynccontextmanager

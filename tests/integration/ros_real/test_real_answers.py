@@ -121,6 +121,19 @@ async def test_the_core_answers_as_a_real_one(tmp_path: Path) -> None:
     assert differences == [], "\n".join(map(str, differences))
 
 
+ENTRIES: tuple[object, ...] = (
+    "",
+    "nothing",
+    "host:1234",
+    "/path",
+    "http://",
+    "http:/host",
+    "//host:1",
+    "://host",
+    7,
+    [],
+)
+
 SLAVE_CALLS: list[tuple[str, tuple[Any, ...]]] = [
     ("getPid", ("/x",)),
     ("getName", ("/x",)),
@@ -131,21 +144,7 @@ SLAVE_CALLS: list[tuple[str, tuple[Any, ...]]] = [
     ("requestTopic", ("/x", "/peer_out", "TCPROS")),
     ("publisherUpdate", ("/master", "/nothing", [])),
     ("publisherUpdate", ("/master", "/peer_in", "no list")),
-    *(
-        ("publisherUpdate", ("/master", "/peer_in", [entry]))
-        for entry in (
-            "",
-            "nothing",
-            "host:1234",
-            "/path",
-            "http://",
-            "http:/host",
-            "//host:1",
-            "://host",
-            7,
-            [],
-        )
-    ),
+    *(("publisherUpdate", ("/master", "/peer_in", [entry])) for entry in ENTRIES),
     ("publisherUpdate", ("/master", "/peer_in", ["http://127.0.0.1:1/", "nothing"])),
     ("publisherUpdate", ("/master", "/peer_in", ["any://127.0.0.1:1"])),
     ("publisherUpdate", ("/master", "/peer_in", {})),

@@ -49,7 +49,7 @@ TOPIC_HEADERS = {
     "no type": without(RIGHT, "type"),
     "neither topic nor service": without(RIGHT, "topic"),
 }
-SERVICE_HEADERS = {
+SERVICE_HEADERS: dict[str, dict[str, str]] = {
     "right": ASKING,
     "kept": ASKING | {"persistent": "1"},
     "any checksum": ASKING | {"md5sum": "*"},
@@ -86,7 +86,7 @@ async def topic_answers(uri: str) -> dict[str, Any]:
 
 
 async def service_answers(graph: Graph) -> dict[str, Any]:
-    where = urlsplit(await graph.service("/peer_set"))
+    where = urlsplit(str(await graph.service("/peer_set")))
     assert where.hostname
     assert where.port
     host, port = where.hostname, where.port

@@ -32,7 +32,7 @@ from rce_fleet.coordination.replanning import compute_plan
 from rce_fleet.coordination.snapshot import FleetSnapshot, RobotSnapshot, RobotState
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from rce_fleet.coordination.planner import FleetPlanner
     from rce_fleet.planning.grid import GridMap
@@ -274,7 +274,7 @@ class MakeBelieveFleet:
 
     # Mail
 
-    def _post(self, topic: str, robot: str, action: Callable[..., None], *values: Any) -> None:
+    def _post(self, topic: str, robot: str, action: Callable[..., object], *values: Any) -> None:
         """Topics are in order each, as over TCP, but not with one another."""
         if self.rng.random() < self.loss:
             return
@@ -315,7 +315,7 @@ class MakeBelieveFleet:
     def _goal_states(self, robot: str, states: dict[str, GoalState]) -> None:
         self._instruct(robot, self.clients[robot].take_goal_states(states, self.now))
 
-    def _instruct(self, robot: str, instructions: list[Any]) -> None:
+    def _instruct(self, robot: str, instructions: Iterable[SendGoal | SendStop | ClientReport]) -> None:
         for instruction in instructions:
             match instruction:
                 case SendGoal():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rce_fleet.coordination.events import (
+    BlockedChanged,
     CellBlocked,
     Event,
     GoalSet,
@@ -12,8 +13,10 @@ from rce_fleet.coordination.events import (
     MakePlan,
     PlanMade,
     PoseSeen,
+    Reply,
     ReportSeen,
     RobotRemoved,
+    SendCancel,
     SendCells,
     Tick,
 )
@@ -43,6 +46,8 @@ class Desk:
                     self.requests.append(request)
                 case SendCells(robot, revision, cells):
                     self.sent[robot], self.revisions[robot] = cells, revision
+                case SendCancel() | Reply() | BlockedChanged():
+                    pass
         self.planner.validate()
         return done
 

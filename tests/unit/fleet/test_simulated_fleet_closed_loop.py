@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import inf
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -17,12 +17,13 @@ from rce_fleet.coordination.events import (
     ObstacleSeen,
     PlanMade,
     PoseSeen,
+    Reply,
     ReportSeen,
     SendCancel,
     SendCells,
     Tick,
 )
-from rce_fleet.coordination.move_client import MoveClient, SendGoal, SendStop
+from rce_fleet.coordination.move_client import ClientReport, MoveClient, SendGoal, SendStop
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.replanning import compute_plan
 from rce_fleet.coordination.snapshot import RobotState
@@ -34,6 +35,7 @@ from rce_fleet.simulation.obstacles import hit_points
 from rce_fleet.simulation.world import World
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
 
 
@@ -67,8 +69,10 @@ class SimulatedFleet:
                         self.world.add_box(cell)
                 case MakePlan(request):
                     self.plan(PlanMade(compute_plan(request)))
+                case Reply():
+                    pass
 
-    def tell(self, robot: str, instructions: list[Any]) -> None:
+    def tell(self, robot: str, instructions: Iterable[SendGoal | SendStop | ClientReport]) -> None:
         for instruction in instructions:
             match instruction:
                 case SendGoal(goal_id, stamp, cell):
@@ -76,6 +80,8 @@ class SimulatedFleet:
                     self.bases[robot].accept(goal_id, stamp, x, y)
                 case SendStop(stamp):
                     self.bases[robot].cancel("", stamp)
+                case ClientReport():
+                    pass  # it is asked for each time
 
     def step(self, number: int) -> None:
         """0.05 s of the world."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any, Self
 
 import pytest
-from rce_master.cli.client import ApiClient
 
 from rce.control.logs import LogLevel
 from rce_master.cli import credentials, follow
+from rce_master.cli.client import ApiClient
 from rce_master.cli.exceptions import ApiError
 
 
