@@ -37,7 +37,7 @@ class Roles(griffe.Extension):
 def _places(package: griffe.Module) -> dict[str, str]:
     """Return where the pages show an object: its own path, and those by which it is known, to its anchor."""
     shown = {name for page in PAGES.glob("*.md") for name in _SHOWN.findall(page.read_text())}
-    places = {}
+    places: dict[str, str] = {}
     for name in sorted(shown):
         if name.partition(".")[0] == package.path:
             item = package[name.partition(".")[2]]

@@ -138,7 +138,7 @@ class MakeBelieveFleet:
         self.clients: dict[str, MoveClient] = {}
         self.replies: list[Reply] = []
         self._plans: list[tuple[float, PlanMade]] = []
-        self._mail: dict[Any, list[tuple[float, Callable[[], None]]]] = defaultdict(list)
+        self._mail: dict[Any, list[tuple[float, Callable[[], object]]]] = defaultdict(list)
         for number, cell in enumerate(starts, start=1):
             self.add_robot(f"Robot{number}", cell)
 
