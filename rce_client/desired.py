@@ -1,4 +1,4 @@
-"""What a client has asked the engine for: the memory that a reconnect restores from. Pure."""
+"""What a client requested from the engine, to restore it after a reconnect. Pure."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Item = TypeVar("Item")
 
 
 class Desired:
-    """Everything that was made and not removed again.
+    """Everything that was created and not removed.
 
     Invariant: what belongs to a container or an interface is forgotten with it; so what :meth:`restore`
     returns never names something that it does not make itself, unless somebody else made it.
@@ -50,7 +50,7 @@ class Desired:
         """By the two interfaces' paths; which of them is named first means nothing."""
 
     def apply(self, request: Request) -> None:
-        """Remember a request that goes to the engine."""
+        """Store a request that is sent to the engine."""
         match request:
             case CreateContainer():
                 self.containers[request.container_tag] = request
@@ -108,12 +108,12 @@ class Desired:
         return requests
 
     def _outside(self, items: dict[tuple[str, str], Item]) -> Iterable[Item]:
-        """Yield what does not vanish with a container of ours."""
+        """Yield what is not removed with one of our containers."""
         return (item for (endpoint, _), item in items.items() if endpoint not in self.containers)
 
     def _resize(self, request: ResizeContainer) -> None:
         if request.container_tag not in self.containers:
-            return  # whoever made it makes it again
+            return  # the client that created it restores it
         before, now = self.sizes.get(request.container_tag), request.container_data
         if before is not None:
             given = {key: getattr(now, key) for key in now.__struct_fields__}

@@ -36,12 +36,12 @@ _log = logging.getLogger(__name__)
 
 
 IN_USE_DELAY = 3.0
-"""Most seconds until the next attempt if another client has the robotID."""
+"""Maximum seconds until the next attempt if another client has the robotID."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Target:
-    """Whom to connect, and where."""
+    """The client's account and the engine's address."""
 
     url: str
     """The master, ``http://HOST:9000/`` or ``https://``."""
@@ -70,7 +70,7 @@ class Target:
                 proxies log.
 
         Raises:
-            RefusedError: There is only a token, and the endpoint takes none.
+            RefusedError: The client has only a token, and the endpoint does not accept tokens.
         """
         who = {"userID": self.user, "robotID": self.robot}
         digest = hashlib.sha256(self.password.encode()).hexdigest()
@@ -106,7 +106,7 @@ class Timing:
 
 
 class Listener(Protocol):
-    """What an engine transport tells of. Called in the event loop; must not block."""
+    """Gets the events of an engine transport. Called in the event loop; must not block."""
 
     def on_connecting(self) -> None:
         """An attempt to connect begins."""
@@ -125,7 +125,7 @@ class Listener(Protocol):
 
 
 class EngineTransport:
-    """One robot's way to the engine, through any number of connections."""
+    """A robot's transport to the engine; it reconnects when a connection is lost."""
 
     def __init__(
         self,
@@ -143,18 +143,18 @@ class EngineTransport:
         self.connected = False
         self._was_connected = False
         self.features: frozenset[str] = frozenset()
-        """What the endpoint of this connection knows beyond the first protocol."""
+        """Optional protocol features of this connection's endpoint."""
         self.dropped = self._queue.dropped
         """Interface tag to the number of its messages that found no room to wait."""
 
     async def run(self) -> None:
         """Connect again and again, until cancelled.
 
-        An engine that was connected before and cannot prove any more who it is (an expired certificate, for
-        example) is tried again: that ends no robot's program, and is repaired by the operator.
+        An engine that was connected before and is not trusted any more (an expired certificate, say) is
+        tried again: the operator can repair it while robots' programs run.
 
         Raises:
-            RefusedError: The engine does not want this client.
+            RefusedError: The engine refuses this client.
         """
         pauses = self._timing.backoff.start()
         while True:
@@ -215,7 +215,7 @@ class EngineTransport:
             async with asyncio.timeout(self._timing.flush):
                 await self._idle.wait()
         except TimeoutError:
-            _log.warning("the engine takes no messages; what waits to be sent is lost")
+            _log.warning("the engine does not read; messages that wait to be sent are lost")
 
     async def _dial(self) -> EngineSocket:
         target, timing = self._target, self._timing

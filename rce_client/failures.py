@@ -1,4 +1,4 @@
-"""Whether a failure is worth another attempt. Pure."""
+"""Decides whether a failed connection attempt is repeated. Pure."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from rce.tls.faults import explain_to_client, find_tls_error
 from rce_client.exceptions import ClientError, InUseError, RefusedError, UnavailableError, UntrustedError
 
 RETRIED_STATUSES = frozenset((408, 425, 429, 500, 502, 503, 504))
-"""HTTP statuses that another attempt may clear."""
+"""HTTP statuses after which another attempt may succeed."""
 IN_USE = 409
 """The status if another client has the robotID: perhaps a former connection that has not ended yet."""
 
 
 def judge_status(status: int, reason: str) -> ClientError:
-    """Return the error for an HTTP answer that is not the wanted one."""
+    """Return the error for an unexpected HTTP answer."""
     if status == IN_USE:
         return InUseError(reason, status)
     if status in RETRIED_STATUSES:
@@ -25,7 +25,7 @@ def judge_status(status: int, reason: str) -> ClientError:
 
 
 def judge(error: Exception) -> ClientError:
-    """Map whatever an attempt to connect raised.
+    """Return the client error for an exception of a connection attempt.
 
     Returns:
         :class:`UnavailableError` if another attempt is worth it, else :class:`RefusedError`; a

@@ -1,4 +1,4 @@
-"""What the command lines of the task sets have in common."""
+"""Options that the task sets share."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Options of TLS for programs whose settings are their options."""
+"""TLS options of programs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import typer
 if TYPE_CHECKING:
     from rce.config.settings import EngineSettings
 
-Tls = Annotated[bool, typer.Option("--tls", help="Serve in TLS (docs/how-to/tls.md).")]
+Tls = Annotated[bool, typer.Option("--tls", help="Serve with TLS (docs/how-to/tls.md).")]
 Certificates = Annotated[
     Path | None,
     typer.Option(
@@ -18,25 +18,25 @@ Certificates = Annotated[
     ),
 ]
 CertificateName = Annotated[
-    str, typer.Option("--certificate", metavar="NAME", help="The certificate to use of that folder.")
+    str, typer.Option("--certificate", metavar="NAME", help="Name of the certificate in that folder.")
 ]
 TlsCert = Annotated[
     Path | None,
-    typer.Option(metavar="FILE", help="Show this certificate, such as one of a public authority."),
+    typer.Option(metavar="FILE", help="Certificate file to use instead, such as one of a public authority."),
 ]
-TlsKey = Annotated[Path | None, typer.Option(metavar="FILE", help="The key of --tls-cert.")]
+TlsKey = Annotated[Path | None, typer.Option(metavar="FILE", help="Key file of --tls-cert.")]
 Authority = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
         envvar="RCE_AUTHORITY",
-        help="The engine's authority.pem, where its certificate is not of a public authority.",
+        help="The engine's authority.pem, unless its certificate is of a public authority.",
     ),
 ]
 
 
 def tls_of(settings: EngineSettings) -> dict[str, Any]:
-    """Return what the settings file's section ``tls`` says, as values of these options."""
+    """Return the values of these options in the settings file's section ``tls``."""
     tls = settings.tls
     found = {
         "tls": tls.enabled,

@@ -1,4 +1,4 @@
-"""The bridge: each span joins an interface of the robot with a topic or service of its ROS graph."""
+"""The bridge: each span connects an interface of the robot with a topic or service of its ROS graph."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from rce_client.topics import Publisher
 
 MASTER_TIMEOUT = 2.0
-"""Seconds between two looks for the robot's ROS master."""
+"""Seconds between two attempts to reach the robot's ROS master."""
 
 REMINDER = 5.0
-"""Seconds between two messages that tell which interfaces are still waited for."""
+"""Seconds between two messages about interfaces that are not connected yet."""
 
 CALL_TIMEOUT = 30.0
 """Seconds that a service of the robot's graph, or of the cloud, may take."""
@@ -34,7 +34,7 @@ CALL_TIMEOUT = 30.0
 async def joined_graph(
     robot: str, master_uri: str, types: TypeRegistry, say: Callable[[str], None]
 ) -> AsyncIterator[Node]:
-    """Be a node of the robot's ROS graph, once its master is there."""
+    """Start a node in the robot's ROS graph, once its master can be reached."""
     async with contextlib.AsyncExitStack() as stack:
         while True:
             node = Node(
@@ -54,11 +54,11 @@ async def joined_graph(
 
 
 async def build(plan: Plan, conn: Connection, node: Node) -> None:
-    """Ask the engine for everything and lay all spans.
+    """Send all requests to the engine and create all spans.
 
     Raises:
-        rce.ros.errors.RosError: The robot's graph does not take part.
-        rce_client.exceptions.ClientError: The engine does not.
+        rce.ros.errors.RosError: The robot's graph refuses a registration.
+        rce_client.exceptions.ClientError: The engine refuses the client.
     """
     for request in plan.requests[: plan.first]:
         await conn.request(request)
@@ -69,7 +69,7 @@ async def build(plan: Plan, conn: Connection, node: Node) -> None:
 
 
 async def lay(span: Span, conn: Connection, node: Node) -> None:
-    """Join one interface with its topic or service. Messages are passed on as they are."""
+    """Connect one interface with its topic or service. Messages are passed on unchanged."""
     match span.role:
         case Role.SUBSCRIBER:
             uplink = Uplink(conn, await conn.publisher(span.tag, span.message_type, raw=True))
@@ -97,15 +97,15 @@ async def lay(span: Span, conn: Connection, node: Node) -> None:
 
 
 class Uplink:
-    """A topic of the robot on its way to the cloud, where nothing is sent before somebody hears it.
+    """Sends a topic of the robot to the cloud, once its interface is connected there.
 
-    The engine makes an interface some time after it was asked to, and would complain of messages before. What
-    is latched waits for its time; any other message would be out of date by then.
+    The engine creates an interface some time after the request, and reports messages before that as errors.
+    Latched messages wait until then; other messages would be out of date and are dropped.
 
     Implements :class:`rce.ros.node.subscriber.TopicListener`.
 
     Args:
-        conn: What it goes over.
+        conn: The connection to the engine.
         publisher: Its interface.
     """
 
@@ -129,13 +129,13 @@ class Uplink:
         self._publisher.publish(bytes(payload), latch=name)
 
     def source_ended(self, source: str) -> None:
-        """Take back what a publisher of the robot's graph latched."""
+        """Remove what a publisher of the robot's graph latched."""
         self._names.pop(source, None)
         self._publisher.keep_latched(tuple(self._names.values()))
 
 
 class Downlink:
-    """A topic of the cloud on its way to the robot's graph, where what is latched there is latched too.
+    """Publishes a topic of the cloud in the robot's graph; latched messages stay latched.
 
     Implements :class:`rce_client.interfaces.LatchListener`.
 
@@ -155,15 +155,15 @@ class Downlink:
         self._publisher.publish_serialized(message, latch=True, source=source)
 
     def keep_latched(self, sources: Sequence[str]) -> None:
-        """Forget what all other sources latched."""
+        """Remove what all other sources latched."""
         for source in self._publisher.latched.keys() - set(sources):
             self._publisher.unlatch(source)
 
 
 async def wait_ready(plan: Plan, conn: Connection, say: Callable[[str], None]) -> None:
-    """Wait until every interface that the config connects is joined with its peer; tell what is missing.
+    """Wait until every interface that the config connects has its peer; log the missing ones.
 
-    Everything is asked for again now and then, because it may name what another robot makes a little later.
+    All requests are repeated from time to time: they may name what another robot creates later.
     """
     missing = sorted(plan.awaited)
     while missing:

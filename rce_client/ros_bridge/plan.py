@@ -1,4 +1,4 @@
-"""What is to be bridged, made of a robot's config. Pure, apart from looking up message types.
+"""The plan of a bridge, from a robot's config. Pure, apart from looking up message types.
 
 An interface of the robot with an ``addr`` ends in the robot's ROS graph. It is made as a Forwarder, whatever
 the file says: messages are serialized at both ends, so nothing is gained by taking them apart on the way.
@@ -28,14 +28,14 @@ class Span:
 
     tag: str
     role: Role
-    """As the engine names it: a robot's sensor is a ``SUBSCRIBER``."""
+    """The engine's name for it: a robot's sensor is a ``SUBSCRIBER``."""
     message_type: str
     addr: str
     """Topic or service in the robot's graph."""
 
     @property
     def type(self) -> str:
-        """The interface type that is asked for."""
+        """The interface type to request."""
         return str(InterfaceType(self.role, Form.FORWARDER))
 
     def __str__(self) -> str:
@@ -57,12 +57,12 @@ class Plan:
     robot: str
     spans: tuple[Span, ...]
     requests: tuple[Request, ...]
-    """What else is asked of the engine, in order; those of :attr:`first` before the spans are made."""
+    """Other requests to the engine, in order; those of :attr:`first` before the spans are created."""
     first: int
     awaited: frozenset[str]
     """Tags of spans that the file connects, so that they become active."""
     unbridged: tuple[str, ...]
-    """Tags of the robot's interfaces that have no ``addr`` and so end nowhere."""
+    """Tags of the robot's interfaces without ``addr``, which are not connected to the ROS graph."""
 
 
 def make_plan(config: ClientConfig) -> Plan:
@@ -90,7 +90,7 @@ def check(config: ClientConfig, types: TypeRegistry, source: str) -> None:
     """Check what only matters to a bridge.
 
     Raises:
-        ConfigError: A class is not known here, or a service would be asked of itself; every fault is listed.
+        ConfigError: A message type is not known here, or a service would call itself; every fault is listed.
     """
     faults = []
     services: dict[str, Role] = {}

@@ -48,7 +48,7 @@ async def install(machine: Booted) -> None:
         stdin="wonderland\n",
     )
     said = await machine.run_soon(f"{BIN}/rce install-service master")
-    assert "made the user rce" in said
+    assert "created the user rce" in said
     roles = [machine.run_soon(f"{BIN}/rce install-service {role}") for role in ("robot", "container")]
     assert "made /etc/systemd/system/rce-robot.service" in "".join(await asyncio.gather(*roles))
     for unit in UNITS:

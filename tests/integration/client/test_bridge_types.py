@@ -64,8 +64,8 @@ async def test_what_the_graph_does_not_tell_is_named() -> None:
         with pytest.raises(ConfigError) as caught:
             await find_types({4: TOPIC}, asker, "file", lambda _: None, timeout=0.1)
         assert str(caught.value) == (
-            "file: bridges[4].type: is missing, and within 0.1 s no node of the robot's graph told that of "
-            "topic pose; start the node first, or give the type"
+            "file: bridges[4].type: is missing, and no node of the robot's graph had the type of topic pose "
+            "within 0.1 s; start the node first, or give the type"
         )
         with pytest.raises(ConfigError, match="topic /a has no end at the robot"):
             await find_types({0: INNER}, asker, "file", lambda _: None)

@@ -16,7 +16,7 @@ from rce_client.failures import judge, judge_status
 def test_a_robot_id_in_use_is_worth_another_try() -> None:
     error = judge_status(409, "robot 'r' is connected already, from 192.0.2.1")
     assert isinstance(error, UnavailableError)
-    assert str(error).startswith("waiting until the robotID is free: robot 'r'")
+    assert str(error).startswith("the robotID is in use; waiting until it is free: robot 'r'")
 
 
 @pytest.mark.parametrize("status", [429, 500, 503, 504])
