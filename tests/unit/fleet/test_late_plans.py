@@ -26,7 +26,7 @@ from rce_fleet.coordination.replanning import PlanRequest, PlanResult, compute_p
 from rce_fleet.planning.grid import GridMap
 
 
-class Desk:
+class PlannerHarness:
     """A planner whose plans are made when a test says so, and robots that stand in their cells."""
 
     def __init__(self, *starts: int) -> None:
@@ -75,18 +75,18 @@ class Desk:
 
 
 @pytest.fixture
-def pair() -> Desk:
+def pair() -> PlannerHarness:
     """Two robots in the corners of a floor, sent across it; the plan for that is asked for, and not there."""
-    desk = Desk(0, 7)
-    desk.finish_all()
-    desk.tell(GoalSet("R1", 56))
-    desk.finish_all()
-    desk.sent.clear()
-    desk.tell(GoalSet("R2", 63))
-    return desk
+    harness = PlannerHarness(0, 7)
+    harness.finish_all()
+    harness.tell(GoalSet("R1", 56))
+    harness.finish_all()
+    harness.sent.clear()
+    harness.tell(GoalSet("R2", 63))
+    return harness
 
 
-def test_no_robot_is_granted_cells_while_a_plan_is_made(pair: Desk) -> None:
+def test_no_robot_is_granted_cells_while_a_plan_is_made(pair: PlannerHarness) -> None:
     x, y = pair.planner.state.grid.centre(8)
     pair.tell(PoseSeen("R1", x, y, 0.0))
     pair.tell(Tick())
@@ -96,7 +96,7 @@ def test_no_robot_is_granted_cells_while_a_plan_is_made(pair: Desk) -> None:
     assert len(pair.sent["R1"]) == len(pair.sent["R2"]) == 5
 
 
-def test_one_plan_is_asked_for_at_a_time(pair: Desk) -> None:
+def test_one_plan_is_asked_for_at_a_time(pair: PlannerHarness) -> None:
     asked = len(pair.requests)
     pair.tell(CellBlocked(30))
     pair.tell(CellBlocked(31))
@@ -106,7 +106,7 @@ def test_one_plan_is_asked_for_at_a_time(pair: Desk) -> None:
     assert {30, 31} <= set(pair.requests[-1].blocked)
 
 
-def test_an_outdated_plan_is_taken_as_far_as_it_goes(pair: Desk) -> None:
+def test_an_outdated_plan_is_taken_as_far_as_it_goes(pair: PlannerHarness) -> None:
     """Robots drive on although the fleet changes during every plan."""
     pair.tell(CellBlocked(30))
     pair.finish()
@@ -114,7 +114,7 @@ def test_an_outdated_plan_is_taken_as_far_as_it_goes(pair: Desk) -> None:
     assert len(pair.sent["R2"]) == 5
 
 
-def test_a_route_ends_before_a_cell_that_was_blocked_meanwhile(pair: Desk) -> None:
+def test_a_route_ends_before_a_cell_that_was_blocked_meanwhile(pair: PlannerHarness) -> None:
     pair.tell(CellBlocked(23))
     pair.finish()
     assert pair.sent["R2"] == (7, 15)
@@ -122,7 +122,7 @@ def test_a_route_ends_before_a_cell_that_was_blocked_meanwhile(pair: Desk) -> No
     assert 23 not in pair.sent["R2"]
 
 
-def test_a_robot_with_another_goal_waits_for_the_next_plan(pair: Desk) -> None:
+def test_a_robot_with_another_goal_waits_for_the_next_plan(pair: PlannerHarness) -> None:
     pair.tell(GoalSet("R2", 3))
     pair.finish()
     assert "R2" not in pair.sent
@@ -130,14 +130,14 @@ def test_a_robot_with_another_goal_waits_for_the_next_plan(pair: Desk) -> None:
     assert pair.sent["R2"] == (7, 6, 5, 4, 3)
 
 
-def test_a_robot_that_was_removed_gets_no_route(pair: Desk) -> None:
+def test_a_robot_that_was_removed_gets_no_route(pair: PlannerHarness) -> None:
     pair.tell(RobotRemoved("R2"))
     pair.finish()
     assert "R2" not in pair.sent
     assert pair.requests[-1].robots == ("R1",)
 
 
-def test_a_plan_that_was_not_asked_for_is_ignored(pair: Desk) -> None:
+def test_a_plan_that_was_not_asked_for_is_ignored(pair: PlannerHarness) -> None:
     result = compute_plan(pair.requests[-1])
     pair.tell(PlanMade(PlanResult(result.number - 1, result.visitors, result.cells, (), complete=True)))
     assert pair.sent == {}
@@ -148,16 +148,16 @@ def test_a_plan_that_was_not_asked_for_is_ignored(pair: Desk) -> None:
 
 
 def test_a_plan_waits_for_a_robot_that_is_being_stopped() -> None:
-    desk = Desk(0)
-    desk.tell(GoalSet("R1", 7))
-    desk.finish_all()
-    desk.tell(GoalSet("R1", None))
-    asked = len(desk.requests)
-    assert desk.sent["R1"] == ()
-    desk.tell(Tick())
-    assert len(desk.requests) == asked
-    desk.tell(ReportSeen("R1", ClientReport(desk.revisions["R1"], ClientState.IDLE)))
-    desk.now += 1.0
-    x, y = desk.planner.state.grid.centre(0)
-    desk.tell(PoseSeen("R1", x, y, 0.0))
-    assert len(desk.requests) == asked + 1
+    harness = PlannerHarness(0)
+    harness.tell(GoalSet("R1", 7))
+    harness.finish_all()
+    harness.tell(GoalSet("R1", None))
+    asked = len(harness.requests)
+    assert harness.sent["R1"] == ()
+    harness.tell(Tick())
+    assert len(harness.requests) == asked
+    harness.tell(ReportSeen("R1", ClientReport(harness.revisions["R1"], ClientState.IDLE)))
+    harness.now += 1.0
+    x, y = harness.planner.state.grid.centre(0)
+    harness.tell(PoseSeen("R1", x, y, 0.0))
+    assert len(harness.requests) == asked + 1
