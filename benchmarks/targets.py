@@ -95,6 +95,20 @@ TARGETS = [
     ),
     Target("fan-out to 200 at 20 Hz, p95", "fanout", _column("p95_ms", clients=200), 20, "ms"),
     Target(
+        "1000 robots join one container: control bytes of the last hundred, 1.0 is linear",
+        "joining",
+        _column("x first hundred (bytes)", robots=1000),
+        1.1,
+        "x first hundred",
+    ),
+    Target(
+        "1000 robots join one container: CPU of the last hundred, 1.0 is linear",
+        "joining",
+        _column("x first hundred (CPU)", robots=1000),
+        1.3,
+        "x first hundred",
+    ),
+    Target(
         "one client stalls: what the others get",
         "stalled",
         _column("share %", phase="it still stalls"),

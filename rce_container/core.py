@@ -13,13 +13,24 @@ from typing import Any, Self, assert_never
 import msgspec
 
 from rce.aio.backoff import Backoff
-from rce.control.messages import Fault, Gone, Status
-from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress
+from rce.control.desired import DesiredState, Fit
+from rce.control.messages import Fault, Gone, PatchStatus, SpecWanted, Status
+from rce.control.model import (
+    EndpointSpec,
+    EndpointState,
+    EndpointStatus,
+    LinkAddress,
+    SpecPatch,
+    StatusPatch,
+)
+from rce.control.observed import ObservedStatus
 from rce.lifecycle import StateMachine
 from rce.model.specs import Resources
 from rce_container.events import (
     Adopted,
     Apply,
+    ApplyPatch,
+    Changed,
     Drop,
     Due,
     Event,
@@ -27,11 +38,13 @@ from rce_container.events import (
     Instruction,
     Lost,
     Made,
+    Patch,
     Put,
     Quit,
     Removed,
     Reported,
     Start,
+    StatusWanted,
     Stop,
     Sync,
     Tell,
@@ -51,12 +64,12 @@ class Container:
 
     id: str
     course: StateMachine[Phase, LifeEvent]
-    desired: EndpointSpec | None = None
+    desired: DesiredState | None = None
     """None also for an adopted one of which the master has not spoken yet."""
     drop_revision: int = 0
     incarnation_id: str = ""
     address: LinkAddress = field(default_factory=LinkAddress)
-    reported: EndpointStatus | None = None
+    reported: ObservedStatus | None = None
     failures: int = 0
     """How often it ended since it was stable last."""
     running_since: float | None = None
@@ -64,6 +77,15 @@ class Container:
     detail: str = ""
     told: str = ""
     """The last failure that the user was told of."""
+    number: int = 0
+    """Of the last report to the master."""
+
+    @property
+    def known_revision(self) -> int:
+        """The newest revision that is known of it."""
+        if self.desired is not None:
+            return self.desired.revision
+        return self.reported.header.revision if self.reported is not None else 0
 
     @classmethod
     def make(cls, id_: str, phase: Phase, **fields: Any) -> Self:
@@ -78,9 +100,12 @@ class Container:
     @property
     def status(self) -> EndpointStatus:
         """What the master is told."""
-        base = self.reported
-        if base is None or self.phase not in {*ALIVE, Phase.STOPPING}:
-            base = EndpointStatus(id=self.id, revision=0, state=_STATES[self.phase])
+        if self.reported is None or self.phase not in {*ALIVE, Phase.STOPPING}:
+            return self.describe(EndpointStatus(id=self.id, revision=0, state=_STATES[self.phase]))
+        return self.describe(self.reported.whole)
+
+    def describe(self, base: EndpointStatus) -> EndpointStatus:
+        """Add to what the environment says what it does not know."""
         state = EndpointState.STOPPING if self.phase is Phase.STOPPING else base.state
         return msgspec.structs.replace(
             base,
@@ -90,6 +115,7 @@ class Container:
             incarnation=self.incarnation_id,
             address=self.address,
             detail=self.detail,
+            number=self.number,
         )
 
 
@@ -127,12 +153,8 @@ class ManagerCore:
         self._now = now
         self._out = []
         match event:
-            case Put(spec=spec):
-                self._put(spec)
-            case Drop(id=id_, revision=revision, reason=reason):
-                self._drop(id_, revision, reason)
-            case Sync(specs=specs):
-                self._sync(specs)
+            case Put() | Patch() | Drop() | Sync() | StatusWanted():
+                self._hear(event)
             case Adopted():
                 self._adopt(event)
             case Due(id=id_, ticket=ticket):
@@ -141,7 +163,7 @@ class ManagerCore:
                 self._quit()
             case Lost(id=id_, incarnation_id="", reason=reason):
                 self._not_started(id_, reason)
-            case Made() | Reported() | Faulted() | Lost() | Removed():
+            case Made() | Reported() | Changed() | Faulted() | Lost() | Removed():
                 self._life(event)
             case _:
                 assert_never(event)
@@ -155,7 +177,7 @@ class ManagerCore:
     def resources(self, id_: str) -> Resources:
         """What a container that is desired asks for."""
         desired = self.containers[id_].desired
-        return desired.resources if desired is not None else Resources()
+        return desired.contents.resources if desired is not None else Resources()
 
     def validate(self) -> None:
         """Check the invariants; for tests."""
@@ -169,6 +191,20 @@ class ManagerCore:
 
     # What the master desires
 
+    def _hear(self, event: Put | Patch | Drop | Sync | StatusWanted) -> None:
+        match event:
+            case Put(spec=spec):
+                self._put(spec)
+            case Patch(patch=patch):
+                self._patch(patch)
+            case Drop(id=id_, revision=revision, reason=reason):
+                self._drop(id_, revision, reason)
+            case Sync(specs=specs):
+                self._sync(specs)
+            case StatusWanted(id=id_):
+                if (container := self.containers.get(id_)) is not None:
+                    self._tell(container)
+
     def _put(self, spec: EndpointSpec) -> None:
         if self._quitting:
             return
@@ -177,13 +213,25 @@ class ManagerCore:
             container = self.containers[spec.id] = Container.make(spec.id, Phase.GONE)
         elif container.desired is not None and spec.revision < container.desired.revision:
             return
-        container.desired = spec
+        container.desired = DesiredState(spec)
         was = container.phase
         container.course.advance(LifeEvent.DESIRE)
         if was is Phase.GONE:
             self._start(container)
         elif container.phase in {*ALIVE, Phase.STARTING} and container.incarnation_id:
             self._out.append(Apply(spec.id, container.incarnation_id, spec))
+
+    def _patch(self, patch: SpecPatch) -> None:
+        if self._quitting:
+            return
+        container = self.containers.get(patch.id)
+        desired = None if container is None else container.desired
+        if container is None or desired is None or (fit := desired.fit(patch)) is Fit.GAP:
+            self._out.append(Tell(SpecWanted(id=patch.id)))
+        elif fit is Fit.NEXT:
+            desired.patch(patch)
+            if container.phase in {*ALIVE, Phase.STARTING} and container.incarnation_id:
+                self._out.append(ApplyPatch(patch.id, container.incarnation_id, patch))
 
     def _drop(self, id_: str, revision: int, reason: str) -> None:
         container = self.containers.get(id_)
@@ -198,8 +246,7 @@ class ManagerCore:
         desired = {spec.id: spec for spec in specs}
         for id_, container in list(self.containers.items()):
             if id_ not in desired:
-                known = container.desired or container.reported
-                self._drop(id_, known.revision if known else 0, "it is not desired here any more")
+                self._drop(id_, container.known_revision, "it is not desired here any more")
         for spec in desired.values():
             self._put(spec)
 
@@ -229,10 +276,10 @@ class ManagerCore:
         container = self.containers[id_] = Container.make(
             id_, phase, incarnation_id=event.incarnation_id, address=event.address
         )
-        container.reported = event.status
+        container.reported = ObservedStatus(event.status)
         container.running_since = self._now
 
-    def _life(self, event: Made | Reported | Faulted | Lost | Removed) -> None:
+    def _life(self, event: Made | Reported | Changed | Faulted | Lost | Removed) -> None:
         container = self.containers.get(event.id)
         if container is None:
             return
@@ -244,6 +291,8 @@ class ManagerCore:
         match event:
             case Reported(status=status):
                 self._report(container, status)
+            case Changed(patch=patch):
+                self._change(container, patch)
             case Faulted(text=text):
                 self._fault(container, text)
             case Lost(reason=reason):
@@ -259,19 +308,31 @@ class ManagerCore:
         if container.phase is not Phase.STARTING or container.desired is None:
             self._out.append(Stop(container.id, event.incarnation_id, "it is not desired any more"))
             return
-        self._out.append(Apply(container.id, event.incarnation_id, container.desired))
+        self._out.append(Apply(container.id, event.incarnation_id, container.desired.whole))
         self._tell(container)
 
     def _report(self, container: Container, status: EndpointStatus) -> None:
         was = container.phase
         is_ill = status.state is EndpointState.DEGRADED
         container.course.advance(LifeEvent.ILLNESS if is_ill else LifeEvent.REPORT)
-        container.reported = status
+        container.reported = ObservedStatus(status)
         if was is Phase.STARTING:
             container.running_since = self._now
             container.detail = ""
         if container.phase in {*ALIVE, Phase.STOPPING}:
             self._tell(container)
+
+    def _change(self, container: Container, patch: StatusPatch) -> None:
+        """Take over what an environment changed in its report: it made a whole one before."""
+        if container.reported is None:
+            return
+        container.reported.patch(patch)
+        is_ill = patch.status.state is EndpointState.DEGRADED
+        container.course.advance(LifeEvent.ILLNESS if is_ill else LifeEvent.REPORT)
+        if container.phase in {*ALIVE, Phase.STOPPING}:
+            container.number += 1
+            told = msgspec.structs.replace(patch, status=container.describe(patch.status))
+            self._out.append(Tell(PatchStatus(patch=told)))
 
     def _lost(self, container: Container, reason: str) -> None:
         was = container.phase
@@ -353,4 +414,5 @@ class ManagerCore:
         self._out.append(Tell(Fault(id=container.id, text=f"container {tag}: {text}")))
 
     def _tell(self, container: Container) -> None:
+        container.number += 1
         self._out.append(Tell(Status(status=container.status)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rce.control.messages import ToMaster
-from rce.control.model import EndpointSpec, EndpointStatus, LinkAddress
+from rce.control.model import EndpointSpec, EndpointStatus, LinkAddress, SpecPatch, StatusPatch
 
 
 @dataclass(frozen=True, slots=True)
@@ -13,6 +13,13 @@ class Put:
     """The master desires a container like this."""
 
     spec: EndpointSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """What the master desires of a container changed in this."""
+
+    patch: SpecPatch
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +66,22 @@ class Reported:
 
 
 @dataclass(frozen=True, slots=True)
+class Changed:
+    """An environment reported what changed since its last report."""
+
+    id: str
+    incarnation_id: str
+    patch: StatusPatch
+
+
+@dataclass(frozen=True, slots=True)
+class StatusWanted:
+    """The master misses a container's status."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True)
 class Faulted:
     """An environment has a fault to tell the user of."""
 
@@ -97,7 +120,22 @@ class Quit:
     """The manager is to end, with all its containers."""
 
 
-Event = Put | Drop | Sync | Adopted | Made | Reported | Faulted | Lost | Removed | Due | Quit
+Event = (
+    Put
+    | Patch
+    | Drop
+    | Sync
+    | StatusWanted
+    | Adopted
+    | Made
+    | Reported
+    | Changed
+    | Faulted
+    | Lost
+    | Removed
+    | Due
+    | Quit
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +152,15 @@ class Apply:
     id: str
     incarnation_id: str
     spec: EndpointSpec
+
+
+@dataclass(frozen=True, slots=True)
+class ApplyPatch:
+    """Give an environment what changed in its specification."""
+
+    id: str
+    incarnation_id: str
+    patch: SpecPatch
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,4 +189,4 @@ class Tell:
     message: ToMaster
 
 
-Instruction = Start | Apply | Stop | Wait | Tell
+Instruction = Start | Apply | ApplyPatch | Stop | Wait | Tell

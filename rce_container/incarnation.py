@@ -14,12 +14,23 @@ from typing import assert_never
 import msgspec
 
 from rce.aio.tasks import BackgroundTasks
+from rce.control.desired import DesiredState
 from rce.control.execution import FEATURE as EXEC
 from rce.control.execution import Command
-from rce.control.model import EndpointSpec, EndpointStatus, LinkAddress, NodeStatus
+from rce.control.model import (
+    PATCHES,
+    EndpointSpec,
+    EndpointStatus,
+    LinkAddress,
+    NodeStatus,
+    SpecPatch,
+    StatusPatch,
+)
+from rce.control.observed import ObservedStatus
 from rce.control.tags import Unknown
 from rce.link.handover import HandoverSender, LinkAcceptor
 from rce.model.names import EndpointId
+from rce.model.specs import Resources
 from rce_container import events, intake
 from rce_container.archive import LogArchive
 from rce_container.dial import dial
@@ -92,7 +103,7 @@ class Incarnation:
         self.enforcer = enforcer
         self.counters = m.Counters()
         """What went through links and interfaces, as the environment said last."""
-        self.status: EndpointStatus | None = None
+        self._observed: ObservedStatus | None = None
         """What the environment reported last."""
         self.reported = asyncio.Event()
         """Set by the first report, and by an end without one."""
@@ -100,7 +111,7 @@ class Incarnation:
         self._isolated = isolated
         self._channel: Channel | None = None
         self._sender: HandoverSender | None = None
-        self._spec: EndpointSpec | None = None
+        self._desired: DesiredState | None = None
         self._pids: dict[int, int] = {}
         self._deadline: asyncio.Timeout | None = None
         self._features: frozenset[str] = frozenset()
@@ -125,21 +136,45 @@ class Incarnation:
     @property
     def node_pids(self) -> dict[str, int]:
         """The pids of the nodes' first processes, as the machine sees them, by tag."""
-        return {node.tag: node.pid for node in self.status.nodes} if self.status is not None else {}
+        return {node.tag: node.pid for node in self._observed.header.nodes} if self._observed else {}
+
+    @property
+    def status(self) -> EndpointStatus | None:
+        """What the environment reported last; None if it has not."""
+        return self._observed.whole if self._observed is not None else None
 
     def apply(self, spec: EndpointSpec) -> None:
         """Give the environment what is desired."""
-        self._spec = spec
-        try:
-            self.folder.note_revision(spec.revision)
-        except StateError as error:
-            _log.warning("container %s: %s", self.id, error)
+        self._desired = DesiredState(spec)
+        self._note_revision(spec.revision)
         self._supply.want(spec.packages)
         if self._channel is not None:
             self._channel.send(m.encode(m.Apply(spec=spec)))
         if self._sender is not None:
             self._errands.spawn(self._route(self._sender, spec), name=f"links of {self.id}")
-            self._errands.spawn(self._resize(spec), name=f"limits of {self.id}")
+            self._errands.spawn(self._resize(spec.resources), name=f"limits of {self.id}")
+
+    def apply_patch(self, patch: SpecPatch) -> None:
+        """Give the environment what changed in what is desired; what it fits was given before."""
+        assert self._desired is not None, "a whole specification comes first"
+        self._desired.patch(patch)
+        if PATCHES not in self._features:
+            self.apply(self._desired.whole)
+            return
+        self._note_revision(patch.revision)
+        if patch.contents is not None:
+            self._supply.want(patch.contents.packages)
+            self._errands.spawn(self._resize(patch.contents.resources), name=f"limits of {self.id}")
+        if self._channel is not None:
+            self._channel.send(m.encode(m.ApplyPatch(patch=patch)))
+        if self._sender is not None and (patch.links or patch.removed_links):
+            self._errands.spawn(self._route_changes(self._sender, patch), name=f"links of {self.id}")
+
+    def _note_revision(self, revision: int) -> None:
+        try:
+            self.folder.note_revision(revision)
+        except StateError as error:
+            _log.warning("container %s: %s", self.id, error)
 
     def _tell_of_arrival(self) -> None:
         if self._channel is not None:
@@ -214,8 +249,8 @@ class Incarnation:
                 self._open_handover(self._channel)
                 if self._stopping:
                     self.stop()
-                if self._spec is not None:
-                    self.apply(self._spec)
+                if self._desired is not None:
+                    self.apply(self._desired.whole)
                 await self._converse(self._channel)
         except TimeoutError:
             self._hurry = True
@@ -271,43 +306,68 @@ class Incarnation:
         pace = intake.Pace()
         while (line := await channel.receive()) is not None:
             pace.pay(intake.PER_LINE + len(line))
-            match intake.read(line):
-                case m.Report(status=status, features=features):
-                    self._features = frozenset(features) & {EXEC}
-                    self._report(self._sanitize(status), pace)
-                case m.Fault(text=text):
-                    pace.pay(intake.PER_FAULT)
-                    self._context.feed(
-                        events.Faulted(self.id, self.incarnation_id, intake.sanitize_text(text))
-                    )
-                case m.Counters() as counters:
-                    self.counters = intake.sanitize_counters(counters)
-                case m.Killed(request=number):
-                    channel.send(m.encode(m.Cause(request=number, text=self.enforcer.claim())))
-                case m.Dial() as request:
-                    self._errands.spawn(self._dial(channel, request), name=f"dial for {self.id}")
-                case Unknown(name=name):
-                    _log.debug("%s: its environment sent a %s", self.id, intake.sanitize_text(name))
-                case message:
-                    assert_never(message)
+            self._hear(channel, intake.read(line), pace)
             if pause := pace.pause:
                 await asyncio.sleep(pause)
 
-    def _sanitize(self, status: EndpointStatus) -> EndpointStatus:
-        """Believe no revision that the environment was not given, by this manager or by one before."""
-        if self._spec is not None:
-            return intake.sanitize_status(self.id, status, self._spec.revision)
+    def _hear(self, channel: Channel, said: m.ToManager | Unknown, pace: intake.Pace) -> None:
+        match said:
+            case m.Report(status=status, features=features):
+                self._features = frozenset(features) & {EXEC, PATCHES}
+                self._report(intake.sanitize_status(self.id, status, self._newest_revision), pace)
+            case m.ReportPatch(patch=patch):
+                self._report_patch(intake.sanitize_patch(self.id, patch, self._newest_revision), pace)
+            case m.SpecWanted():
+                self._apply_again(pace)
+            case m.Fault(text=text):
+                pace.pay(intake.PER_FAULT)
+                self._context.feed(events.Faulted(self.id, self.incarnation_id, intake.sanitize_text(text)))
+            case m.Counters() as counters:
+                self.counters = intake.sanitize_counters(counters)
+            case m.Killed(request=number):
+                channel.send(m.encode(m.Cause(request=number, text=self.enforcer.claim())))
+            case m.Dial() as request:
+                self._errands.spawn(self._dial(channel, request), name=f"dial for {self.id}")
+            case Unknown(name=name):
+                _log.debug("%s: its environment sent a %s", self.id, intake.sanitize_text(name))
+            case message:
+                assert_never(message)
+
+    @property
+    def _newest_revision(self) -> int:
+        """The newest revision that the environment was given, by this manager or by one before."""
+        if self._desired is not None:
+            return self._desired.revision
         record = self.folder.read_record()
-        return intake.sanitize_status(self.id, status, record.revision if record is not None else 0)
+        return record.revision if record is not None else 0
+
+    def _apply_again(self, pace: intake.Pace) -> None:
+        """Give the environment all that is desired; it pays for what that costs."""
+        pace.pay(intake.PER_FAULT)
+        if self._desired is not None:
+            pace.pay(intake.PER_PART * (len(self._desired.interfaces) + len(self._desired.connections)))
+            self.apply(self._desired.whole)
 
     def _report(self, status: EndpointStatus, pace: intake.Pace) -> None:
         if not self._stopping:
             self._limit(None)
-        if self._isolated:
-            status = msgspec.structs.replace(status, nodes=self._with_outer_pids(status, pace))
-        self.status = status
+        status = self._outside(status, pace)
+        self._observed = ObservedStatus(status, intake.MAX_CONNECTIONS)
         self.reported.set()
         self._context.feed(events.Reported(self.id, self.incarnation_id, status))
+
+    def _report_patch(self, patch: StatusPatch, pace: intake.Pace) -> None:
+        if self._observed is None:
+            return
+        patch = msgspec.structs.replace(patch, status=self._outside(patch.status, pace))
+        self._observed.patch(patch)
+        self._context.feed(events.Changed(self.id, self.incarnation_id, patch))
+
+    def _outside(self, status: EndpointStatus, pace: intake.Pace) -> EndpointStatus:
+        """Return a status as it is seen from outside of the container."""
+        if not self._isolated:
+            return status
+        return msgspec.structs.replace(status, nodes=self._with_outer_pids(status, pace))
 
     def _with_outer_pids(self, status: EndpointStatus, pace: intake.Pace) -> tuple[NodeStatus, ...]:
         """Replace the nodes' pids inside the container by those outside."""
@@ -327,8 +387,8 @@ class Incarnation:
             loop = asyncio.get_running_loop()
             self._deadline.reschedule(None if seconds is None else loop.time() + seconds)
 
-    async def _resize(self, spec: EndpointSpec) -> None:
-        if text := await self.enforcer.apply(spec.resources):
+    async def _resize(self, resources: Resources) -> None:
+        if text := await self.enforcer.apply(resources):
             self._context.feed(events.Faulted(self.id, self.incarnation_id, text))
 
     # Links
@@ -337,14 +397,20 @@ class Incarnation:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._sender = HandoverSender(ours)
         with theirs:
-            channel.send(m.encode(m.Handover()), theirs.fileno())
+            channel.send(m.encode(m.Handover(features=(PATCHES,))), theirs.fileno())
 
     async def _route(self, sender: HandoverSender, spec: EndpointSpec) -> None:
         await self._context.acceptor.assign(sender, [link.id for link in spec.links if not link.dial])
 
+    async def _route_changes(self, sender: HandoverSender, patch: SpecPatch) -> None:
+        accepted = [link.id for link in patch.links if not link.dial]
+        dialed = [link.id for link in patch.links if link.dial]
+        await self._context.acceptor.reassign(sender, accepted, [*patch.removed_links, *dialed])
+
     async def _dial(self, channel: Channel, request: m.Dial) -> None:
         """Connect to a peer of this container, and to nothing else."""
-        allowed: list[LinkAddress] = [link.address for link in self._spec.links] if self._spec else []
+        links = self._desired.links.values() if self._desired is not None else ()
+        allowed: list[LinkAddress] = [link.address for link in links]
         try:
             if request.address not in allowed:
                 raise ConnectionError("the container has no link to there")

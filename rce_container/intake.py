@@ -14,7 +14,14 @@ from typing import TypeVar
 import msgspec
 from msgspec.structs import asdict, replace
 
-from rce.control.model import EndpointState, EndpointStatus, InterfaceUsage, LinkAddress, NodeStatus
+from rce.control.model import (
+    EndpointState,
+    EndpointStatus,
+    InterfaceUsage,
+    LinkAddress,
+    NodeStatus,
+    StatusPatch,
+)
 from rce.control.tags import Unknown
 from rce.model.names import is_name
 from rce.protocol.printable import one_line
@@ -25,7 +32,9 @@ T = TypeVar("T")
 MAX_TEXT = 2000
 """Characters of a text for people."""
 MAX_ITEMS = 4096
-"""Nodes, and interfaces, of one container."""
+"""Nodes of one container."""
+MAX_INTERFACES = 16384
+"""Of one container; more than the master lets users make."""
 MAX_CONNECTIONS = 65536
 _MAX_NUMBER = 2**53
 """Whatever is counted; JSON readers everywhere take numbers up to here."""
@@ -40,6 +49,8 @@ PER_LINE = 2_000
 """What a line costs beside its bytes."""
 PER_FAULT = 200_000
 """The same for one that somebody is told of and that is kept."""
+PER_PART = 500
+"""The same for each interface and connection of a specification that it wants again."""
 PER_LOOK = 100_000
 """The same for one that makes the manager look for processes."""
 
@@ -85,6 +96,15 @@ def sanitize_status(id_: str, status: EndpointStatus, newest: int) -> EndpointSt
     )
 
 
+def sanitize_patch(id_: str, patch: StatusPatch, newest: int) -> StatusPatch:
+    """Take of what changed in a report what can be true of a container; as :func:`sanitize_status`."""
+    return StatusPatch(
+        status=sanitize_status(id_, patch.status, newest),
+        removed_interfaces=tuple(filter(is_name, patch.removed_interfaces[:MAX_INTERFACES])),
+        lost_connections=tuple(map(_whole, patch.lost_connections[:MAX_CONNECTIONS])),
+    )
+
+
 def sanitize_counters(said: m.Counters) -> m.Counters:
     """Take of counters what can be true of a container's links and interfaces."""
     return m.Counters(
@@ -108,7 +128,7 @@ def _sanitize_node(node: NodeStatus) -> NodeStatus:
 
 
 def _named(things: Mapping[str, T]) -> dict[str, T]:
-    return {tag: thing for tag, thing in islice(things.items(), MAX_ITEMS) if is_name(tag)}
+    return {tag: thing for tag, thing in islice(things.items(), MAX_INTERFACES) if is_name(tag)}
 
 
 def _whole(number: int, *, least: int = 0) -> int:

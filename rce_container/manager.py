@@ -23,10 +23,14 @@ from rce.control.messages import (
     LoginReply,
     MachineInfo,
     Notify,
+    PatchSpec,
+    PatchStatus,
     Probe,
     Put,
     ReadLog,
     Refused,
+    Status,
+    StatusWanted,
     Sync,
     TaskSetKind,
     ToMaster,
@@ -34,7 +38,7 @@ from rce.control.messages import (
     Usage,
     Welcome,
 )
-from rce.control.model import EndpointStatus, LinkAddress
+from rce.control.model import PATCHES, EndpointStatus, LinkAddress
 from rce.control.usage import cpu_seconds, resident_bytes
 from rce.model.names import EndpointId
 from rce_container import core, events
@@ -114,6 +118,7 @@ class Manager:
         self._limiter = limiter
         self.send: Callable[[ToMaster], None] = lambda _: None
         self._core = core.ManagerCore()
+        self._master_features: frozenset[str] = frozenset()
         self._networks = Networks()
         self._launcher = Launcher(
             settings=settings,
@@ -146,20 +151,27 @@ class Manager:
 
     def hello(self) -> Hello:
         """Say who this is and what is there."""
+        self._master_features = frozenset()
         return Hello(
             version=CONTROL_VERSION,
             kind=TaskSetKind.CONTAINER,
             process=self._name,
             machine=self._info,
             endpoints=self._core.statuses,
-            features=(EXEC,) if self._executions is not None else (),
+            features=(PATCHES, EXEC) if self._executions is not None else (PATCHES,),
         )
 
     async def handle(self, message: ToTaskSet) -> None:
         """Do what the master says."""
         match message:
+            case Welcome(features=features):
+                self._master_features = frozenset(features)
             case Put(endpoint=spec):
                 self._feed(events.Put(spec))
+            case PatchSpec(patch=patch):
+                self._feed(events.Patch(patch))
+            case StatusWanted(id=id_):
+                self._feed(events.StatusWanted(id_))
             case Drop(id=id_, revision=revision, reason=reason):
                 self._feed(events.Drop(id_, revision, reason))
             case Sync(endpoints=specs):
@@ -293,18 +305,26 @@ class Manager:
     def _perform(self, instruction: events.Instruction) -> None:
         match instruction:
             case events.Tell(message=message):
-                self.send(message)
+                self._tell(message)
             case events.Start(id=id_):
                 self._queue.append(id_)
                 self._start_waiting()
             case events.Apply(incarnation_id=incarnation_id, spec=spec):
                 self._incarnations[incarnation_id].apply(spec)
+            case events.ApplyPatch(incarnation_id=incarnation_id, patch=patch):
+                self._incarnations[incarnation_id].apply_patch(patch)
             case events.Stop(incarnation_id=incarnation_id, reason=reason):
                 self._incarnations[incarnation_id].stop(reason)
             case events.Wait(id=id_, ticket=ticket, delay=delay):
                 asyncio.get_running_loop().call_later(delay, self._feed, events.Due(id_, ticket))
             case _:
                 assert_never(instruction)
+
+    def _tell(self, message: ToMaster) -> None:
+        """Send a message to the master; one of an earlier release gets whole statuses."""
+        if isinstance(message, PatchStatus) and PATCHES not in self._master_features:
+            message = Status(status=self._core.containers[message.patch.status.id].status)
+        self.send(message)
 
     def _start_waiting(self) -> None:
         """Start the containers that wait for it, as far as there is room, and let go of those not wanted."""

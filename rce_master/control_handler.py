@@ -17,6 +17,8 @@ from rce.control.messages import (
     LogChunk,
     Login,
     LoginReply,
+    PatchStatus,
+    SpecWanted,
     Status,
     Usage,
 )
@@ -113,7 +115,17 @@ class ControlHandler:
                 self._take_login(peer, message)
             case ClientRequest():
                 await self._request(peer, message)
-            case Status() | Gone() | Fault() | Usage() | Left() | Hello() | LogChunk():
+            case (
+                Status()
+                | PatchStatus()
+                | SpecWanted()
+                | Gone()
+                | Fault()
+                | Usage()
+                | Left()
+                | Hello()
+                | LogChunk()
+            ):
                 self._note_leaving(process, message)
                 await self._reconciler.on_message(process, message)
             case _:

@@ -17,14 +17,19 @@ from rce.control.messages import (
     LogChunk,
     Login,
     Notify,
+    PatchSpec,
+    PatchStatus,
     Probe,
     Put,
+    SpecWanted,
     Status,
+    StatusWanted,
     Sync,
     ToMaster,
     ToTaskSet,
     Usage,
 )
+from rce.control.model import PATCHES
 from rce_master.exceptions import NotFoundError, RefusedError, TaskSetAwayError
 from rce_master.logs import LogReader, LogRequest, read_log
 from rce_master.state import commands
@@ -34,7 +39,7 @@ from rce_master.usage import UsageBook
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rce_master.state.changes import Changes, Notice
+    from rce_master.state.changes import Changes, Notice, Touched
     from rce_master.state_service import StateService
 
 _log = logging.getLogger(__name__)
@@ -58,8 +63,9 @@ class Peer(LogReader, Protocol):
 class Reconciler:
     """Sends every change to the task sets that it concerns.
 
-    Changes of one endpoint are never added up: its whole spec goes out, with a new revision, to where it is
-    placed. Listens to the state service, so nothing goes out that is not stored.
+    What changed of an endpoint goes to where it is placed, as a patch of the revision that was sent there
+    last; as a whole, if there is none or the task set takes no patches. Listens to the state service, so
+    nothing goes out that is not stored.
 
     Attributes:
         book: What the connected task sets told of what they consume.
@@ -70,6 +76,10 @@ class Reconciler:
         self._state_service = state_service
         self._peers: dict[str, Peer] = {}
         self._arriving: dict[str, Peer] = {}
+        self._sent: dict[str, dict[str, int]] = {}
+        """The revision of each endpoint that a connected task set was sent last, by process and id."""
+        self._asked: set[tuple[str, str]] = set()
+        """Of which endpoints a whole status is on its way, with their process."""
         state_service.listeners.append(self.on_changes)
 
     # From the task sets
@@ -94,7 +104,12 @@ class Reconciler:
         command: commands.Command
         match message:
             case Status():
+                self._asked.discard((process, message.status.id))
                 command = commands.StatusReported(process=process, status=message.status)
+            case PatchStatus():
+                command = commands.StatusPatched(process=process, patch=message.patch)
+            case SpecWanted():
+                command = commands.SpecRequested(process=process, id=message.id)
             case Gone():
                 command = commands.EndpointGone(process=process, id=message.id)
             case Fault():
@@ -115,7 +130,7 @@ class Reconciler:
     async def on_gone(self, peer: Peer) -> None:
         """Note that a task set's channel ended."""
         if self._peers.get(peer.process) is peer:
-            del self._peers[peer.process]
+            self._forget(peer.process)
             self.book.forget(peer.process)
             await self._state_service.submit(commands.TaskSetLeft(process=peer.process))
 
@@ -163,14 +178,21 @@ class Reconciler:
         """Send what follows from a change."""
         for withdrawal in changes.withdrawals:
             message = Drop(id=withdrawal.id, revision=withdrawal.revision, reason=withdrawal.reason)
+            self._sent.get(withdrawal.process, {}).pop(withdrawal.id, None)
             self._send(withdrawal.process, message)
-        for id_ in changes.touched:
+        for id_, touched in changes.touched.items():
             endpoint = self._state_service.tables.endpoints.get(id_)
-            if endpoint is not None and id_ != changes.answered:
-                self._send(endpoint.task_set, Put(endpoint=self._state_service.spec(id_)))
-                copy = self._state_service.copy_spec(id_)
-                if copy is not None:
-                    self._send(copy[0], Put(endpoint=copy[1]))
+            if endpoint is None:
+                continue
+            if id_ == changes.answered:
+                # Which revision the answer will have is not known yet, so the next change goes as a whole.
+                self._sent.get(endpoint.task_set, {}).pop(id_, None)
+            else:
+                self._send_change(endpoint.task_set, id_, touched)
+        for process, id_ in changes.wanted_specs:
+            self._send_whole(process, id_)
+        for process, id_ in changes.wanted_statuses:
+            self._ask_status(process, id_)
         if changes.arrived:
             self._sync(changes.arrived)
         for notice in changes.notices:
@@ -182,10 +204,46 @@ class Reconciler:
         if found is not None:
             self._send(found.task_set, Probe(id=robot))
 
+    def _send_change(self, process: str, id_: str, touched: Touched) -> None:
+        """Send what changed of an endpoint to where it is, and to where it moves."""
+        peer = self._peers.get(process)
+        if peer is not None and self._sent[process].get(id_) == touched.since and PATCHES in peer.features:
+            patch = self._state_service.patch(id_, touched)
+            self._sent[process][id_] = patch.revision
+            peer.send(PatchSpec(patch=patch))
+        else:
+            self._send_whole(process, id_)
+        copy = self._state_service.copy_spec(id_)
+        if copy is not None:
+            self._send(copy[0], Put(endpoint=copy[1]))
+
+    def _send_whole(self, process: str, id_: str) -> None:
+        peer = self._peers.get(process)
+        if peer is not None:
+            spec = self._state_service.spec(id_)
+            self._sent[process][id_] = spec.revision
+            peer.send(Put(endpoint=spec))
+
+    def _ask_status(self, process: str, id_: str) -> None:
+        """Ask for the whole status of an endpoint, once until it comes."""
+        peer = self._peers.get(process)
+        if peer is not None and (process, id_) not in self._asked:
+            self._asked.add((process, id_))
+            peer.send(StatusWanted(id=id_))
+
     def _sync(self, process: str) -> None:
+        self._forget(process)
         peer = self._peers[process] = self._arriving[process]
         placed = self._state_service.tables.endpoints.by("task_set", process)
-        peer.send(Sync(endpoints=tuple(self._state_service.spec(endpoint.id) for endpoint in placed)))
+        specs = tuple(self._state_service.spec(endpoint.id) for endpoint in placed)
+        self._sent[process] = {spec.id: spec.revision for spec in specs}
+        peer.send(Sync(endpoints=specs))
+
+    def _forget(self, process: str) -> None:
+        """Forget what is known of a connection that ended."""
+        self._peers.pop(process, None)
+        self._sent.pop(process, None)
+        self._asked = {asked for asked in self._asked if asked[0] != process}
 
     def _notify(self, notice: Notice) -> None:
         tables = self._state_service.tables

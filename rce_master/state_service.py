@@ -16,7 +16,7 @@ from rce_master.state.migration import conversion
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rce.control.model import EndpointSpec
+    from rce.control.model import EndpointSpec, SpecPatch
     from rce_master.state.changes import Changes, Touched
     from rce_master.state.commands import Command
     from rce_master.state.settings import StateSettings
@@ -100,6 +100,14 @@ class StateService:
             KeyError: There is no such endpoint.
         """
         return self.state.spec(endpoint)
+
+    def patch(self, endpoint: str, touched: Touched) -> SpecPatch:
+        """Return what is desired now of the parts of an endpoint that changed.
+
+        Raises:
+            KeyError: There is no such endpoint.
+        """
+        return self.state.patch(endpoint, touched)
 
     def copy_spec(self, endpoint: str) -> tuple[str, EndpointSpec] | None:
         """Tell where a container is being handed over to, and what is desired there; None if it is not."""

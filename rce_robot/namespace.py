@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import msgspec
 
 from rce.aio.queues import OverflowPolicy
-from rce.control.model import EndpointState, EndpointStatus, EndpointUsage
+from rce.control.model import EndpointState, EndpointStatus, EndpointUsage, InterfaceUsage, StatusPatch
 from rce.guard.holdings import Holdings
 from rce.link import Endpoint, InterfaceError
 from rce.model.names import EndpointId, InterfaceType
@@ -26,7 +26,7 @@ from rce_robot.interfaces import make_interface
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
 
-    from rce.control.model import EndpointSpec, LinkAddress
+    from rce.control.model import EndpointSpec, LinkAddress, SpecPatch
     from rce.guard.budget import Ledger
     from rce.guard.holdings import Holding
     from rce.link import Interface, LinkHub, Port
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from rce_robot.session import Session
 
 
+_UNUSED = InterfaceUsage()
 COLLECT_AFTER = 16 << 20
 """Bytes given up after which it is made sure that they are free."""
 
@@ -94,6 +95,10 @@ class Namespace:
         self.id = id
         self.revision = 0
         self._address = address
+        self._number = 0
+        """Of the last report to the master."""
+        self._told_session: Session | None = None
+        """The session at that time."""
         self.session: Session | None = None
         """The session from handshake to end, also while it cannot send (yet, or any more)."""
         self.dropped: Counter[str] = Counter()
@@ -120,6 +125,17 @@ class Namespace:
                 await self._endpoint.apply(spec)
         self._changed()
 
+    async def patch(self, patch: SpecPatch) -> bool:
+        """Do what :meth:`apply` does, with what changed; return False if what it fits is not there."""
+        async with self._applying:
+            if patch.revision > self.revision:
+                if patch.base != self.revision:
+                    return False
+                self.revision = patch.revision
+                await self._endpoint.patch(patch)
+        self._changed()
+        return True
+
     async def close(self, reason: str) -> None:
         """End the connection, if there is one, and give up everything."""
         if self.session is not None:
@@ -129,25 +145,61 @@ class Namespace:
         self._account.close()
 
     def status(self) -> EndpointStatus:
-        """Return what the master is told."""
+        """Return all that the master is told."""
+        return msgspec.structs.replace(
+            self._header(),
+            interfaces=dict(self._endpoint.interfaces),
+            connections=tuple(self._endpoint.connections),
+        )
+
+    def _header(self) -> EndpointStatus:
+        """Return a status without interfaces and connections."""
         return EndpointStatus(
             id=str(self.id),
             revision=self.revision,
             state=EndpointState.RUNNING if self.session is not None else EndpointState.ABSENT,
-            interfaces=dict(self._endpoint.interfaces),
-            connections=tuple(self._endpoint.connections),
             address=self._address,
             client=self.session.client if self.session is not None else "",
+            number=self._number,
+        )
+
+    def next_status(self, *, in_patches: bool) -> EndpointStatus | StatusPatch:
+        """Return what the master is to be told next.
+
+        Args:
+            in_patches: Whether it takes what changed. It still gets all when the robot came or left: it
+                forgets what it knew then.
+        """
+        self._number += 1
+        news = self._endpoint.take_news()
+        if not in_patches or self._number == 1 or self._told_session is not self.session:
+            self._told_session = self.session
+            return self.status()
+        header = self._header()
+        return StatusPatch(
+            status=msgspec.structs.replace(
+                header, interfaces=news.interfaces, connections=tuple(news.connections)
+            ),
+            removed_interfaces=tuple(news.removed_interfaces),
+            lost_connections=tuple(news.lost_connections),
         )
 
     def usage(self) -> EndpointUsage:
-        """Return the counters, with what was dropped on the way to the robot added."""
+        """Return the counters of the interfaces that were used.
+
+        What was dropped on the way to the robot is added.
+        """
         return EndpointUsage(
             interfaces={
-                tag: msgspec.structs.replace(usage, dropped=usage.dropped + self.dropped[tag])
-                for tag, usage in self._endpoint.usage().items()
+                tag: usage
+                for tag, counted in self._endpoint.usage().items()
+                if (usage := self._with_dropped(tag, counted)) != _UNUSED
             }
         )
+
+    def _with_dropped(self, tag: str, usage: InterfaceUsage) -> InterfaceUsage:
+        dropped = self.dropped[tag]
+        return msgspec.structs.replace(usage, dropped=usage.dropped + dropped) if dropped else usage
 
     def tick(self) -> None:
         """Do what is to be done every few seconds."""

@@ -26,16 +26,21 @@ from rce.control.messages import (
     LoginReply,
     MachineInfo,
     Notify,
+    PatchSpec,
+    PatchStatus,
     Probe,
     Put,
     ReadLog,
     Refused,
+    SpecWanted,
     Status,
+    StatusWanted,
     Sync,
     TaskSetKind,
     Usage,
     Welcome,
 )
+from rce.control.model import PATCHES, StatusPatch
 from rce.control.usage import cpu_seconds, machine_memory, resident_bytes
 from rce.guard.budget import Ledger
 from rce.model.names import EndpointId
@@ -47,7 +52,7 @@ from rce_robot.namespace import Namespace
 
 if TYPE_CHECKING:
     from rce.control.messages import ToMaster, ToTaskSet
-    from rce.control.model import EndpointSpec, LinkAddress
+    from rce.control.model import EndpointSpec, LinkAddress, SpecPatch
     from rce.guard.lobby import Lobby
     from rce.link import LinkHub
     from rce.protocol.http import Credentials
@@ -124,6 +129,7 @@ class RobotTaskSet:
             in_all=settings.memory or machine_memory() // 2,
         )
         self._tasks: asyncio.TaskGroup | None = None
+        self._master_features: frozenset[str] = frozenset()
         self._unused = UnusedMemory(resident_bytes())
 
     # The master's side
@@ -134,6 +140,7 @@ class RobotTaskSet:
 
     def hello(self) -> Hello:
         """Say who this is and what is there."""
+        self._master_features = frozenset()
         return Hello(
             version=CONTROL_VERSION,
             kind=TaskSetKind.ROBOT,
@@ -143,13 +150,20 @@ class RobotTaskSet:
             address=self._address,
             endpoints=tuple(namespace.status() for namespace in self._namespaces.values()),
             bearer=True,
+            features=(PATCHES,),
         )
 
     async def handle(self, message: ToTaskSet) -> None:
         """Do what the master says."""
         match message:
+            case Welcome():
+                self._master_features = frozenset(message.features)
             case Put():
                 await self.settle(message.endpoint)
+            case PatchSpec():
+                await self._patch(message.patch)
+            case StatusWanted():
+                self._report_whole(EndpointId.parse(message.id))
             case Drop():
                 self._drop(EndpointId.parse(message.id), message.reason or "removed", message.revision)
             case Sync():
@@ -227,6 +241,12 @@ class RobotTaskSet:
         await namespace.apply(spec)
         return namespace
 
+    async def _patch(self, patch: SpecPatch) -> None:
+        """Apply what changed in a robot's spec; what does not fit is asked for as a whole."""
+        namespace = self._namespaces.get(EndpointId.parse(patch.id))
+        if namespace is None or not await namespace.patch(patch):
+            self._channel.send(SpecWanted(id=patch.id))
+
     # What the namespaces ask: rce_robot.namespace.NamespaceListener
 
     def changed(self, namespace: Namespace) -> None:
@@ -262,7 +282,19 @@ class RobotTaskSet:
         changed, self._changed = self._changed, set()
         for namespace in changed:
             if self._is_current(namespace):
-                self._channel.send(Status(status=namespace.status()))
+                self._report(namespace, in_patches=PATCHES in self._master_features)
+
+    def _report(self, namespace: Namespace, *, in_patches: bool) -> None:
+        told = namespace.next_status(in_patches=in_patches)
+        if isinstance(told, StatusPatch):
+            self._channel.send(PatchStatus(patch=told))
+        else:
+            self._channel.send(Status(status=told))
+
+    def _report_whole(self, id_: EndpointId) -> None:
+        namespace = self._namespaces.get(id_)
+        if namespace is not None:
+            self._report(namespace, in_patches=False)
 
     def _report_usage(self) -> None:
         for namespace in self._namespaces.values():

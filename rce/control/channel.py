@@ -26,10 +26,12 @@ from rce.control.messages import (
     Login,
     LoginReply,
     Notify,
+    PatchSpec,
     Probe,
     Put,
     ReadLog,
     Refused,
+    StatusWanted,
     Sync,
     Welcome,
     decode_to_task_set,
@@ -312,7 +314,17 @@ class TaskSetChannel:
                 pending = self._pending.get(message.request)
                 if pending is not None and not pending.reply.done():
                     pending.reply.set_result(message)
-            case Sync() | Put() | Drop() | Notify() | Probe() | ReadLog() | Execute():
+            case (
+                Sync()
+                | Put()
+                | PatchSpec()
+                | StatusWanted()
+                | Drop()
+                | Notify()
+                | Probe()
+                | ReadLog()
+                | Execute()
+            ):
                 await self._inbox.put(message)
             case _:
                 assert_never(message)

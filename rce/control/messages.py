@@ -1,7 +1,9 @@
 """The messages on the control channel (JSON text frames, tagged by ``t``).
 
 A task set dials the master and sends :class:`Hello`. The master answers :class:`Welcome` and
-:class:`Sync` with all that it desires there, and from then on single :class:`Put` and :class:`Drop`.
+:class:`Sync` with all that it desires there, and from then on single :class:`Put`, :class:`PatchSpec` and
+:class:`Drop`. Reports go the same way: what is there in ``Hello``, then :class:`Status` and
+:class:`PatchStatus`. Who gets a patch that does not fit what it has asks for the whole.
 Messages with a ``request`` number are answered by the reply with the same number.
 
 Programs of two releases that follow each other talk to one another: the master takes task sets of this
@@ -25,6 +27,8 @@ from rce.control.model import (
     EndpointStatus,
     EndpointUsage,
     LinkAddress,
+    SpecPatch,
+    StatusPatch,
 )
 from rce.control.tags import TaggedReader
 
@@ -98,6 +102,18 @@ class Status(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """An endpoint changed."""
 
     status: EndpointStatus
+
+
+class PatchStatus(_Message, frozen=True, kw_only=True, omit_defaults=True):
+    """An endpoint changed in this. Only to masters with the feature :data:`rce.control.model.PATCHES`."""
+
+    patch: StatusPatch
+
+
+class SpecWanted(_Message, frozen=True, kw_only=True, omit_defaults=True):
+    """A patch did not fit what is desired here. Answered by :class:`Put`, if the endpoint is placed here."""
+
+    id: str
 
 
 class Gone(_Message, frozen=True, kw_only=True, omit_defaults=True):
@@ -188,6 +204,8 @@ class Welcome(_Message, frozen=True, kw_only=True, omit_defaults=True):
 
     version: int
     master: str
+    features: tuple[str, ...] = ()
+    """What this master can do that one of an earlier release could not."""
 
 
 class Refused(_Message, frozen=True, kw_only=True, omit_defaults=True):
@@ -206,6 +224,21 @@ class Put(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """One endpoint is desired like this. An older revision than the one applied is ignored."""
 
     endpoint: EndpointSpec
+
+
+class PatchSpec(_Message, frozen=True, kw_only=True, omit_defaults=True):
+    """What is desired of one endpoint changed in this.
+
+    Only to task sets with the feature :data:`rce.control.model.PATCHES`.
+    """
+
+    patch: SpecPatch
+
+
+class StatusWanted(_Message, frozen=True, kw_only=True, omit_defaults=True):
+    """A patch did not fit what was reported. Answered by :class:`Status`, if the endpoint is there."""
+
+    id: str
 
 
 class Drop(_Message, frozen=True, kw_only=True, omit_defaults=True):
@@ -270,9 +303,23 @@ class Execute(_Message, frozen=True, kw_only=True, omit_defaults=True):
     command: Command
 
 
-ToMaster = Hello | Status | Gone | Fault | Usage | Login | Left | ClientRequest | LogChunk
+ToMaster = (
+    Hello | Status | PatchStatus | SpecWanted | Gone | Fault | Usage | Login | Left | ClientRequest | LogChunk
+)
 ToTaskSet = (
-    Welcome | Refused | Sync | Put | Drop | Notify | Probe | LoginReply | ClientReply | ReadLog | Execute
+    Welcome
+    | Refused
+    | Sync
+    | Put
+    | PatchSpec
+    | StatusWanted
+    | Drop
+    | Notify
+    | Probe
+    | LoginReply
+    | ClientReply
+    | ReadLog
+    | Execute
 )
 
 _encoder = msgspec.json.Encoder()

@@ -1,8 +1,9 @@
 """What the master desires of an endpoint and what a task set reports of it.
 
-An *endpoint* is a robot or a container. The master keeps one :class:`EndpointSpec` for each and sends it
-whole, with a growing revision, to the task set where the endpoint is placed; the task set compares it with
-what is there and makes up the difference. Applying the same spec twice changes nothing.
+An *endpoint* is a robot or a container. The master sends its :class:`EndpointSpec`, with a growing revision,
+to the task set where it is placed: whole at first, then what changed (:class:`SpecPatch`). The task set
+compares it with what is there and makes up the difference. Applying the same twice changes nothing. What is
+observed goes the other way in the same forms: :class:`EndpointStatus`, then :class:`StatusPatch`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,9 @@ from enum import Enum
 from msgspec import Struct, field
 
 from rce.model.specs import InterfaceSpec, NodeSpec, ParameterSpec, Resources
+
+PATCHES = "patches"
+"""The feature of programs that take and send patches in place of whole specs and statuses."""
 
 
 class LinkAddress(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -86,6 +90,36 @@ class EndpointSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
     packages: tuple[PackageSpec, ...] = field(default=(), name="bundles")
 
 
+class EndpointContents(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What an endpoint's spec holds beside interfaces, links and connections."""
+
+    resources: Resources = Resources()
+    nodes: tuple[NodeSpec, ...] = ()
+    parameters: tuple[ParameterSpec, ...] = ()
+    packages: tuple[PackageSpec, ...] = ()
+
+
+class SpecPatch(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What changed in the spec of an endpoint. It fits only what has the revision ``base``."""
+
+    id: str
+    base: int
+    revision: int
+    """Of the spec when the patch is applied."""
+    interfaces: tuple[InterfaceSpec, ...] = ()
+    """New, or changed; so are links and connections."""
+    links: tuple[LinkSpec, ...] = ()
+    connections: tuple[ConnectionSpec, ...] = ()
+    removed_interfaces: tuple[str, ...] = ()
+    """By tag."""
+    removed_links: tuple[str, ...] = ()
+    """By id."""
+    removed_connections: tuple[int, ...] = ()
+    """By id."""
+    contents: EndpointContents | None = None
+    """None: as before."""
+
+
 class NodeState(Enum):
     """Where a node is in its life."""
 
@@ -131,7 +165,7 @@ class EndpointState(Enum):
 
 
 class EndpointStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """All that a task set reports of one endpoint; sent whole whenever something in it changed."""
+    """All that a task set reports of one endpoint."""
 
     id: str
     revision: int
@@ -148,6 +182,19 @@ class EndpointStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     address: LinkAddress = LinkAddress()
     client: str = ""
     """From where a robot is connected, and since when, in words for its user; robots only."""
+    number: int = 0
+    """Counts the reports of this endpoint; each patch has the number after that of what it fits."""
+
+
+class StatusPatch(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What changed in the status of an endpoint. It fits only what has the number before its own."""
+
+    status: EndpointStatus
+    """As it is now; but of interfaces only those that are new or changed, and of connections only those that
+    were established since."""
+    removed_interfaces: tuple[str, ...] = ()
+    lost_connections: tuple[int, ...] = ()
+    """No longer established, or removed."""
 
 
 class InterfaceUsage(Struct, frozen=True, kw_only=True, omit_defaults=True):

@@ -25,7 +25,9 @@ from rce.control.messages import (
     Left,
     LogChunk,
     Login,
+    PatchStatus,
     Refused,
+    SpecWanted,
     Status,
     Usage,
     Welcome,
@@ -104,7 +106,9 @@ class ControlServer:
         tls: Context | None = None,
         is_revoked: Callable[[int], bool] | None = None,
         on_execution: Callable[[str, ServerConnection], Awaitable[None]] | None = None,
+        features: tuple[str, ...] = (),
     ) -> None:
+        self._features = features
         self._secret = secret
         self._tls = tls
         self._is_revoked = is_revoked
@@ -267,7 +271,7 @@ class ControlServer:
             peer.finished.set()
 
     async def _introduce(self, peer: Peer, socket: ServerConnection) -> None:
-        peer.send(Welcome(version=CONTROL_VERSION, master=self._master))
+        peer.send(Welcome(version=CONTROL_VERSION, master=self._master, features=self._features))
         try:
             await self._on_hello(peer, peer.hello)
         except PeerRefusedError as error:
@@ -305,7 +309,17 @@ class ControlServer:
                     return
                 case Unknown(name=name):
                     _log.info("%r sent a %s, which this release does not know", peer, name)
-                case Status() | Gone() | Fault() | Usage() | Login() | Left() | ClientRequest():
+                case (
+                    Status()
+                    | PatchStatus()
+                    | SpecWanted()
+                    | Gone()
+                    | Fault()
+                    | Usage()
+                    | Login()
+                    | Left()
+                    | ClientRequest()
+                ):
                     await self._on_message(peer, message)
                 case _:
                     assert_never(message)

@@ -217,6 +217,15 @@ class LinkAcceptor:
             self._routes.update(dict.fromkeys(links, sender))
             self._assigned.notify_all()
 
+    async def reassign(self, sender: HandoverSender, added: Iterable[str], removed: Iterable[str]) -> None:
+        """Send some more links to ``sender``, and some no longer."""
+        for link in removed:
+            if self._routes.get(link) is sender:
+                del self._routes[link]
+        async with self._assigned:
+            self._routes.update(dict.fromkeys(added, sender))
+            self._assigned.notify_all()
+
     def forget(self, sender: HandoverSender) -> None:
         """Send no more links to ``sender``."""
         self._forget(sender)

@@ -41,7 +41,7 @@ class InterfaceSlot:
         *,
         limits: LinkLimits,
         timeouts: LinkTimeouts,
-        on_change: Callable[[], None],
+        on_change: Callable[[int], None],
         on_fault: Callable[[str], None],
         holdings: Holdings | None = None,
     ) -> None:
@@ -154,7 +154,7 @@ class InterfaceSlot:
         if active != self.active:
             self.active = active
             self._tell_interface(active)
-        self._on_change()
+        self._on_change(channel.number)
 
     def receive(self, channel: Channel, payload: bytes, source: int | None) -> None:
         """Hand a peer's message to the interface; a latched one has a source."""

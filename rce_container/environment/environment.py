@@ -12,14 +12,25 @@ from pathlib import Path
 from typing import assert_never
 
 import msgspec
+from msgspec.structs import replace
 
+from rce.control.desired import DesiredState, Fit
 from rce.control.execution import FEATURE as EXEC
-from rce.control.model import EndpointKind, EndpointSpec, EndpointState, EndpointStatus
+from rce.control.model import (
+    PATCHES,
+    EndpointKind,
+    EndpointSpec,
+    EndpointState,
+    EndpointStatus,
+    InterfaceUsage,
+    SpecPatch,
+    StatusPatch,
+)
 from rce.control.tags import Unknown
 from rce.link import Endpoint, LinkHub
 from rce.link.handover import HandoverReceiver
+from rce.link.wiring import WiringNews
 from rce.model.names import EndpointId
-from rce.model.specs import InterfaceSpec
 from rce.ros.core import Core
 from rce.ros.core.events import Change
 from rce.ros.core.rosout import AGGREGATE
@@ -51,6 +62,7 @@ from rce_container.environment.user_packages import UserPackages
 _log = logging.getLogger(__name__)
 
 _MAX_UNTOLD = 100
+_UNUSED = InterfaceUsage()
 _GET_PID_TIMEOUT_S = 5.0
 
 
@@ -81,16 +93,22 @@ class Environment:
         self._loop = asyncio.get_running_loop()
         self._ending = asyncio.Event()
         self._end_reason = ""
-        self._desired = EndpointSpec(id=boot.id, kind=EndpointKind.CONTAINER, revision=-1)
+        self._desired = DesiredState(EndpointSpec(id=boot.id, kind=EndpointKind.CONTAINER, revision=-1))
+        self._patches: list[SpecPatch] = []
+        """What is to be done about interfaces and connections, if it is not all of them."""
+        self._all_due = False
+        self._holds_back = False
+        """Whether interfaces wait for packages."""
         self._applied_revision = -1
         self._news = asyncio.Event()
         self._parameters: Values = {}
         self._faulty: set[str] = set()
-        self._interfaces: tuple[InterfaceSpec, ...] = ()
         self._channel: Channel | None = None
         self._grace: asyncio.TimerHandle | None = None
         self._untold: deque[str] = deque(maxlen=_MAX_UNTOLD)
         self._told: EndpointStatus | None = None
+        """What the manager was told last; without interfaces and connections, if it takes patches."""
+        self._manager_features: frozenset[str] = frozenset()
         self._report_due: asyncio.Handle | None = None
         self._handover: HandoverReceiver | None = None
         self._user_packages = UserPackages(boot.user_packages, boot.packages)
@@ -198,22 +216,46 @@ class Environment:
     def _apply(self, spec: EndpointSpec) -> None:
         if spec.revision < self._desired.revision or self._ending.is_set():
             return
-        self._desired = spec
-        self._user_packages.apply(spec.packages)
-        self._set_parameters(spec)
-        self._nodes.lack(self._user_packages.lacking(spec.nodes))
-        self._nodes.apply(spec.nodes)
+        self._desired.replace(spec)
+        self._apply_contents()
+        self._apply_all()
+
+    def _apply_patch(self, channel: Channel, patch: SpecPatch) -> None:
+        fit = self._desired.fit(patch)
+        if fit is Fit.GAP:
+            channel.send(m.encode(m.SpecWanted()))
+        if fit is not Fit.NEXT or self._ending.is_set():
+            return
+        self._desired.patch(patch)
+        self._patches.append(patch)
+        if patch.contents is not None:
+            self._apply_contents()
+        self._news.set()
+
+    def _apply_contents(self) -> None:
+        """Make parameters and nodes as desired."""
+        contents = self._desired.contents
+        self._user_packages.apply(contents.packages)
+        self._set_parameters()
+        self._nodes.lack(self._user_packages.lacking(contents.nodes))
+        self._nodes.apply(contents.nodes)
+
+    def _apply_all(self) -> None:
+        """Have all interfaces and connections looked at."""
+        self._all_due = True
+        self._patches.clear()
         self._news.set()
 
     def _take_user_packages(self) -> None:
         """Go on with what waited for packages that have come."""
         self._user_packages.look()
-        self._set_parameters(self._desired)
-        self._nodes.lack(self._user_packages.lacking(self._desired.nodes))
-        self._news.set()
+        self._set_parameters()
+        self._nodes.lack(self._user_packages.lacking(self._desired.contents.nodes))
+        self._apply_all()
 
-    def _set_parameters(self, spec: EndpointSpec) -> None:
-        desired, faults = evaluate_all(spec.parameters, self._packages, self._environ())
+    def _set_parameters(self) -> None:
+        parameters = self._desired.contents.parameters
+        desired, faults = evaluate_all(parameters, self._packages, self._environ())
         change = difference(self._parameters, desired)
         for name in change.delete:
             self._core.delete_param(name)
@@ -231,13 +273,26 @@ class Environment:
         while True:
             await self._news.wait()
             self._news.clear()
-            spec = self._desired
-            await self._heartbeats.follow(spec.nodes)
-            possible = self._user_packages.hold_back(spec, self._interfaces)
-            self._interfaces = possible.interfaces
-            await self._endpoint.apply(possible)
-            self._applied_revision = spec.revision
+            patches, self._patches = self._patches, []
+            is_whole = self._all_due or self._holds_back or self._user_packages.is_waiting
+            self._all_due = False
+            desired = self._desired.whole if is_whole else None
+            revision = self._desired.revision
+            if desired is not None or any(patch.contents is not None for patch in patches):
+                await self._heartbeats.follow(self._desired.contents.nodes)
+            if desired is None:
+                for patch in patches:
+                    await self._endpoint.patch(patch)
+            else:
+                await self._apply_possible(desired)
+            self._applied_revision = revision
             self._changed()
+
+    async def _apply_possible(self, desired: EndpointSpec) -> None:
+        """Make all interfaces and connections but those that wait for packages."""
+        possible = self._user_packages.hold_back(desired, self._endpoint.desired_interfaces)
+        self._holds_back = possible is not desired
+        await self._endpoint.apply(possible)
 
     # What is
 
@@ -247,17 +302,35 @@ class Environment:
 
     def _report(self) -> None:
         self._report_due = None
-        status = EndpointStatus(
+        if self._channel is None:
+            return
+        header = EndpointStatus(
             id=self._boot.id,
             revision=self._applied_revision,
             state=self._state,
             nodes=self._nodes.statuses,
-            interfaces=dict(self._endpoint.interfaces),
-            connections=self._endpoint.connections,
         )
-        if status != self._told and self._channel is not None:
+        news = self._endpoint.take_news()
+        if self._told is not None and PATCHES in self._manager_features:
+            self._report_patch(self._channel, header, news)
+            return
+        interfaces = dict(self._endpoint.interfaces)
+        status = replace(header, interfaces=interfaces, connections=self._endpoint.connections)
+        if status != self._told:
             self._told = status
-            self._channel.send(m.encode(m.Report(status=status, features=(EXEC,))))
+            self._channel.send(m.encode(m.Report(status=status, features=(EXEC, PATCHES))))
+
+    def _report_patch(self, channel: Channel, header: EndpointStatus, news: WiringNews) -> None:
+        """Report what changed since the last report on this channel."""
+        if header == self._told and not news:
+            return
+        self._told = header
+        patch = StatusPatch(
+            status=replace(header, interfaces=news.interfaces, connections=tuple(news.connections)),
+            removed_interfaces=tuple(news.removed_interfaces),
+            lost_connections=tuple(news.lost_connections),
+        )
+        channel.send(m.encode(m.ReportPatch(patch=patch)))
 
     @property
     def _state(self) -> EndpointState:
@@ -314,6 +387,7 @@ class Environment:
             self._grace.cancel()
         self._channel = Channel(sock)
         self._told = None
+        self._manager_features = frozenset()
         self._report()
         while self._untold:
             self._channel.send(m.encode(m.Fault(text=self._untold.popleft())))
@@ -336,16 +410,20 @@ class Environment:
         match message:
             case m.Apply(spec=spec):
                 self._apply(spec)
+            case m.ApplyPatch(patch=patch):
+                self._apply_patch(channel, patch)
             case m.Shelved():
                 self._take_user_packages()
             case m.Poll():
-                counters = m.Counters(interfaces=self._endpoint.usage(), traffic=self._endpoint.traffic)
+                used = {tag: one for tag, one in self._endpoint.usage().items() if one != _UNUSED}
+                counters = m.Counters(interfaces=used, traffic=self._endpoint.traffic)
                 channel.send(m.encode(counters))
             case m.Dialed(request=request, error=error):
                 self._dial_proxy.answered(request, error or socket.socket(fileno=channel.take_fd()))
             case m.Cause(request=request, text=text):
                 self._causes.answered(request, text)
-            case m.Handover():
+            case m.Handover(features=features):
+                self._manager_features = frozenset(features)
                 if self._handover is not None:
                     await self._handover.close()
                 self._handover = HandoverReceiver(socket.socket(fileno=channel.take_fd()), self._hub.adopt)

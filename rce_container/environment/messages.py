@@ -11,7 +11,14 @@ import msgspec
 from msgspec import Struct, field
 
 from rce.control.execution import Command
-from rce.control.model import EndpointSpec, EndpointStatus, InterfaceUsage, LinkAddress
+from rce.control.model import (
+    EndpointSpec,
+    EndpointStatus,
+    InterfaceUsage,
+    LinkAddress,
+    SpecPatch,
+    StatusPatch,
+)
 from rce.control.tags import TaggedReader
 
 
@@ -63,12 +70,21 @@ class Apply(_Message):
     spec: EndpointSpec
 
 
+class ApplyPatch(_Message):
+    """What is desired of the container changed in this. Only to environments with the feature ``patches``."""
+
+    patch: SpecPatch
+
+
 class Shelved(_Message):
     """Packages that the user brought have appeared."""
 
 
 class Handover(_Message):
     """Comes with a socket, on which the manager hands accepted links over (:mod:`rce.link.handover`)."""
+
+    features: tuple[str, ...] = ()
+    """What this manager can do that one of an earlier release could not."""
 
 
 class Dialed(_Message):
@@ -112,6 +128,16 @@ class Report(_Message):
     """What this environment can do that one of an earlier release could not."""
 
 
+class ReportPatch(_Message):
+    """What there is changed in this. Only to managers with the feature ``patches``."""
+
+    patch: StatusPatch
+
+
+class SpecWanted(_Message):
+    """A patch did not fit what is desired here. Answered by :class:`Apply`."""
+
+
 class Fault(_Message):
     """Something failed that the user must know of."""
 
@@ -139,8 +165,8 @@ class Killed(_Message):
     request: int
 
 
-ToEnvironment = Apply | Shelved | Handover | Dialed | Cause | Poll | Execute | Stop
-ToManager = Report | Fault | Counters | Dial | Killed
+ToEnvironment = Apply | ApplyPatch | Shelved | Handover | Dialed | Cause | Poll | Execute | Stop
+ToManager = Report | ReportPatch | SpecWanted | Fault | Counters | Dial | Killed
 
 encode = msgspec.json.Encoder().encode
 """Write a message as JSON; holds no newline."""

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from msgspec.structs import replace
-
-from rce_master.state.wiring_records import ActiveInterface, OpenEnd
+from rce_master.state.wiring_records import ActiveInterface, OpenEnd, interface_key, open_end_key
 
 if TYPE_CHECKING:
-    from rce.control.model import EndpointStatus
+    from rce.control.model import EndpointStatus, StatusPatch
     from rce_master.state.changes import Transaction
 
 
-def note(tx: Transaction, status: EndpointStatus) -> EndpointStatus:
-    """Note all that a whole report says of an endpoint's interfaces and connections; return the rest."""
+def note(tx: Transaction, status: EndpointStatus) -> None:
+    """Note all that a whole report says of an endpoint's interfaces and connections."""
     id_, tables = status.id, tx.tables
     active = {tag for tag, is_active in status.interfaces.items() if is_active}
     for interface in tables.active.by("endpoint", id_):
@@ -28,7 +26,22 @@ def note(tx: Transaction, status: EndpointStatus) -> EndpointStatus:
             tx.delete(tables.open_ends, end.id)
     for connection in established:
         tx.put(OpenEnd(endpoint=id_, connection=connection))
-    return replace(status, interfaces={}, connections=())
+
+
+def amend(tx: Transaction, patch: StatusPatch) -> None:
+    """Note what changed in a report."""
+    id_, tables = patch.status.id, tx.tables
+    for tag in patch.removed_interfaces:
+        tx.delete(tables.active, interface_key(id_, tag))
+    for tag, is_active in patch.status.interfaces.items():
+        if is_active:
+            tx.put(ActiveInterface(endpoint=id_, tag=tag))
+        else:
+            tx.delete(tables.active, interface_key(id_, tag))
+    for connection in patch.lost_connections:
+        tx.delete(tables.open_ends, open_end_key(id_, connection))
+    for connection in patch.status.connections:
+        tx.put(OpenEnd(endpoint=id_, connection=connection))
 
 
 def forget(tx: Transaction, id_: str) -> None:

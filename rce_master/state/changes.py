@@ -113,6 +113,10 @@ class Changes:
     """Process name of the task set that is to be synchronised."""
     answered: str = ""
     """Id of an endpoint whose spec goes out with the answer to the command, so that it needs no ``Put``."""
+    wanted_specs: list[tuple[str, str]] = field(default_factory=list)
+    """Process names and endpoint ids: which task sets are to get which whole specs again."""
+    wanted_statuses: list[tuple[str, str]] = field(default_factory=list)
+    """Process names and endpoint ids: which task sets are to report which endpoints as a whole."""
     _writes: list[_Write] = field(default_factory=list)
 
     def written(self) -> dict[tuple[str, str], Table[Any]]:

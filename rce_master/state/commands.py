@@ -13,7 +13,7 @@ from rce.model.specs import Resources
 
 if TYPE_CHECKING:
     from rce.control.messages import Hello
-    from rce.control.model import EndpointStatus
+    from rce.control.model import EndpointStatus, StatusPatch
     from rce.model.specs import InterfaceSpec, NodeSpec, ParameterValue
     from rce_master.state.records import KnownLogin, PackageKey, Token, User, UserPackage, UserRole
 
@@ -171,6 +171,22 @@ class StatusReported:
 
     process: str
     status: EndpointStatus
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatusPatched:
+    """A task set reported what changed of an endpoint."""
+
+    process: str
+    patch: StatusPatch
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpecRequested:
+    """A task set asked for the whole spec of an endpoint, because a patch did not fit what it has."""
+
+    process: str
+    id: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -371,6 +387,8 @@ Command: TypeAlias = (
     | TaskSetArrived
     | TaskSetLeft
     | StatusReported
+    | StatusPatched
+    | SpecRequested
     | EndpointGone
     | FaultReported
     | RobotLogin

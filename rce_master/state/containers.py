@@ -214,7 +214,7 @@ def _forget_status(tx: Transaction, container: Container) -> None:
 
 
 def reported(tx: Transaction, container: Container, status: EndpointStatus) -> None:
-    """Note what its task set reports of a container."""
+    """Note what its task set reports of a container beside its interfaces and connections."""
     before = tx.tables.container_live(container.id)
     event = _EVENTS[status.state]
     if before.after(event, tx.now).phase is not before.phase:
@@ -223,8 +223,7 @@ def reported(tx: Transaction, container: Container, status: EndpointStatus) -> N
     elif before.status and before.status.incarnation != status.incarnation:
         tx.happen("container_restarted", container.id, status.detail)
     _compare_nodes(tx, container.id, before.status, status)
-    header = activity.note(tx, status)
-    tx.put(replace(tx.tables.container_live(container.id), status=header))
+    tx.put(replace(tx.tables.container_live(container.id), status=status))
     _move(tx, container, status.address)
 
 

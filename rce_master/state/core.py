@@ -6,7 +6,6 @@ import secrets
 from typing import TYPE_CHECKING, Any
 
 import msgspec
-from msgspec.structs import replace
 
 from rce_master.exceptions import StoreError
 from rce_master.state import (
@@ -27,13 +26,14 @@ from rce_master.state.changes import Changes, Transaction
 from rce_master.state.invariants import validate
 from rce_master.state.migration import converted
 from rce_master.state.settings import StateSettings
-from rce_master.state.specs import build_spec
+from rce_master.state.specs import build_patch, build_spec
 from rce_master.state.tables import Tables
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rce.control.model import EndpointSpec
+    from rce.control.model import EndpointSpec, SpecPatch
+    from rce_master.state.changes import Touched
     from rce_master.store.base import Snapshot
 
 _HANDLERS: dict[type, Callable[[Transaction, Any], None]] = {
@@ -55,6 +55,8 @@ _HANDLERS: dict[type, Callable[[Transaction, Any], None]] = {
     commands.TaskSetArrived: task_sets.arrived,
     commands.TaskSetLeft: task_sets.left,
     commands.StatusReported: task_sets.status_reported,
+    commands.StatusPatched: task_sets.status_patched,
+    commands.SpecRequested: task_sets.spec_requested,
     commands.EndpointGone: task_sets.gone,
     commands.FaultReported: task_sets.fault,
     commands.RobotLogin: robots.login,
@@ -170,8 +172,15 @@ class State:
         move = self.tables.moves.get(endpoint)
         if move is None:
             return None
-        whole = self.spec(endpoint)
-        return move.to, replace(whole, interfaces=(), links=(), connections=())
+        return move.to, build_spec(self.tables, endpoint, with_wiring=False)
+
+    def patch(self, endpoint: str, touched: Touched) -> SpecPatch:
+        """Return what is desired now of the parts of an endpoint that changed.
+
+        Raises:
+            KeyError: There is no such endpoint.
+        """
+        return build_patch(self.tables, endpoint, touched)
 
     def validate(self) -> None:
         """Check all invariants.

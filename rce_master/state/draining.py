@@ -18,6 +18,7 @@ from msgspec.structs import replace
 
 from rce.control.messages import TaskSetKind
 from rce.control.model import EndpointState, EndpointStatus, NodeState
+from rce.control.observed import without_wiring
 from rce_master.exceptions import NotFoundError
 from rce_master.state import activity, capacity, endpoints, placing
 from rce_master.state.lifecycle import ContainerEvent
@@ -192,7 +193,8 @@ def _switch(tx: Transaction, move: Move) -> None:
     tx.delete(tx.tables.moves, move.id)
     endpoints.withdraw(tx, container, "it was handed over to another machine")
     _settle(tx, container, move)
-    tx.put(replace(tx.tables.container_live(move.id), status=activity.note(tx, move.status)))
+    tx.put(replace(tx.tables.container_live(move.id), status=without_wiring(move.status)))
+    activity.note(tx, move.status)
     placing.happened(tx, move.id, _PHASES[move.status.state])
     tx.put(replace(tx.tables.endpoints[move.id], address=move.status.address))
     tx.happen("container_moved", move.id, f"from {container.task_set} to {move.to}")

@@ -116,7 +116,7 @@ def send_away(tx: Transaction, robot: Robot, reason: str) -> None:
 
 
 def reported(tx: Transaction, robot: Robot, status: EndpointStatus) -> None:
-    """Note what its task set reports of a robot."""
+    """Note what its task set reports of a robot beside its interfaces and connections."""
     live = tx.tables.robot_live(robot.id)
     if status.state is EndpointState.RUNNING and live.session is RobotSession.ABSENT:
         live = live.after(RobotEvent.LOGIN, tx.now)
@@ -127,7 +127,7 @@ def reported(tx: Transaction, robot: Robot, status: EndpointStatus) -> None:
             return
         leave(tx, robot, status.detail)
         live = tx.tables.robot_live(robot.id)
-    tx.put(replace(live, status=activity.note(tx, status)))
+    tx.put(replace(live, status=status))
 
 
 def expire(tx: Transaction) -> None:

@@ -236,6 +236,7 @@ class Tables:
             key=lambda i: i.id,
             order=lambda i: i.number,
             endpoint=lambda i: [i.endpoint],
+            user=lambda i: [i.endpoint.partition("/")[0]],
         )
         self.links = Table[Link](
             "links",
@@ -249,6 +250,7 @@ class Tables:
             type_=Connection,
             key=lambda c: str(c.id),
             order=lambda c: c.id,
+            user=lambda c: [c.a.partition("/")[0]],
             link=lambda c: [c.link],
             endpoint=lambda c: dict.fromkeys((c.a, c.b)),
             end=lambda c: dict.fromkeys(c.ends),

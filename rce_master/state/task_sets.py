@@ -6,9 +6,10 @@ import re
 from typing import TYPE_CHECKING
 
 from rce.control.messages import Hello, TaskSetKind
-from rce.control.model import EndpointState, EndpointStatus
+from rce.control.model import EndpointState, EndpointStatus, StatusPatch
+from rce.control.observed import without_wiring
 from rce_master.exceptions import ConflictError, InvalidRequestError, NotFoundError
-from rce_master.state import capacity, containers, draining, endpoints, placing, robots
+from rce_master.state import activity, capacity, containers, draining, endpoints, placing, robots
 from rce_master.state.lifecycle import ContainerPhase, RobotSession
 from rce_master.state.records import (
     Container,
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from rce_master.state.commands import (
         EndpointGone,
         FaultReported,
+        SpecRequested,
+        StatusPatched,
         StatusReported,
         TaskSetArrived,
         TaskSetLeft,
@@ -167,11 +170,50 @@ def status_reported(tx: Transaction, command: StatusReported) -> None:
         draining.reported(tx, move, command.status)
 
 
-def _note(tx: Transaction, endpoint: Container | Robot, status: EndpointStatus) -> None:
+def status_patched(tx: Transaction, command: StatusPatched) -> None:
+    """Note what a task set reports as changed; if it does not fit what is known, ask for the whole."""
+    process, patch = command.process, command.patch
+    if not tx.tables.is_connected(process):
+        return
+    id_ = patch.status.id
+    endpoint, move = tx.tables.endpoints.get(id_), tx.tables.moves.get(id_)
+    if endpoint is not None and endpoint.task_set == process:
+        if _follows(patch, tx.tables.live[id_].status):
+            _note(tx, endpoint, patch.status, patch)
+        else:
+            tx.changes.wanted_statuses.append((process, id_))
+    elif move is not None and move.to == process:
+        if _follows(patch, move.status):
+            draining.reported(tx, move, without_wiring(patch.status))
+        else:
+            tx.changes.wanted_statuses.append((process, id_))
+
+
+def _follows(patch: StatusPatch, known: EndpointStatus | None) -> bool:
+    return known is not None and patch.status.number == known.number + 1
+
+
+def spec_requested(tx: Transaction, command: SpecRequested) -> None:
+    """Have the whole spec of an endpoint sent to its task set again."""
+    endpoint = tx.tables.endpoints.get(command.id)
+    if endpoint is not None and endpoint.task_set == command.process:
+        tx.changes.wanted_specs.append((command.process, command.id))
+
+
+def _note(
+    tx: Transaction, endpoint: Container | Robot, status: EndpointStatus, patch: StatusPatch | None = None
+) -> None:
+    header = without_wiring(status)
     if isinstance(endpoint, Container):
-        containers.reported(tx, endpoint, status)
+        containers.reported(tx, endpoint, header)
     else:
-        robots.reported(tx, endpoint, status)
+        robots.reported(tx, endpoint, header)
+    if tx.tables.live[endpoint.id].status is None:
+        return
+    if patch is None:
+        activity.note(tx, status)
+    else:
+        activity.amend(tx, patch)
 
 
 def gone(tx: Transaction, command: EndpointGone) -> None:

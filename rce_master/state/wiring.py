@@ -32,6 +32,10 @@ def add_interface(tx: Transaction, command: AddInterface) -> None:
         )
     if tx.tables.interfaces.count("endpoint", endpoint.id) >= tx.settings.max_interfaces:
         raise LimitReachedError(f"{endpoint.tag!r} has {tx.settings.max_interfaces} interfaces already")
+    if tx.tables.interfaces.count("user", endpoint.user) >= tx.settings.max_user_interfaces:
+        raise LimitReachedError(
+            f"you have {tx.settings.max_user_interfaces} interfaces already; remove some first"
+        )
     size = endpoints.grown(tx, endpoint, interface)
     tx.put(replace(endpoint, size=size))
     tx.put(Interface(endpoint=endpoint.id, number=tx.next_number("interface"), spec=interface))
@@ -152,6 +156,10 @@ def _check_pair(tx: Transaction, pair: _Pair) -> None:
         raise InvalidRequestError(
             f"{path_a!r} has the class {one.message_type} and {path_b!r} {other.message_type}; "
             "they must be the same"
+        )
+    if tx.tables.connections.count("user", pair.a.user) >= tx.settings.max_user_connections:
+        raise LimitReachedError(
+            f"you have {tx.settings.max_user_connections} connections already; remove some first"
         )
     for endpoint, interface, role in ((pair.a, one, role_a), (pair.b, other, role_b)):
         _check_room(tx, endpoint, interface, role)

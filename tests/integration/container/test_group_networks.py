@@ -99,7 +99,9 @@ async def reached(machine: Machine, id_: str, *targets: str) -> dict[str, Any]:
     spec = own("reach.py", " ".join(targets), tag=f"reach{status.revision}")
     kept = machine.manager._core.containers[id_].desired
     assert kept is not None
-    await machine.put(id_, status.revision + 1, nodes=(*kept.nodes, spec), resources=kept.resources)
+    await machine.put(
+        id_, status.revision + 1, nodes=(*kept.contents.nodes, spec), resources=kept.contents.resources
+    )
     await machine.node_is(id_, spec.tag, NodeState.EXITED)
     lines = (await machine.log(id_, spec.tag)).splitlines()
     found: dict[str, Any] = json.loads(next(line for line in lines if line.startswith("{")))

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from support.patches import patch_between
 
 from rce.aio.backoff import Backoff
 from rce.control.model import ConnectionSpec, EndpointKind, EndpointSpec, LinkAddress, LinkSpec
@@ -120,6 +121,8 @@ class Party:
             on_fault=self._fault,
         )
         self.address = LinkAddress()
+        self.in_patches = False
+        """Whether what it applies is told as patches."""
 
     def _make(self, port: Port) -> Interface:
         if port.spec.addr == "/unmakable":
@@ -154,7 +157,10 @@ class Party:
             connections=old.connections if connections is None else tuple(connections),
             resources=old.resources,
         )
-        await self.endpoint.apply(self.spec)
+        if self.in_patches:
+            await self.endpoint.patch(patch_between(old, self.spec))
+        else:
+            await self.endpoint.apply(self.spec)
 
     async def until(self, condition: Callable[[], bool]) -> None:
         """Wait for a change that makes ``condition`` true."""

@@ -390,11 +390,11 @@ async def test_stalled_peer_loses_its_own_old_messages_only(rig: Rig) -> None:
     assert usage["i3"].dropped == 0
     assert usage["i1"].dropped >= 56
     assert usage["i2"].dropped >= 50
-    queues = [channel._queue for channel in robot.endpoint._channels.values()]
+    queues = [channel._queue for channel in robot.endpoint._channels]
     assert sum(queue.waiting_bytes for queue in queues) <= 17_001_000
     stalled.sock.close()
     await robot.connected(3)
-    assert sum(channel._queue.waiting_bytes for channel in robot.endpoint._channels.values()) == 0
+    assert sum(channel._queue.waiting_bytes for channel in robot.endpoint._channels) == 0
 
 
 async def test_small_messages_overtake_a_large_one(rig: Rig) -> None:
@@ -407,7 +407,7 @@ async def test_small_messages_overtake_a_large_one(rig: Rig) -> None:
     while len(messages) < 5:
         messages += [bytes(f.payload) for f in await stalled.read_frames(reader) if f.type is FrameType.DATA]
     assert messages == [b"urgent %d" % n for n in range(5)]
-    (queue,) = (c._queue for (number, _), c in robot.endpoint._channels.items() if number == 1)
+    (queue,) = (channel._queue for channel in robot.endpoint._channels.of(1))
     assert queue.sent < 2_000_000
     while len(messages) < 6:
         messages += [bytes(f.payload) for f in await stalled.read_frames(reader) if f.type is FrameType.DATA]

@@ -45,11 +45,11 @@ def test_sizes_are_those_of_containers() -> None:
     node = NodeStatus(tag="n", state=NodeState.FAILED, pid=10**30, exit_code=-(10**30), detail="x" * 10**6)
     found = status(
         nodes=(node, *(NodeStatus(tag=f"n{i}", state=NodeState.RUNNING) for i in range(10_000))),
-        interfaces={"no name": True, **{f"i{i}": True for i in range(10_000)}},
+        interfaces={"no name": True, **{f"i{i}": True for i in range(20_000)}},
         connections=tuple(range(100_000)),
     )
     assert len(found.nodes) == intake.MAX_ITEMS
-    assert len(found.interfaces) < intake.MAX_ITEMS
+    assert len(found.interfaces) < intake.MAX_INTERFACES
     assert "no name" not in found.interfaces
     assert len(found.connections) == intake.MAX_CONNECTIONS
     first = found.nodes[0]

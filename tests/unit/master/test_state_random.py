@@ -6,12 +6,15 @@ import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+from msgspec.structs import replace
 
+from rce.control.desired import DesiredState, Fit
 from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, TaskSetKind
-from rce.control.model import EndpointState, EndpointStatus, LinkAddress
+from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress
 from rce.model.specs import InterfaceSpec, Network, NodeSpec, Resources
 from rce_master.exceptions import RefusedError
 from rce_master.state import capacity, commands
+from rce_master.state.changes import Changes
 from rce_master.state.core import State
 from rce_master.state.records import User, UserRole
 from rce_master.state.settings import StateSettings
@@ -48,6 +51,15 @@ LIMITS = StateSettings(
 )
 
 
+def in_order(spec: EndpointSpec) -> EndpointSpec:
+    return replace(
+        spec,
+        interfaces=tuple(sorted(spec.interfaces, key=lambda one: one.tag)),
+        links=tuple(sorted(spec.links, key=lambda one: one.id)),
+        connections=tuple(sorted(spec.connections, key=lambda one: one.id)),
+    )
+
+
 class Histories(RuleBasedStateMachine):
     """Everything that can happen, in any order."""
 
@@ -58,6 +70,7 @@ class Histories(RuleBasedStateMachine):
         self.stored: dict[str, dict[str, bytes]] = {}
         self.numbers: set[int] = set()
         self.revisions: dict[str, int] = {}
+        self.replicas: dict[str, DesiredState] = {}
         for name in ("ann", "bob"):
             self.do(commands.AddUser(user=User(name=name, role=UserRole.ADMIN, password="", created=0.0)))
 
@@ -78,12 +91,31 @@ class Histories(RuleBasedStateMachine):
         new = self.connection_ids() - known
         assert not new & self.numbers, "a connection id was used again"
         self.numbers |= new
+        self.follow(changes)
         for id_ in changes.touched:
             revision = self.state.spec(id_).revision
             assert revision > self.revisions.get(id_, 0)
             self.revisions[id_] = revision
         for drop in changes.withdrawals:
             assert drop.revision > self.revisions.get(drop.id, 0) or drop.id in changes.touched
+
+    def follow(self, changes: Changes) -> None:
+        """Keep what a task set knows that is told of every change in patches."""
+        for id_, touched in changes.touched.items():
+            patch = self.state.patch(id_, touched)
+            there = self.replicas.get(id_)
+            if there is None or touched.since == 0:
+                self.replicas[id_] = DesiredState(self.state.spec(id_))
+            else:
+                assert there.fit(patch) is Fit.NEXT
+                there.patch(patch)
+        for id_ in [id_ for id_ in self.replicas if id_ not in self.state.tables.endpoints]:
+            del self.replicas[id_]
+
+    @invariant()
+    def patches_add_up_to_the_whole(self) -> None:
+        for id_, replica in self.replicas.items():
+            assert in_order(replica.whole) == in_order(self.state.spec(id_))
 
     def connection_ids(self) -> set[int]:
         return {connection.id for connection in self.state.tables.connections}

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import pytest
 from argon2 import PasswordHasher
 
+from rce.control.desired import DesiredState, Fit
 from rce.control.exceptions import PeerTimeoutError
 from rce.control.logs import LogQuery
 from rce.control.messages import (
@@ -26,15 +27,19 @@ from rce.control.messages import (
     LoginReply,
     MachineInfo,
     Notify,
+    PatchSpec,
+    PatchStatus,
     Probe,
     Put,
+    SpecWanted,
     Status,
+    StatusWanted,
     Sync,
     TaskSetKind,
     ToTaskSet,
     Usage,
 )
-from rce.control.model import EndpointState, EndpointStatus, LinkAddress
+from rce.control.model import PATCHES, EndpointState, EndpointStatus, LinkAddress, StatusPatch
 from rce_master.auth import Authenticator, client_digest
 from rce_master.control_handler import ControlHandler
 from rce_master.exceptions import MasterError, NotFoundError, StoreError, TaskSetAwayError
@@ -306,6 +311,87 @@ async def test_everything_is_said_at_hello_and_changes_after_it(cloud: Cloud) ->
     assert put.endpoint.links[0].dial
     await robots.ask("DC", {"containerTag": "c"})
     assert (await containers.get(Drop)).id == "anna/c"
+
+
+INTERFACE = {"interfaceType": "PublisherInterface", "className": "std_msgs/String"}
+
+
+def add(tag: str) -> dict[str, Any]:
+    return {"addInterfaces": [{"endpointTag": "c", "interfaceTag": tag, "addr": f"/{tag}", **INTERFACE}]}
+
+
+async def test_a_task_set_that_takes_patches_is_sent_what_changed(cloud: Cloud) -> None:
+    robots, containers = cloud.robots(), cloud.containers()
+    containers.features = frozenset({PATCHES})
+    await robots.hello()
+    await wire(robots)
+    (spec,) = (await containers.hello()).endpoints
+    desired = DesiredState(spec)
+    for tag in ("x", "y"):
+        await robots.ask("CN", add(tag))
+        patch = (await containers.get(PatchSpec)).patch
+        assert [one.tag for one in patch.interfaces] == [tag]
+        assert (patch.links, patch.connections, patch.contents) == ((), (), None)
+        assert desired.fit(patch) is Fit.NEXT
+        desired.patch(patch)
+    await robots.ask("CN", {"removeInterfaces": [{"endpointTag": "c", "interfaceTag": "in"}]})
+    patch = (await containers.get(PatchSpec)).patch
+    assert patch.removed_interfaces == ("in",)
+    assert len(patch.removed_links) == len(patch.removed_connections) == 1
+    desired.patch(patch)
+    assert desired.whole == cloud.state_service.spec("anna/c")
+
+
+async def test_a_patch_that_did_not_fit_is_followed_by_the_whole(cloud: Cloud) -> None:
+    robots, containers = cloud.robots(), cloud.containers()
+    containers.features = frozenset({PATCHES})
+    await robots.hello()
+    await wire(robots)
+    await containers.hello()
+    await containers.say(SpecWanted(id="anna/c"))
+    put = await containers.get(Put)
+    assert put.endpoint == cloud.state_service.spec("anna/c")
+    await robots.ask("CN", add("x"))
+    assert (await containers.get(PatchSpec)).patch.base == put.endpoint.revision
+    await containers.say(SpecWanted(id="anna/rob"))
+    await containers.say(SpecWanted(id="anna/nothing"))
+    await containers.say(SpecWanted(id="anna/c"))
+    assert (await containers.get(Put)).endpoint.id == "anna/c", "others are not placed there"
+
+
+async def test_status_patches_are_added_up_and_a_gap_asks_once(cloud: Cloud) -> None:
+    robots, containers = cloud.robots(), cloud.containers()
+    await robots.hello()
+    await wire(robots)
+    await containers.hello()
+    tables = cloud.state_service.tables
+
+    def status(number: int, **fields: Any) -> EndpointStatus:
+        return EndpointStatus(id="anna/c", revision=1, state=EndpointState.RUNNING, number=number, **fields)
+
+    await containers.say(Status(status=status(4, interfaces={"in": False})))
+    await containers.say(
+        PatchStatus(patch=StatusPatch(status=status(5, interfaces={"in": True}, connections=(1,))))
+    )
+    await robots.ask("CN", add("x"))
+    assert [one.tag for one in tables.active.by("endpoint", "anna/c")] == ["in"]
+    assert [one.connection for one in tables.open_ends.by("endpoint", "anna/c")] == [1]
+    for number in (7, 8):
+        await containers.say(PatchStatus(patch=StatusPatch(status=status(number, interfaces={"in": False}))))
+    assert (await containers.get(StatusWanted)).id == "anna/c"
+    await containers.say(Status(status=status(9)))
+    await containers.say(PatchStatus(patch=StatusPatch(status=status(10), lost_connections=(1,))))
+    await robots.ask("CN", add("y"))
+    assert not tables.active
+    assert not tables.open_ends
+    assert not any(isinstance(left, StatusWanted) for left in drain(containers))
+
+
+def drain(peer: FakePeer) -> list[ToTaskSet]:
+    found = []
+    while not peer.inbox.empty():
+        found.append(peer.inbox.get_nowait())
+    return found
 
 
 async def test_a_logins_answer_carries_the_spec_and_no_put_precedes_it(cloud: Cloud) -> None:
