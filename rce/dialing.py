@@ -61,11 +61,11 @@ async def open_url_socket(url: str) -> socket.socket:
 
     Raises:
         OSError: The name cannot be resolved (``socket.gaierror``), or nobody answers.
-        ValueError: The URL names no host, or its port is not a number.
+        ValueError: The URL has no host, or its port is not a number.
     """
     parts = urlsplit(url)
     if not parts.hostname:
-        raise ValueError(f"{url!r} names no host")
+        raise ValueError(f"{url!r} has no host")
     return await open_socket(parts.hostname, parts.port or _PORTS.get(parts.scheme, 80))
 
 

@@ -78,7 +78,7 @@ class Target:
             return urlencode(who), {"Authorization": f"Bearer {self.token or digest}"}
         if self.token:
             reason = (
-                "this engine does not take robots' tokens: update it, or give the user's password in place"
+                "this engine does not accept robots' tokens: update it, or use the user's password instead"
                 " of the token"
             )
             raise RefusedError(HTTPStatus.UNAUTHORIZED, reason)

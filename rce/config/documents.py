@@ -70,9 +70,9 @@ def _parse_json(text: str, source: str) -> Any:
         value = json.loads(text, object_pairs_hook=_make_object)
     except json.JSONDecodeError as error:
         place = f"line {error.lineno}, column {error.colno}"
-        raise ConfigError(source, [Fault(place, f"no valid JSON: {error.msg}")]) from error
+        raise ConfigError(source, [Fault(place, f"not valid JSON: {error.msg}")]) from error
     except (ValueError, RecursionError) as error:
-        raise ConfigError(source, [Fault("", f"no valid JSON: {error}")]) from error
+        raise ConfigError(source, [Fault("", f"not valid JSON: {error}")]) from error
     faults = list(_repeated_keys(value, ""))
     if faults:
         raise ConfigError(source, faults)

@@ -212,13 +212,13 @@ def parse_json(text: str | bytes) -> Any:
         raise MessageError("", "nested deeper than any message may be") from error
     except _DECODE_FAULTS as error:
         if not _may_hold_nan(text):
-            raise MessageError("", f"no valid JSON: {error}") from error
+            raise MessageError("", f"not valid JSON: {error}") from error
     try:
         value = json.loads(text)
         if _ESCAPED_SURROGATE.search(text.encode(errors="replace") if isinstance(text, str) else text):
             json.dumps(value, ensure_ascii=False).encode()  # Python reads halves of characters, too
     except (ValueError, RecursionError) as error:
-        raise MessageError("", f"no valid JSON: {error}") from error
+        raise MessageError("", f"not valid JSON: {error}") from error
     return value
 
 

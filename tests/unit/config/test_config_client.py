@@ -293,13 +293,13 @@ def test_robot_is_no_container() -> None:
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ('{"url": 1,\n  "userID" 2}', "line 2, column 12: no valid JSON: Expecting ':' delimiter"),
+        ('{"url": 1,\n  "userID" 2}', "line 2, column 12: not valid JSON: Expecting ':' delimiter"),
         ('{"nodes": [{"cTag": "a", "cTag": "b"}]}', "nodes[0].cTag: is given more than once"),
         ("url: 1\nuserID: [\n", "line 3, column 1: no valid YAML"),
         ("url: 1\nurl: 2\n", "line 2, column 1: no valid YAML: key 'url' is given more than once"),
         ("? [a]\n: 1\n", "line 1, column 3: no valid YAML"),
         ("a: !!python/object/apply:os.system [id]\n", "line 1, column 4: no valid YAML"),
-        ("[" * 100_000, "no valid JSON"),
+        ("[" * 100_000, "not valid JSON"),
         ("[]", "must be an object"),
         ("", "must be an object"),
     ],

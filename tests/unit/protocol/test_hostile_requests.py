@@ -24,7 +24,7 @@ def test_half_a_character_is_refused_beside_a_nan_too(half: str) -> None:
     text = '{"type": "CN", "data": {"x": NaN, "deleteParam": [{"containerTag": "c", "name": "HALF"}]}}'
     text = text.replace("HALF", half)
     for frame in (text, text.encode()):
-        with pytest.raises(MessageError, match="no valid JSON"):
+        with pytest.raises(MessageError, match="not valid JSON"):
             decode(frame)
 
 
