@@ -9,9 +9,9 @@ import asyncio
 import json
 import sys
 import time
-from typing import Any
 
 from rce.ros.node import Node, run
+from rce.ros.types import Message
 
 STRING = "std_msgs/String"
 SET_BOOL = "std_srvs/SetBool"
@@ -69,7 +69,7 @@ async def listen(node: Node) -> None:
     first = last = 0.0
     count = 0
 
-    def heard(_: Any) -> None:
+    def heard(_: Message) -> None:
         nonlocal first, last, count
         last = time.perf_counter()
         first = first or last

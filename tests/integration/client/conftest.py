@@ -5,14 +5,16 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
-from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from ssl import SSLContext
+from typing import TYPE_CHECKING, Protocol
 
 import pytest
-from support.cloud import PASSWORD, Cloud, running_cloud
+from support.cloud import PASSWORD, Cloud, PeerInterface, running_cloud
 
 from rce.aio.backoff import Backoff
-from rce_client.connection import Connection
+from rce_client.connection import Connection, State
 from rce_client.engine_transport import Timing
 from rce_robot.websocket import RobotSocket
 
@@ -43,8 +45,14 @@ class Door:
         await writer.wait_closed()
 
 
+class OpenDoor(Protocol):
+    """Opens a door; see :func:`open_door`."""
+
+    def __call__(self, ssl: SSLContext | None = None) -> AbstractAsyncContextManager[Door]: ...
+
+
 @asynccontextmanager
-async def open_door(ssl: Any = None) -> AsyncIterator[Door]:
+async def open_door(ssl: SSLContext | None = None) -> AsyncIterator[Door]:
     door = Door()
     server = await asyncio.start_server(door.serve, "127.0.0.1", 0, ssl=ssl)
     async with server:
@@ -74,7 +82,7 @@ class Engine:
                 await self.cloud.wire(tag, item["interfaceType"], item["className"], robot=robot)
         return tuple(errors)
 
-    def end(self, tag: str) -> Any:
+    def end(self, tag: str) -> PeerInterface:
         return self.cloud.ends[f"testRobot_{tag}"]
 
     async def kick(self) -> None:
@@ -89,8 +97,21 @@ class Engine:
         for socket in _server_sockets():
             socket.transport.pause_reading()
 
-    def connection(self, **options: Any) -> Connection:
-        return Connection(self.door.url, "testUser", PASSWORD, "testRobot", timing=TIMING, **options)
+    def connection(
+        self,
+        *,
+        on_error: Callable[[str], None] | None = None,
+        on_state: Callable[[State, str], None] | None = None,
+    ) -> Connection:
+        return Connection(
+            self.door.url,
+            "testUser",
+            PASSWORD,
+            "testRobot",
+            timing=TIMING,
+            on_error=on_error,
+            on_state=on_state,
+        )
 
 
 def _server_sockets() -> list[RobotSocket]:
@@ -110,5 +131,5 @@ async def engine(door: Door) -> AsyncIterator[Engine]:
 
 
 @pytest.fixture(name="open_door")
-def _open_door() -> Any:
+def _open_door() -> OpenDoor:
     return open_door

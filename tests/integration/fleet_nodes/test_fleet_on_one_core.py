@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
-from rce.ros.types import TypeRegistry
+from rce.ros.types import Message, TypeRegistry
 from rce_fleet.drivers.robot_driver import RobotDriver
 from rce_fleet.drivers.runner import run_world
 from rce_fleet.planning.grid import GridMap
@@ -85,7 +85,7 @@ class Fleet:
     def _after_update(self) -> None:
         self.keeper.update()
 
-    def _take_state(self, message: Any) -> None:
+    def _take_state(self, message: Message) -> None:
         self.state = message
         self._changed.set()
 

@@ -19,6 +19,8 @@ from rce_robot.settings import SessionSettings
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from integration.robot.conftest import Robot
+
 MIB = 1 << 20
 STRING = "std_msgs/String"
 PATIENT = SessionSettings(ping_interval=None, drain_timeout=1.0)
@@ -54,7 +56,7 @@ async def close_of(socket: ClientConnection) -> tuple[int, str]:
     return ended.value.rcvd.code, ended.value.rcvd.reason
 
 
-async def test_unclaimed_values_are_dropped_oldest_first(robot_of: Any) -> None:
+async def test_unclaimed_values_are_dropped_oldest_first(robot_of: type[Robot]) -> None:
     async with small_cloud(user_memory=4 * MIB) as (cloud, good, stack):
         sockets = [await stack.enter_async_context(dial(cloud, "flood", f"f{n}")) for n in range(3)]
         for number in range(4):
@@ -68,7 +70,7 @@ async def test_unclaimed_values_are_dropped_oldest_first(robot_of: Any) -> None:
         assert cloud.master.usage.held <= 5 * MIB
 
 
-async def test_endless_messages_end_the_connection(robot_of: Any) -> None:
+async def test_endless_messages_end_the_connection(robot_of: type[Robot]) -> None:
     async with small_cloud(user_memory=4 * MIB) as (cloud, good, stack):
         sockets = [await stack.enter_async_context(dial(cloud, "flood", f"f{n}")) for n in range(2)]
 
@@ -96,7 +98,7 @@ async def test_endless_messages_end_the_connection(robot_of: Any) -> None:
         await still_served(again)
 
 
-async def test_robots_that_do_not_read_lose_their_own_messages(robot_of: Any) -> None:
+async def test_robots_that_do_not_read_lose_their_own_messages(robot_of: type[Robot]) -> None:
     async with small_cloud(user_memory=6 * MIB) as (cloud, good, stack):
         stalled = [await stack.enter_async_context(dial(cloud, "testUser", f"s{n}")) for n in range(3)]
         ends = [await cloud.joined("image", "PublisherForwarder", STRING, robot=f"s{n}") for n in range(3)]
@@ -120,7 +122,7 @@ async def test_robots_that_do_not_read_lose_their_own_messages(robot_of: Any) ->
             assert await robot_of(socket).get("DM")
 
 
-async def test_all_users_together_have_a_bound_too(robot_of: Any) -> None:
+async def test_all_users_together_have_a_bound_too(robot_of: type[Robot]) -> None:
     async with small_cloud(memory=4 * MIB) as (cloud, good, stack):
         flood = await stack.enter_async_context(dial(cloud, "flood", "f"))
         await good.send(b"%032x" % 1 + bytes(MIB))

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from support.ros_nodes import MakeNode
 
 from rce.ros.core import Change, Core, GraphEvent
 from rce.ros.errors import MasterRefusedError, ParameterMissingError, RemoteFaultError
@@ -18,7 +19,6 @@ from rce.ros.node import Node
 from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer
 from rce.ros.xmlrpc.codec import encode_call
 
-MakeNode = Callable[..., Node]
 STRING = "std_msgs/String"
 
 

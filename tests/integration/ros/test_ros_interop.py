@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 from support.processes import finish
+from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
 from rce.ros.errors import ServiceFaultError
-from rce.ros.node import Node
+from rce.ros.types import Message
 
 pytestmark = pytest.mark.needs("rospy")
 
-MakeNode = Callable[..., Node]
 STRING = "std_msgs/String"
 
 ROSPY_NODE = """
@@ -152,10 +152,10 @@ async def test_topic_tools_see_our_nodes(core: Core, make_node: MakeNode) -> Non
 async def test_service_tools_call_our_nodes(core: Core, make_node: MakeNode) -> None:
     async with make_node("ours") as ours:
 
-        async def loggers(request: Any) -> dict[str, Any]:
+        async def loggers(request: Message) -> dict[str, Any]:
             return {"loggers": [{"name": "a", "level": "info"}, {"name": "b", "level": "debug"}]}
 
-        def refuse(request: Any) -> None:
+        def refuse(request: Message) -> None:
             raise ServiceFaultError("/refuse", "never")
 
         await ours.advertise_service("get", "roscpp/GetLoggers", loggers)

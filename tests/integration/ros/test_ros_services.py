@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
 from rce.ros.errors import (
@@ -17,15 +17,13 @@ from rce.ros.errors import (
     ServiceTimeoutError,
     TypeMismatchError,
 )
-from rce.ros.node import Node
 from rce.ros.tcpros.header import decode_header, encode_header
-from rce.ros.types import SerializationError
+from rce.ros.types import Message, SerializationError
 
-MakeNode = Callable[..., Node]
 SET_BOOL = "std_srvs/SetBool"
 
 
-def switch(request: Any) -> dict[str, Any]:
+def switch(request: Message) -> dict[str, Any]:
     return {"success": request.data, "message": "on" if request.data else "off"}
 
 
@@ -45,7 +43,7 @@ async def test_bursts_make_no_new_connections(make_node: MakeNode, core: Core) -
     async with make_node("a") as a, make_node("b") as b:
         all_there = asyncio.Barrier(40)
 
-        async def meet(request: Any) -> dict[str, Any]:
+        async def meet(request: Message) -> dict[str, Any]:
             await all_there.wait()
             return switch(request)
 
@@ -82,7 +80,7 @@ async def test_calls_run_side_by_side(make_node: MakeNode) -> None:
         waiting = 0
         all_there = asyncio.Event()
 
-        async def meet(request: Any) -> dict[str, Any]:
+        async def meet(request: Message) -> dict[str, Any]:
             nonlocal waiting
             waiting += 1
             if waiting == 20:
@@ -100,7 +98,7 @@ async def test_calls_run_side_by_side(make_node: MakeNode) -> None:
 async def test_each_call_has_its_own_time_limit(make_node: MakeNode) -> None:
     async with make_node("a") as a, make_node("b") as b:
 
-        async def maybe(request: Any) -> dict[str, Any]:
+        async def maybe(request: Message) -> dict[str, Any]:
             if request.data:
                 await asyncio.Event().wait()
             return switch(request)
@@ -118,12 +116,12 @@ async def test_each_call_has_its_own_time_limit(make_node: MakeNode) -> None:
 async def test_a_handler_that_fails_answers_with_an_error(
     make_node: MakeNode, is_async: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def handle(request: Any) -> dict[str, Any]:
+    def handle(request: Message) -> dict[str, Any]:
         if request.data:
             raise ServiceFaultError("/f", "not today")
         raise ZeroDivisionError("oops")
 
-    async def handle_later(request: Any) -> dict[str, Any]:
+    async def handle_later(request: Message) -> dict[str, Any]:
         await asyncio.sleep(0)
         return handle(request)
 
@@ -145,7 +143,7 @@ async def test_a_provider_that_dies_ends_its_calls_and_may_come_back(make_node: 
             await client(data=True)
         called = asyncio.Event()
 
-        async def hang(request: Any) -> None:
+        async def hang(request: Message) -> None:
             called.set()
             await asyncio.Event().wait()
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+
+from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
 from rce.ros.node import Node, Publisher, TimerEvent
 from rce.ros.node.clock import CLOCK
 from rce.ros.types import Time, TypeRegistry
-
-MakeNode = Callable[..., Node]
 
 
 def test_the_clock_has_the_checksum_of_its_type() -> None:

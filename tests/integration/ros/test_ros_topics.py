@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
 
 import pytest
+from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
 from rce.ros.errors import MasterUnreachableError, NodeClosedError, TypeMismatchError
@@ -14,7 +14,6 @@ from rce.ros.tcpros.header import encode_header
 from rce.ros.types import TypeRegistry
 from rce.ros.xmlrpc import RpcClient
 
-MakeNode = Callable[..., Node]
 STRING = "std_msgs/String"
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, AsyncIterator, Callable
+from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
 
 import pytest
+from support.ros_nodes import MakeNode
 
 from rce.ros.actions import (
     ActionClient,
@@ -22,10 +23,8 @@ from rce.ros.actions import (
 )
 from rce.ros.actions.ledger import Arrival
 from rce.ros.core import Core
-from rce.ros.node import Node
 from rce.ros.types import Message, SerializationError, Time
 
-MakeNode = Callable[..., Node]
 FIBONACCI = "actionlib_tutorials/FibonacciAction"
 
 

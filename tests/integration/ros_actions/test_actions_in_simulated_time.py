@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 import pytest
+from support.ros_nodes import MakeNode
 
 from rce.ros.actions import ActionClient, ActionServer, GoalState, ServerGoal
 from rce.ros.actions.patience import PatientClock
@@ -14,7 +15,6 @@ from rce.ros.core import Core
 from rce.ros.node import Node, Publisher
 from rce.ros.types import Time
 
-MakeNode = Callable[..., Node]
 FIBONACCI = "actionlib_tutorials/FibonacciAction"
 
 

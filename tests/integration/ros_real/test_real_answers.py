@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from support.ports import free_port
+from support.ros_nodes import MakeGraphNode
 from support.ros_real import Graph
 
 from rce.ros.core import Core
 from rce.ros.errors import RemoteFaultError
-from rce.ros.node import Node
 from rce.ros.xmlrpc import RpcClient
 
 pytestmark = [pytest.mark.needs("rospy", "roslaunch")]
@@ -168,7 +167,7 @@ SLAVE_CALLS: list[tuple[str, tuple[Any, ...]]] = [
 
 
 async def test_a_node_answers_as_a_real_one(
-    ours: Graph, make_node: Callable[..., Node], rospy_peer: tuple[str, str]
+    ours: Graph, make_node: MakeGraphNode, rospy_peer: tuple[str, str]
 ) -> None:
     async with make_node(ours, "mine") as node, ours.program(*rospy_peer):
         await ours.until(lambda: ours.service("/peer_ask"), what="the rospy node is up")

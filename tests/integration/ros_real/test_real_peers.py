@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from support.ports import free_port
+from support.ros_nodes import MakeGraphNode
 from support.ros_real import Graph, our_graph
 
 from rce.ros.errors import ServiceFaultError
@@ -18,7 +19,6 @@ from rce.ros.node import Node
 
 pytestmark = [pytest.mark.needs("rospy"), pytest.mark.timeout(300)]
 
-MakeNode = Callable[..., Node]
 STRING = "std_msgs/String"
 LANGUAGES = ["rospy", pytest.param("roscpp", marks=pytest.mark.needs("roscpp"))]
 
@@ -39,7 +39,7 @@ def start(request: pytest.FixtureRequest, language: str) -> Callable[..., Any]:
 
 @pytest.mark.parametrize("language", LANGUAGES)
 async def test_topics_services_and_parameters(
-    graph: Graph, make_node: MakeNode, start: Callable[..., Any], language: str
+    graph: Graph, make_node: MakeGraphNode, start: Callable[..., Any], language: str
 ) -> None:
     async with make_node(graph, "ours") as node, start(graph, "_word:=word") as (process, name):
         latched: asyncio.Queue[tuple[bytes, bool]] = asyncio.Queue()
@@ -101,7 +101,7 @@ async def is_gone(graph: Graph, name: str) -> bool:
 @pytest.mark.needs("roscpp")
 @pytest.mark.parametrize("language", ["roscpp"])
 async def test_a_subscriber_that_offers_udp_first_gets_tcp(
-    ours: Graph, make_node: MakeNode, start: Callable[..., Any]
+    ours: Graph, make_node: MakeGraphNode, start: Callable[..., Any]
 ) -> None:
     async with make_node(ours, "ours") as node, start(ours, "_udp:=true"):
         await echoes(node)
@@ -110,7 +110,7 @@ async def test_a_subscriber_that_offers_udp_first_gets_tcp(
 
 @pytest.mark.parametrize("language", LANGUAGES)
 async def test_a_killed_node_comes_back(
-    graph: Graph, make_node: MakeNode, start: Callable[..., Any], language: str
+    graph: Graph, make_node: MakeGraphNode, start: Callable[..., Any], language: str
 ) -> None:
     async with make_node(graph, "ours") as node:
         for _ in range(2):
@@ -145,7 +145,7 @@ def older_argv(process: asyncio.subprocess.Process) -> list[str]:
 
 @pytest.mark.parametrize("language", ["rospy"])
 async def test_any_message_carries_its_type(
-    ours: Graph, make_node: MakeNode, start: Callable[..., Any], language: str
+    ours: Graph, make_node: MakeGraphNode, start: Callable[..., Any], language: str
 ) -> None:
     async with make_node(ours, "ours") as node, start(ours):
         kinds = await node.subscribe("peer_kinds", STRING)
@@ -157,7 +157,7 @@ async def test_any_message_carries_its_type(
 
 @pytest.mark.parametrize("language", LANGUAGES)
 async def test_our_core_is_killed_and_restarted(
-    make_node: MakeNode, start: Callable[..., Any], language: str, tmp_path: Any
+    make_node: MakeGraphNode, start: Callable[..., Any], language: str, tmp_path: Any
 ) -> None:
     """Connections live on without a core; our nodes register again at the next one, real nodes do not."""
     port = free_port()

@@ -6,15 +6,15 @@ import asyncio
 import json
 import logging
 import os
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
+from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
 from rce.ros.errors import NodeClosedError
-from rce.ros.node import Node
 from rce.ros.tf import (
     BadTransformError,
     ExtrapolationError,
@@ -26,8 +26,6 @@ from rce.ros.tf import (
     TransformTimeoutError,
 )
 from rce.ros.types import Time
-
-MakeNode = Callable[..., Node]
 
 
 def at(seconds: float) -> Time:

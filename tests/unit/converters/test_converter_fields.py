@@ -93,7 +93,7 @@ def test_values_survive_json_with_base64_binaries(value: Any) -> None:
 
 
 @given(st.data())
-def test_any_part_of_the_fields_may_be_missing(data: Any) -> None:
+def test_any_part_of_the_fields_may_be_missing(data: st.DataObject) -> None:
     full = data.draw(OBJECTS)
     kept = {key: full[key] for key in data.draw(st.sets(st.sampled_from(sorted(full))))}
     payload, unknown = CONVERTERS.of(EVERYTHING).decode(kept)
@@ -111,7 +111,7 @@ JSON_VALUES = st.recursive(
 
 
 @given(st.data(), JSON_VALUES)
-def test_strange_value_is_taken_or_refused_by_name(data: Any, strange: Any) -> None:
+def test_strange_value_is_taken_or_refused_by_name(data: st.DataObject, strange: Any) -> None:
     """A strange value in any field is taken or refused by name."""
     field = data.draw(st.sampled_from(EVERYTHING.fields))
     codec = CONVERTERS.of(EVERYTHING)
@@ -125,7 +125,7 @@ def test_strange_value_is_taken_or_refused_by_name(data: Any, strange: Any) -> N
 
 
 @given(st.binary(max_size=200))
-def test_garbage_bytes_are_read_or_refused(data: Any) -> None:
+def test_garbage_bytes_are_read_or_refused(data: bytes) -> None:
     for name in ("nav_msgs/Path", "std_msgs/Int32MultiArray", "sensor_msgs/Image"):
         try:
             converter(name).encode(data)

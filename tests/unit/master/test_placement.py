@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from random import Random
 from typing import Any
 
 import pytest
@@ -150,7 +151,7 @@ def test_filling_a_machine_at_once_is_filling_it_one_by_one(
 
 @given(ROOMS, REQUESTS, st.randoms())
 def test_the_choice_does_not_depend_on_the_order(
-    rooms: list[Room], requested: Resources, random: Any
+    rooms: list[Room], requested: Resources, random: Random
 ) -> None:
     shuffled = list(rooms)
     random.shuffle(shuffled)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from random import Random
 from typing import Any
 
 import pytest
@@ -253,7 +254,7 @@ MESSAGES = st.dictionaries(KEYS, VALUES, max_size=4) | st.binary(max_size=40)
 
 @settings(max_examples=150, deadline=None)
 @given(st.lists(MESSAGES, min_size=1, max_size=8), st.randoms(use_true_random=False))
-def test_frames_of_many_messages_in_any_order(sent: list[Any], random: Any) -> None:
+def test_frames_of_many_messages_in_any_order(sent: list[Any], random: Random) -> None:
     stream = ProtocolStream.for_engine()
     frames = [frame for msg in sent for frame in encode_data("i", "a/B", msg)]
     random.shuffle(frames)

@@ -69,7 +69,7 @@ def test_every_field_type_survives_the_wire(message: Any) -> None:
 
 
 @given(st.data())
-def test_the_bytes_are_those_that_rosbags_reads_and_writes(data: Any) -> None:
+def test_the_bytes_are_those_that_rosbags_reads_and_writes(data: st.DataObject) -> None:
     store = get_typestore(Stores.ROS1_NOETIC)
     names = [name for kind, name in builtin_definitions() if kind == "msg"]
     name = data.draw(
@@ -81,7 +81,7 @@ def test_the_bytes_are_those_that_rosbags_reads_and_writes(data: Any) -> None:
 
 
 @given(st.binary(max_size=400))
-def test_garbage_is_read_or_refused(data: Any) -> None:
+def test_garbage_is_read_or_refused(data: bytes) -> None:
     for name in ("nav_msgs/Path", "std_msgs/Int32MultiArray", "diagnostic_msgs/DiagnosticArray"):
         kind = TYPES.message(name)
         try:
@@ -93,7 +93,7 @@ def test_garbage_is_read_or_refused(data: Any) -> None:
 
 
 @given(message_values(TYPES.message("nav_msgs/Path")), st.data())
-def test_every_cut_or_lengthened_message_is_refused(message: Any, data: Any) -> None:
+def test_every_cut_or_lengthened_message_is_refused(message: Any, data: st.DataObject) -> None:
     kind = TYPES.message("nav_msgs/Path")
     payload = kind.serialize(message)
     cut = data.draw(st.integers(0, len(payload) - 1))
