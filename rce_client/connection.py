@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NoReturn, Self
 
 from rce_client.engine_transport import Target, Timing
+from rce_client.life import State
 from rce_client.own_interfaces import OwnInterfaces
 from rce_client.requests import Requests
 from rce_client.sendqueue import QueueLimits
-from rce_client.session import Session, State
+from rce_client.session import Session
 
 if TYPE_CHECKING:
     import ssl

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
-from enum import Enum
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self, assert_never
 
@@ -29,6 +28,7 @@ from rce_client.desired import Desired
 from rce_client.engine_transport import EngineTransport, Target, Timing
 from rce_client.exceptions import InUseError, LostError, NotConnectedError, RefusedError, UntrustedError
 from rce_client.interface_table import InterfaceTable
+from rce_client.life import CONNECTION_LIFE, ConnectionEvent, State
 from rce_client.reminder import Reminder
 from rce_client.sendqueue import QueueLimits
 from rce_client.services import read_call_fault
@@ -47,21 +47,6 @@ _log = logging.getLogger(__name__)
 
 CONNECTING = "looking for the engine"
 """The words of the first report of an attempt; the reports of failures tell what went wrong."""
-
-
-class State(Enum):
-    """Where a connection is in its life."""
-
-    CONNECTING = "connecting"
-    """Looking for the engine, for the first time or again."""
-    CONNECTED = "connected"
-    """Connected for the first time."""
-    LOST = "lost"
-    """The connection broke; everything that was made is remembered."""
-    RESTORED = "restored"
-    """Connected again, and everything that was made was asked for again."""
-    CLOSED = "closed"
-    """Closed by the program, or refused by the engine for good."""
 
 
 class Session:
@@ -88,7 +73,7 @@ class Session:
         limits: QueueLimits | None = None,
     ) -> None:
         self.robot = target.robot
-        self.state = State.CLOSED
+        self._life = CONNECTION_LIFE.start(State.CLOSED, target.robot)
         self.errors: deque[str] = deque(maxlen=100)
         """The newest error texts."""
         self.transport = EngineTransport(target, self, timing, limits)
@@ -102,6 +87,11 @@ class Session:
         self._was_connected = False
         self._refusal: RefusedError | None = None
         self._reminder = Reminder()
+
+    @property
+    def state(self) -> State:
+        """Where the connection is in its life."""
+        return self._life.state
 
     async def __aenter__(self) -> Self:
         """Connect, and wait until it is done."""
@@ -140,7 +130,7 @@ class Session:
             await tasks.__aexit__(exc_type, exc, traceback)
         finally:
             self._tasks = None
-            self._set_state(State.CLOSED, "closed")
+            self._happen(ConnectionEvent.CLOSE, "closed")
 
     async def request(self, request: Request) -> None:
         """Send a request, and remember it for reconnects."""
@@ -235,28 +225,28 @@ class Session:
 
     def on_connecting(self) -> None:
         """An attempt to connect begins."""
-        self._set_state(State.CONNECTING, CONNECTING)
+        self._happen(ConnectionEvent.DIAL, CONNECTING)
 
     def on_failure(self, error: ClientError) -> None:
         """It failed. A program that does not listen is told in the log what only a person can repair."""
         repairable = isinstance(error, (InUseError, UntrustedError))
         if self._on_state is None and repairable and self._reminder.is_due(str(error)):
             _log.warning("%s: %s", self.robot, error)
-        self._set_state(State.CONNECTING, str(error))
+        self._happen(ConnectionEvent.FAIL, str(error))
 
     def on_connected(self) -> None:
         """Ask again for everything that was made."""
         for request in (*self._backlog, *self.desired.restore()):
             self.transport.post_request(encode(request))
         self._backlog.clear()
-        state = State.RESTORED if self._was_connected else State.CONNECTED
+        event = ConnectionEvent.RESTORE if self._was_connected else ConnectionEvent.CONNECT
         self._was_connected = True
-        self._set_state(state, "connected")
+        self._happen(event, "connected")
 
     def on_lost(self, error: LostError) -> None:
         """Learn that the connection broke."""
         self.interfaces.lose()
-        self._set_state(State.LOST, str(error))
+        self._happen(ConnectionEvent.LOSE, str(error))
 
     def on_event(self, event: Event) -> None:
         """Take what came from the engine."""
@@ -292,7 +282,7 @@ class Session:
         except RefusedError as error:
             self._refusal = error
             self.interfaces.close()
-            self._set_state(State.CLOSED, str(error))
+            self._happen(ConnectionEvent.REFUSE, str(error))
 
     def _note_unsent(self, request: Request, sent: asyncio.Future[None]) -> None:
         """Send a request after the reconnect that the connection broke before."""
@@ -316,8 +306,8 @@ class Session:
         else:
             _log.warning("engine: %s", text)
 
-    def _set_state(self, state: State, words: str) -> None:
-        self.state = state
+    def _happen(self, event: ConnectionEvent, words: str) -> None:
+        state = self._life.advance(event)
         if self._on_state is not None:
             self._on_state(state, words)
         self._notify()

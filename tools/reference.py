@@ -1,4 +1,4 @@
-"""Makes the reference pages of settings and options, and the shipped settings file, from the code.
+"""Makes the pages of settings, options and life cycles, and the shipped settings file, from the code.
 
 ``python -m tools.reference`` writes them (``make reference``); with ``--check`` it names those that are not
 current, and ends with 1 if there are any.
@@ -11,6 +11,7 @@ import textwrap
 import tomllib
 from collections.abc import Iterator
 from enum import Enum
+from functools import partial
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from rce_client.ros_bridge.__main__ import app as rce_ros
 from rce_container.command import app as rce_container
 from rce_master.command import app as rce_master
 from rce_robot.command import app as rce_robot
+from tools import lifecycles
 
 ROOT = Path(__file__).resolve().parent.parent
 WIDTH = 110
@@ -153,6 +155,8 @@ PAGES = {
     "configs/engine.yaml": shipped_file,
     "docs/reference/settings.md": settings_page,
     "docs/reference/options.md": options_page,
+    "docs/reference/lifecycles.md": lifecycles.page,
+    **{place: partial(str, text) for place, text in lifecycles.pictures().items()},
 }
 
 
@@ -258,6 +262,7 @@ def main(check: bool) -> int:
         if check:
             print(f"{place} is not current: run `make reference`")  # noqa: T201 - its result
         else:
+            path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
     return stale if check else 0
 

@@ -30,9 +30,13 @@ class Cause(Enum):
     """What moves a robot from phase to phase."""
 
     SETTLED = "settled"
+    """It stands still, and a cell is its own."""
     HELD = "held"
+    """It is told to stand still."""
     LOST = "lost"
+    """It or its move client is not heard any more."""
     HEARD = "heard"
+    """It is heard again."""
 
 
 ROBOT_LIFE: LifeCycle[Phase, Cause] = LifeCycle(
