@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 import textwrap
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from enum import Enum
 from functools import partial
 from importlib.metadata import EntryPoint
@@ -151,7 +151,7 @@ def _rce() -> typer.Typer:
     return build_app([EntryPoint(name, commands[name], GROUP) for name in sorted(commands)])
 
 
-PAGES = {
+PAGES: dict[str, Callable[[], str]] = {
     "configs/engine.yaml": shipped_file,
     "docs/reference/settings.md": settings_page,
     "docs/reference/options.md": options_page,

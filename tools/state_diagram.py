@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 from enum import Enum
 from html import escape
 from itertools import groupby
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
-Table: TypeAlias = Mapping[Enum, Mapping[Enum, Enum]]
+Table: TypeAlias = Mapping[Any, Mapping[Any, Any]]
+"""State to event to the next state, all members of enums."""
 
 SLOT, GAP, LANE, CORNER = 20, 22, 14, 6
 CHARACTER = 6.6
