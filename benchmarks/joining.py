@@ -43,6 +43,7 @@ async def run(running: RunningEngine, *, robots: int) -> list[dict[str, Any]]:
             now = meter.read()
             spent = {what: (now[what] - before[what]) / STEP for what in now}
             rows.append({"robots": number, "s": round(perf_counter() - begin, 1), **spent})
+            print(f"{number} robots have joined", flush=True)
             before, begin = now, perf_counter()
         await first.send("DC", {"containerTag": CONTAINER})
     return [_readable(row, rows[0]) for row in rows]
