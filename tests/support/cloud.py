@@ -24,12 +24,16 @@ from rce.control.messages import (
     Left,
     Login,
     LoginReply,
+    PatchSpec,
+    PatchStatus,
     Put,
+    SpecWanted,
     Status,
     Sync,
     Usage,
 )
 from rce.control.model import (
+    PATCHES,
     ConnectionSpec,
     EndpointKind,
     EndpointSpec,
@@ -38,12 +42,14 @@ from rce.control.model import (
     LinkAddress,
     LinkSpec,
 )
+from rce.control.observed import ObservedStatus
 from rce.control.server import ControlServer
 from rce.link import Endpoint, Interface, LinkHub
 from rce.model.names import EndpointId, InterfaceType
 from rce.model.specs import InterfaceSpec
 from rce_robot.app import App
 from rce_robot.settings import RobotSettings, SessionSettings
+from support.patches import patch_between
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
@@ -95,6 +101,10 @@ class FakeMaster:
         self.answer: Callable[[ClientRequest], Awaitable[tuple[str, ...]]] = self._agree
         self.peer: Peer | None = None
         self.url = ""
+        self.in_patches = False
+        """Whether it sends what changed of specs, and takes what changed of statuses."""
+        self.wanted: list[str] = []
+        """Of which robots whole specs were asked for."""
         self.silent = False
         """Whether it answers nothing, like a master that hangs."""
 
@@ -124,6 +134,8 @@ class FakeMaster:
                 peer.send(ClientReply(request=message.request, errors=await self.answer(message)))
             case Status():
                 self.statuses[message.status.id] = message.status
+            case PatchStatus() | SpecWanted():
+                self._take_patching(peer, message)
             case Left():
                 self.inside.discard(message.id)
                 self.left.append(message.id)
@@ -136,6 +148,17 @@ class FakeMaster:
             case _:
                 raise AssertionError(message)
         self.changed.set()
+
+    def _take_patching(self, peer: Peer, message: PatchStatus | SpecWanted) -> None:
+        if isinstance(message, SpecWanted):
+            self.wanted.append(message.id)
+            peer.send(Put(endpoint=self.specs[message.id]))
+            return
+        status = message.patch.status
+        observed = ObservedStatus(self.statuses[status.id])
+        assert status.number == observed.header.number + 1
+        observed.patch(message.patch)
+        self.statuses[status.id] = observed.whole
 
     def _login(self, message: Login) -> LoginReply:
         id_ = f"{message.user}/{message.robot}"
@@ -150,9 +173,11 @@ class FakeMaster:
         return self.specs.setdefault(id_, EndpointSpec(id=id_, kind=EndpointKind.ROBOT, revision=1))
 
     def put(self, id_: str, **changes: Any) -> None:
-        spec = self.spec(id_)
+        spec = former = self.spec(id_)
         self.specs[id_] = spec = msgspec.structs.replace(spec, revision=spec.revision + 1, **changes)
-        if self.peer is not None:
+        if self.peer is not None and self.in_patches:
+            self.peer.send(PatchSpec(patch=patch_between(former, spec)))
+        elif self.peer is not None:
             self.peer.send(Put(endpoint=spec))
 
     def drop(self, id_: str, reason: str) -> None:
@@ -271,9 +296,12 @@ def _grown(
 
 
 @asynccontextmanager
-async def running_cloud(session: SessionSettings | None = None, **settings: Any) -> AsyncIterator[Cloud]:
-    """Run it all on loopback."""
+async def running_cloud(
+    session: SessionSettings | None = None, *, in_patches: bool = False, **settings: Any
+) -> AsyncIterator[Cloud]:
+    """Run it all on loopback; ``in_patches`` with a master of this release, else with one of the former."""
     master = FakeMaster()
+    master.in_patches = in_patches
     folder = Path(tempfile.mkdtemp(dir="/tmp"))
     ends: dict[str, PeerInterface] = {}
 
@@ -291,7 +319,12 @@ async def running_cloud(session: SessionSettings | None = None, **settings: Any)
         endpoint = Endpoint(id_, make, hub, on_change=lambda: None, on_fault=faults.append)
         stack.push_async_callback(endpoint.close)
         server = ControlServer(
-            SECRET, on_hello=master.on_hello, on_message=master.on_message, on_gone=master.on_gone, port=0
+            SECRET,
+            on_hello=master.on_hello,
+            on_message=master.on_message,
+            on_gone=master.on_gone,
+            port=0,
+            features=(PATCHES,) if in_patches else (),
         )
         await stack.enter_async_context(server)
         cloud = Cloud(master, endpoint, ends, LinkAddress(machine=MACHINE, unix=str(folder / "s")))
