@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from types import TracebackType
 
-    from rce.protocol.messages import Request
+    from rce.model.requests import Request
 
 __all__ = ["Connection", "State"]
 
@@ -145,7 +145,7 @@ class Connection(Requests, OwnInterfaces):
         the reconnect then. Cancelling stops the wait; the request is sent and remembered all the same.
 
         Args:
-            request: A message ``CC``, ``RC``, ``DC``, ``CN`` or ``CX`` of :mod:`rce.protocol.messages`.
+            request: A request of :mod:`rce.model.requests`.
 
         Raises:
             RefusedError: The engine refused this client for good.
@@ -153,9 +153,9 @@ class Connection(Requests, OwnInterfaces):
 
         Example:
             ```python
-            from rce.protocol.messages import CreateContainer
+            from rce.model.requests import CreateContainer
 
-            await robot.request(CreateContainer(container_tag="brain"))
+            await robot.request(CreateContainer(tag="brain"))
             ```
         """
         await self._session.request(request)

@@ -6,25 +6,25 @@ from typing import TYPE_CHECKING, TypeVar, assert_never
 
 from msgspec.structs import replace
 
-from rce.protocol.messages import (
+from rce.model.requests import (
     AddInterface,
     AddNode,
     ConfigureComponents,
     ConfigureConnections,
     Connection,
     CreateContainer,
-    DeleteParam,
+    DeleteParameter,
     DestroyContainer,
     RemoveInterface,
     RemoveNode,
     ResizeContainer,
-    SetParam,
+    SetParameter,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rce.protocol.messages import Request
+    from rce.model.requests import Request
 
 Item = TypeVar("Item")
 
@@ -42,7 +42,7 @@ class Desired:
         """By the tag of a container of ours; what several requests said, in one."""
         self.nodes: dict[tuple[str, str], AddNode] = {}
         """By container tag and node tag."""
-        self.parameters: dict[tuple[str, str], SetParam] = {}
+        self.parameters: dict[tuple[str, str], SetParameter] = {}
         """By container tag and name."""
         self.interfaces: dict[tuple[str, str], AddInterface] = {}
         """By endpoint tag and interface tag."""
@@ -53,11 +53,11 @@ class Desired:
         """Store a request that is sent to the engine."""
         match request:
             case CreateContainer():
-                self.containers[request.container_tag] = request
+                self.containers[request.tag] = request
             case ResizeContainer():
                 self._resize(request)
             case DestroyContainer():
-                self._forget_container(request.container_tag)
+                self._forget_container(request.tag)
             case ConfigureComponents():
                 self._configure(request)
             case ConfigureConnections():
@@ -90,21 +90,20 @@ class Desired:
             requests.append(ConfigureConnections(disconnect=tuple(self.connections.values())))
         components = ConfigureComponents(
             remove_nodes=tuple(
-                RemoveNode(container_tag=item.container_tag, node_tag=item.node_tag)
-                for item in self._outside(self.nodes)
+                RemoveNode(container=item.container, tag=item.node.tag) for item in self._outside(self.nodes)
             ),
             remove_interfaces=tuple(
-                RemoveInterface(endpoint_tag=item.endpoint_tag, interface_tag=item.interface_tag)
+                RemoveInterface(endpoint=item.endpoint, tag=item.interface.tag)
                 for item in self._outside(self.interfaces)
             ),
             delete_param=tuple(
-                DeleteParam(container_tag=item.container_tag, name=item.name)
+                DeleteParameter(container=item.container, name=item.parameter.name)
                 for item in self._outside(self.parameters)
             ),
         )
         if components != ConfigureComponents():
             requests.append(components)
-        requests += [DestroyContainer(container_tag=tag) for tag in self.containers]
+        requests += [DestroyContainer(tag=tag) for tag in self.containers]
         return requests
 
     def _outside(self, items: dict[tuple[str, str], Item]) -> Iterable[Item]:
@@ -112,29 +111,27 @@ class Desired:
         return (item for (endpoint, _), item in items.items() if endpoint not in self.containers)
 
     def _resize(self, request: ResizeContainer) -> None:
-        if request.container_tag not in self.containers:
+        if request.tag not in self.containers:
             return  # the client that created it restores it
-        before, now = self.sizes.get(request.container_tag), request.container_data
+        before = self.sizes.get(request.tag)
         if before is not None:
-            given = {key: getattr(now, key) for key in now.__struct_fields__}
-            changed = {key: value for key, value in given.items() if value is not None}
-            request = replace(request, container_data=replace(before.container_data, **changed))
-        self.sizes[request.container_tag] = request
+            request = replace(request, changes=replace(before.changes, **request.changes.given()))
+        self.sizes[request.tag] = request
 
     def _configure(self, request: ConfigureComponents) -> None:
         for node in request.remove_nodes:
-            self.nodes.pop((node.container_tag, node.node_tag), None)
+            self.nodes.pop((node.container, node.tag), None)
         for removed in request.remove_interfaces:
-            self.interfaces.pop((removed.endpoint_tag, removed.interface_tag), None)
-            self._forget_connections(f"{removed.endpoint_tag}/{removed.interface_tag}")
+            self.interfaces.pop((removed.endpoint, removed.tag), None)
+            self._forget_connections(f"{removed.endpoint}/{removed.tag}")
         for deleted in request.delete_param:
-            self.parameters.pop((deleted.container_tag, deleted.name), None)
+            self.parameters.pop((deleted.container, deleted.name), None)
         for parameter in request.set_param:
-            self.parameters[parameter.container_tag, parameter.name] = parameter
+            self.parameters[parameter.container, parameter.parameter.name] = parameter
         for interface in request.add_interfaces:
-            self.interfaces[interface.endpoint_tag, interface.interface_tag] = interface
+            self.interfaces[interface.endpoint, interface.interface.tag] = interface
         for added in request.add_nodes:
-            self.nodes[added.container_tag, added.node_tag] = added
+            self.nodes[added.container, added.node.tag] = added
 
     def _forget_container(self, tag: str) -> None:
         self.containers.pop(tag, None)

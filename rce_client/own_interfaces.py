@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, overload
 
-from rce.protocol.messages import AddInterface, ConfigureComponents
+from rce.model.requests import AddInterface, ConfigureComponents
+from rce.model.specs import InterfaceSpec
 from rce_client.services import ServiceClient, ServiceProvider
 from rce_client.topics import Publisher, Subscriber
 
@@ -228,10 +229,10 @@ class OwnInterfaces:
         session.check_open()
         session.interfaces.add(interface)
         added = AddInterface(
-            endpoint_tag=self.robot_id,
-            interface_tag=interface.tag,
-            interface_type=interface.interface_type,
-            message_type=interface.message_type,
+            endpoint=self.robot_id,
+            interface=InterfaceSpec(
+                tag=interface.tag, type=interface.interface_type, message_type=interface.message_type
+            ),
         )
         try:
             await session.request(ConfigureComponents(add_interfaces=(added,)))

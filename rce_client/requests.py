@@ -3,34 +3,30 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
-from msgspec import NODEFAULT
-from msgspec.structs import fields, replace
-
-from rce.protocol.messages import (
+from rce.model.requests import (
     AddInterface,
     AddNode,
     ConfigureComponents,
     ConfigureConnections,
     Connection,
-    ContainerData,
     CreateContainer,
-    DeleteParam,
+    DeleteParameter,
     DestroyContainer,
     RemoveInterface,
     RemoveNode,
     ResizeContainer,
-    ResizeData,
-    SetParam,
+    SetParameter,
 )
+from rce.model.specs import InterfaceSpec, ParameterSpec
+from rce.model.spelling import PLAIN
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rce.protocol.messages import NetworkName, Quantity, Request, RestartName, Value
-
-Part = TypeVar("Part", AddNode, ContainerData)
+    from rce.model.requests import Request
+    from rce.model.written import NetworkName, Quantity, RestartName, Value
 
 
 class Requests(ABC):
@@ -86,6 +82,7 @@ class Requests(ABC):
                 created.
 
         Raises:
+            ValueError: An argument cannot be read; the text says which, and what would be right.
             RefusedError: The engine refused this client for good.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
@@ -94,20 +91,22 @@ class Requests(ABC):
             await robot.create_container("brain", cpu="50%", memory="256M", wait=True)
             ```
         """
-        features = special_features if isinstance(special_features, str) else list(special_features)
-        data = ContainerData(
-            size=size,
-            cpu=cpu,
-            memory=memory,
-            bandwidth=bandwidth,
-            network=network,
-            group=group,
-            group_ip=group_ip,
-            image=image,
-            special_features=features,
-            wait=wait,
-        )
-        await self.request(CreateContainer(container_tag=tag, container_data=_without_defaults(data)))
+        given = {
+            "tag": tag,
+            "size": size,
+            "cpu": cpu,
+            "memory": memory,
+            "bandwidth": bandwidth,
+            "network": network,
+            "group": group,
+            "group_ip": group_ip,
+            "image": image,
+            "special_features": special_features
+            if isinstance(special_features, str)
+            else list(special_features),
+            "wait": wait,
+        }
+        await self.request(PLAIN.read(CreateContainer, given))
 
     async def resize_container(
         self,
@@ -132,6 +131,7 @@ class Requests(ABC):
                 the request.
 
         Raises:
+            ValueError: An argument cannot be read; the text says which, and what would be right.
             RefusedError: The engine refused this client for good.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
@@ -140,8 +140,8 @@ class Requests(ABC):
             await robot.resize_container("brain", cpu=0.5, memory="512M")
             ```
         """
-        data = ResizeData(size=size, cpu=cpu, memory=memory, bandwidth=bandwidth)
-        await self.request(ResizeContainer(container_tag=tag, container_data=data))
+        changes = {"size": size, "cpu": cpu, "memory": memory, "bandwidth": bandwidth}
+        await self.request(PLAIN.read(ResizeContainer, {"tag": tag, **changes}))
 
     async def destroy_container(self, tag: str) -> None:
         """Remove a container with its nodes, interfaces and connections.
@@ -160,7 +160,7 @@ class Requests(ABC):
             await robot.destroy_container("brain")
             ```
         """
-        await self.request(DestroyContainer(container_tag=tag))
+        await self.request(DestroyContainer(tag=tag))
 
     # Nodes and parameters
 
@@ -200,6 +200,7 @@ class Requests(ABC):
                 86400.
 
         Raises:
+            ValueError: An argument cannot be read; the text says which, and what would be right.
             RefusedError: The engine refused this client for good.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
@@ -209,21 +210,21 @@ class Requests(ABC):
             await robot.add_node("brain", "plan", "Test", "stringEcho.py", args="_rate:=5", after=["map"])
             ```
         """
-        node = AddNode(
-            container_tag=container,
-            node_tag=tag,
-            pkg=pkg,
-            exe=exe,
-            args=args,
-            name=name,
-            namespace=namespace,
-            restart=restart,
-            max_restarts=max_restarts,
-            after=(after,) if isinstance(after, str) else tuple(after),
-            heartbeat=heartbeat,
-            heartbeat_timeout=heartbeat_timeout,
-        )
-        await self.request(ConfigureComponents(add_nodes=(_without_defaults(node),)))
+        given = {
+            "container": container,
+            "tag": tag,
+            "pkg": pkg,
+            "exe": exe,
+            "args": args,
+            "name": name,
+            "namespace": namespace,
+            "restart": restart,
+            "max_restarts": max_restarts,
+            "after": (after,) if isinstance(after, str) else tuple(after),
+            "heartbeat": heartbeat,
+            "heartbeat_timeout": heartbeat_timeout,
+        }
+        await self.request(ConfigureComponents(add_nodes=(PLAIN.read(AddNode, given),)))
 
     async def remove_node(self, container: str, tag: str) -> None:
         """Stop a node. Cancelling does not take the request back.
@@ -241,7 +242,7 @@ class Requests(ABC):
             await robot.remove_node("brain", "map")
             ```
         """
-        node = RemoveNode(container_tag=container, node_tag=tag)
+        node = RemoveNode(container=container, tag=tag)
         await self.request(ConfigureComponents(remove_nodes=(node,)))
 
     async def set_parameter(self, container: str, name: str, value: Value) -> None:
@@ -262,7 +263,7 @@ class Requests(ABC):
             await robot.set_parameter("brain", "limits/speed", 0.5)
             ```
         """
-        parameter = SetParam(container_tag=container, name=name, value=value)
+        parameter = SetParameter(container=container, parameter=ParameterSpec(name=name, value=value))
         await self.request(ConfigureComponents(set_param=(parameter,)))
 
     async def delete_parameter(self, container: str, name: str) -> None:
@@ -281,7 +282,7 @@ class Requests(ABC):
             await robot.delete_parameter("brain", "limits/speed")
             ```
         """
-        parameter = DeleteParam(container_tag=container, name=name)
+        parameter = DeleteParameter(container=container, name=name)
         await self.request(ConfigureComponents(delete_param=(parameter,)))
 
     # Interfaces and connections
@@ -314,13 +315,8 @@ class Requests(ABC):
             await robot.add_interface("brain", "names", role, "std_msgs/String", addr="/names")
             ```
         """
-        interface = AddInterface(
-            endpoint_tag=endpoint,
-            interface_tag=tag,
-            interface_type=interface_type,
-            message_type=message_type,
-            addr=addr,
-        )
+        spec = InterfaceSpec(tag=tag, type=interface_type, message_type=message_type, addr=addr)
+        interface = AddInterface(endpoint=endpoint, interface=spec)
         await self.request(ConfigureComponents(add_interfaces=(interface,)))
 
     async def remove_interface(self, endpoint: str, tag: str) -> None:
@@ -339,7 +335,7 @@ class Requests(ABC):
             await robot.remove_interface("brain", "names")
             ```
         """
-        interface = RemoveInterface(endpoint_tag=endpoint, interface_tag=tag)
+        interface = RemoveInterface(endpoint=endpoint, tag=tag)
         await self.request(ConfigureComponents(remove_interfaces=(interface,)))
 
     async def connect(self, a: str, b: str) -> None:
@@ -377,13 +373,3 @@ class Requests(ABC):
             ```
         """
         await self.request(ConfigureConnections(disconnect=(Connection(tag_a=a, tag_b=b),)))
-
-
-def _without_defaults(part: Part) -> Part:
-    """Put the defaults themselves in place of values that equal them: only those are left out on the wire."""
-    equal = {
-        field.name: field.default
-        for field in fields(part)
-        if field.default is not NODEFAULT and getattr(part, field.name) == field.default
-    }
-    return replace(part, **equal)

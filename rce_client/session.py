@@ -9,20 +9,17 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Self, assert_never
 
 from rce.aio.tasks import TaskScope
-from rce.protocol.codec import encode
-from rce.protocol.http import LATCH, SINGLE_FRAME
-from rce.protocol.messages import (
+from rce.model.requests import (
     ConfigureComponents,
     ConfigureConnections,
     CreateContainer,
-    DataMessage,
     DestroyContainer,
-    ErrorReport,
-    InterfaceStatus,
-    LatchedSources,
     RemoveInterface,
     ResizeContainer,
 )
+from rce.protocol.codec import encode
+from rce.protocol.http import LATCH, SINGLE_FRAME
+from rce.protocol.messages import DataMessage, ErrorReport, InterfaceStatus, LatchedSources
 from rce.protocol.stream import Fault, LargeData
 from rce_client.desired import Desired
 from rce_client.engine_transport import EngineTransport, Target, Timing
@@ -37,8 +34,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
     from types import TracebackType
 
+    from rce.model.requests import Request
     from rce.protocol.codec import Frame
-    from rce.protocol.messages import Request
     from rce.protocol.stream import Event
     from rce_client.exceptions import ClientError
     from rce_client.interfaces import ClientInterface
@@ -218,7 +215,7 @@ class Session:
     async def withdraw(self, interface: ClientInterface) -> None:
         """Remove an interface."""
         if self.interfaces.withdraw(interface):
-            removed = RemoveInterface(endpoint_tag=self.robot, interface_tag=interface.tag)
+            removed = RemoveInterface(endpoint=self.robot, tag=interface.tag)
             await self.request(ConfigureComponents(remove_interfaces=(removed,)))
 
     # What the transport tells: rce_client.engine_transport.Listener

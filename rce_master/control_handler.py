@@ -243,13 +243,11 @@ class ControlHandler:
             peer.send(ClientReply(request=request.request, errors=(error,)))
             return
         try:
-            self._quotas.robot_request(
-                self._state_service.tables.users[user], requests.count_items(request.data)
-            )
+            self._quotas.robot_request(self._state_service.tables.users[user], requests.count_items(request))
         except TooMuchError as error:
             peer.send(ClientReply(request=request.request, errors=(f"{request.type}: {error}",)))
             return
-        wanted, faults = requests.read(user, request.type, request.data)
+        wanted, faults = requests.read(user, request)
         parts = [wanted[first : first + MAX_TOGETHER] for first in range(0, len(wanted), MAX_TOGETHER)]
         outcomes = [await self._state_service.enqueue(part) for part in parts]
         if self._audit is not None and wanted:

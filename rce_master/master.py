@@ -9,6 +9,7 @@ from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from rce.control.messages import TYPED_REQUESTS
 from rce.control.model import PATCHES
 from rce.control.server import ControlServer
 from rce.guard.proxies import TrustedProxies
@@ -176,7 +177,7 @@ class Master:
             tls=for_task_sets.mutual_server if for_task_sets else None,
             is_revoked=for_task_sets.is_revoked if for_task_sets else None,
             on_execution=services.executions.arrived,
-            features=(PATCHES,),
+            features=(PATCHES, TYPED_REQUESTS),
         )
         http = HttpServer(app, settings.bind, settings.http_port, for_clients.server if for_clients else None)
         if for_clients is None or for_task_sets is None:

@@ -30,9 +30,10 @@ if TYPE_CHECKING:
     from rce.guard.budget import Ledger
     from rce.guard.holdings import Holding
     from rce.link import Interface, LinkHub, Port
+    from rce.model.requests import Request
     from rce.model.specs import InterfaceSpec
     from rce.protocol.calls import CallId
-    from rce.protocol.messages import DataMessage, Request
+    from rce.protocol.messages import DataMessage
     from rce.protocol.stream import LargeData
     from rce_robot.conversion import ConversionPool, Result
     from rce_robot.conversion.jobs import Job

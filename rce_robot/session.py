@@ -16,22 +16,18 @@ from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 
 from rce.aio.queues import OverflowPolicy
+from rce.model.requests import (
+    ConfigureComponents,
+    ConfigureConnections,
+    CreateContainer,
+    DestroyContainer,
+    ResizeContainer,
+)
 from rce.protocol.calls import call_at
 from rce.protocol.codec import encode
 from rce.protocol.http import LATCH, SINGLE_FRAME
 from rce.protocol.limits import Limits
-from rce.protocol.messages import (
-    ConfigureComponents,
-    ConfigureConnections,
-    CreateContainer,
-    DataMessage,
-    DestroyContainer,
-    ErrorReport,
-    InterfaceStatus,
-    LatchedSources,
-    ResizeContainer,
-    type_of,
-)
+from rce.protocol.messages import DataMessage, ErrorReport, InterfaceStatus, LatchedSources, type_of
 from rce.protocol.stream import Fault, LargeData, ProtocolStream
 from rce.protocol.weight import is_light, utf8_in_steps
 from rce_robot.exceptions import RobotError
@@ -43,8 +39,8 @@ if TYPE_CHECKING:
     from collections import Counter
     from collections.abc import Coroutine, Iterator, Sequence
 
+    from rce.model.requests import Request
     from rce.protocol.calls import CallId
-    from rce.protocol.messages import Request
     from rce.protocol.stream import Event
     from rce_robot.outbox import Queued
     from rce_robot.settings import SessionSettings
@@ -406,7 +402,7 @@ class Session:
     def _request(self, request: Request, size: int) -> None:
         if isinstance(request, (ConfigureComponents, ConfigureConnections)):
             for fault in request.faults:
-                self.report(fault)
+                self.report(str(fault))
             request = msgspec.structs.replace(request, faults=())
         waiting = self._waiting_bytes + size
         if (

@@ -11,11 +11,10 @@ import gc
 import logging
 from typing import TYPE_CHECKING, Protocol, assert_never
 
-import msgspec
-
 from rce.control.exceptions import ControlError
 from rce.control.messages import (
     CONTROL_VERSION,
+    TYPED_REQUESTS,
     ClientReply,
     Drop,
     Execute,
@@ -46,6 +45,7 @@ from rce.guard.budget import Ledger
 from rce.model.names import EndpointId
 from rce.protocol.exceptions import HandshakeError
 from rce.protocol.messages import type_of
+from rce.protocol.requests import write_request
 from rce.ros.tcpros.allocator import give_back_free_memory
 from rce_robot.memory import UnusedMemory
 from rce_robot.namespace import Namespace
@@ -55,8 +55,8 @@ if TYPE_CHECKING:
     from rce.control.model import EndpointSpec, LinkAddress, SpecPatch
     from rce.guard.lobby import Lobby
     from rce.link import LinkHub
+    from rce.model.requests import Request
     from rce.protocol.http import Credentials
-    from rce.protocol.messages import Request
     from rce_robot.conversion import ConversionPool
     from rce_robot.namespace import Forms
     from rce_robot.settings import RobotSettings
@@ -77,7 +77,14 @@ class Channel(Protocol):
     ) -> LoginReply:
         """Ask whether a robot may come in; raises :class:`ControlError` if the master stays away."""
 
-    async def client_request(self, id: str, type: str, data: object) -> ClientReply:  # noqa: A002
+    async def client_request(
+        self,
+        id: str,  # noqa: A002 - wire names
+        type: str,  # noqa: A002
+        data: object = None,
+        *,
+        content: Request | None = None,
+    ) -> ClientReply:
         """Have a client's request carried out; raises :class:`ControlError` likewise."""
 
 
@@ -268,7 +275,11 @@ class RobotTaskSet:
         """Have a client's request carried out; return what went wrong."""
         type_ = type_of(request)
         try:
-            reply = await self._channel.client_request(str(id), type_, msgspec.to_builtins(request))
+            if TYPED_REQUESTS in self._master_features:
+                reply = await self._channel.client_request(str(id), type_, content=request)
+            else:
+                data = write_request(request)
+                reply = await self._channel.client_request(str(id), type_, data=data)
         except ControlError as error:
             return (f"{type_}: not done: {error}",)
         return reply.errors

@@ -20,10 +20,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, assert_ne
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from rce.config.exceptions import Fault
-from rce.config.items import Interface, Link, MessageTypeName, RosName
+from rce.config.items import MessageTypeName, RosName
 from rce.config.validation import Strict
 from rce.model.names import MAX_NAME_LENGTH, Form, InterfaceType, Role, is_name
-from rce.protocol.messages import ROS_NAME_PATTERN
+from rce.model.requests import AddInterface, Connection
+from rce.model.specs import InterfaceSpec
+from rce.model.written import ROS_NAME_PATTERN
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -199,8 +201,8 @@ class Wiring:
     """
 
     robot: str
-    interfaces: list[Interface]
-    connections: list[Link]
+    interfaces: list[AddInterface]
+    connections: list[Connection]
     origins: dict[tuple[str, int], str] = field(default_factory=dict)
     """Key and index of what was made, and the bridge that it was made for, as a place in the file."""
     faults: list[Fault] = field(default_factory=list)
@@ -223,33 +225,34 @@ class Wiring:
     def _join(self, place: str, bridge: Bridge, part: Part, source: End, target: End) -> None:
         a = self._interface(place, bridge, part, source, part.source)
         b = self._interface(place, bridge, part, target, part.source.complement)
-        link = Link.model_validate({"tagA": a.path, "tagB": b.path})
-        if not any({one.a, one.b} == {link.a, link.b} for one in self.connections):
+        pair = {a.path, b.path}
+        if not any({one.tag_a, one.tag_b} == pair for one in self.connections):
             self.origins["connections", len(self.connections)] = place
-            self.connections.append(link)
+            self.connections.append(Connection(tag_a=a.path, tag_b=b.path))
 
-    def _interface(self, place: str, bridge: Bridge, part: Part, end: End, role: Role) -> Interface:
+    def _interface(self, place: str, bridge: Bridge, part: Part, end: End, role: Role) -> AddInterface:
         """Find or make the interface at one end."""
         on_robot = end.endpoint == ROBOT
         endpoint = self.robot if on_robot else end.endpoint
         addr = "/".join(filter(None, (end.name or bridge.name, part.name)))
         for index, one in enumerate(self.interfaces):
-            if one.endpoint == endpoint and one.kind.role is role and _same(one.addr, addr):
-                if one.message_type != part.message_type:
+            spec = one.interface
+            if one.endpoint == endpoint and spec.kind.role is role and _same(spec.addr, addr):
+                if spec.message_type != part.message_type:
                     where = self.origins.get(("interfaces", index), f"interfaces[{index}]")
-                    here, there = part.message_type, one.message_type
+                    here, there = part.message_type, spec.message_type
                     problem = f"{endpoint}:{addr} carries {here} here and {there} in {where}"
                     self.faults.append(Fault(place, problem))
                 return one
         form = Form.INTERFACE if not on_robot else Form(bridge.form.capitalize())
-        made = Interface.model_validate(
-            {
-                "eTag": endpoint,
-                "iTag": self._tag(endpoint, addr, role),
-                "iType": str(InterfaceType(role, form)),
-                "iCls": part.message_type,
-                "addr": addr,
-            }
+        made = AddInterface(
+            endpoint=endpoint,
+            interface=InterfaceSpec(
+                tag=self._tag(endpoint, addr, role),
+                type=str(InterfaceType(role, form)),
+                message_type=part.message_type,
+                addr=addr,
+            ),
         )
         self.origins["interfaces", len(self.interfaces)] = place
         self.interfaces.append(made)
@@ -263,7 +266,7 @@ class Wiring:
         """
         words = [addr.strip("~/").replace("/", "_"), _WORDS[role]]
         tag = "_".join(words if endpoint == self.robot else [self.robot, *words])
-        taken = {one.tag for one in self.interfaces if one.endpoint == endpoint}
+        taken = {one.interface.tag for one in self.interfaces if one.endpoint == endpoint}
         if len(tag) > MAX_NAME_LENGTH or tag in taken:
             digest = hashlib.sha256(addr.encode()).hexdigest()[:8]
             tag = f"{tag[: MAX_NAME_LENGTH - len(digest) - 1]}_{digest}"
@@ -278,8 +281,8 @@ def expand(
     bridges: Sequence[Bridge],
     types: Mapping[int, str],
     robot: str,
-    interfaces: Iterable[Interface],
-    connections: Iterable[Link],
+    interfaces: Iterable[AddInterface],
+    connections: Iterable[Connection],
 ) -> Wiring:
     """Make the long form of bridges.
 

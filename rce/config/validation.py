@@ -65,6 +65,8 @@ def _keys_beside(model: type[BaseModel], steps: tuple[int | str, ...]) -> list[s
 def _inner_model(model: type[BaseModel], key: str) -> type[BaseModel] | None:
     for name, field in model.model_fields.items():
         if key in (name, field.alias):
-            candidates = (field.annotation, *getattr(field.annotation, "__args__", ()))
+            candidates = [field.annotation, *getattr(field.annotation, "__args__", ())]
+            for one in candidates[:]:  # a model of its own may read what is annotated: rce.config.items
+                candidates += [getattr(mark, "model", None) for mark in getattr(one, "__metadata__", ())]
             return next((c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)), None)
     return None

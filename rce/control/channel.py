@@ -51,6 +51,7 @@ if TYPE_CHECKING:
 
     from rce.config.secret import Secret
     from rce.control.messages import Hello, ToMaster, ToTaskSet
+    from rce.model.requests import Request
     from rce.tls.identity import Context
 
 _log = logging.getLogger(__name__)
@@ -166,19 +167,28 @@ class TaskSetChannel:
         )
         return await self._request(message, LoginReply)
 
-    async def client_request(self, id: str, type: str, data: Any) -> ClientReply:  # noqa: A002 - wire names
+    async def client_request(
+        self,
+        id: str,  # noqa: A002 - wire names
+        type: str,  # noqa: A002
+        data: Any = None,
+        *,
+        content: Request | None = None,
+    ) -> ClientReply:
         """Have a client's request carried out.
 
         Args:
             id: Endpoint id of the robot that asks.
-            type: ``CC``, ``DC``, ``CN`` or ``CX``.
-            data: As the client sent it.
+            type: ``CC``, ``RC``, ``DC``, ``CN`` or ``CX``.
+            data: As the client sent it; for a master that does not know
+                :data:`rce.control.messages.TYPED_REQUESTS`.
+            content: What it asks for, for one that does.
 
         Raises:
             MasterUnavailableError: No answer in time.
             UnsendableError: It is too long, or holds something that cannot be sent.
         """
-        message = ClientRequest(request=next(self._numbers), id=id, type=type, data=data)
+        message = ClientRequest(request=next(self._numbers), id=id, type=type, content=content, data=data)
         return await self._request(message, ClientReply)
 
     async def run(self) -> None:

@@ -31,10 +31,15 @@ from rce.control.model import (
     StatusPatch,
 )
 from rce.control.tags import TaggedReader
+from rce.model.requests import Request
 
 CONTROL_VERSION = 2
 ACCEPTED_VERSIONS = (1, CONTROL_VERSION)
 """Of task sets: a new master works with those that are not upgraded yet."""
+
+
+TYPED_REQUESTS = "typed-requests"
+"""A feature of masters: they take :attr:`ClientRequest.content`."""
 
 
 class TaskSetKind(Enum):
@@ -178,6 +183,9 @@ class ClientRequest(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """Endpoint id of the robot that asks."""
     type: str
     data: Any
+    """As the client sent it, for masters of the release before; else None."""
+    content: Request | None = None
+    """What it asks for; for masters whose ``features`` name :data:`TYPED_REQUESTS`."""
 
 
 class LogChunk(_Message, frozen=True, kw_only=True, omit_defaults=True):

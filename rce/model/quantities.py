@@ -123,6 +123,12 @@ def write_memory(count: int) -> str:
     return _exact(count, 1024, ("T", "G", "M", "K"), "B")
 
 
+def write_plain_memory(count: int) -> int | str:
+    """Write bytes as a number of MB, or as a text if that is not whole; :func:`read_memory` reads it."""
+    megabytes, rest = divmod(count, _MEBI)
+    return f"{count}B" if rest else megabytes
+
+
 def write_bandwidth(rate: int) -> str:
     """Write bytes per second with the largest prefix that loses nothing; :func:`read_bandwidth` reads it."""
     return _exact(rate, 1000, ("T", "G", "M", "k"), "B")

@@ -20,8 +20,11 @@ from rce.protocol.messages import (
     ClientMessage,
     DataMessage,
     ErrorReport,
+    InterfaceStatus,
+    LatchedSources,
     type_of,
 )
+from rce.protocol.requests import write_request
 from rce.protocol.single import MAX_PAYLOAD, encode_single
 
 if TYPE_CHECKING:
@@ -58,7 +61,9 @@ def encode(message: ClientMessage) -> list[Frame]:
         return encode_data(message.i_tag, message.message_type, message.msg, message.msg_id, message.latch)
     if isinstance(message, ErrorReport):
         return encode_message("ER", message.text)
-    return encode_message(type_of(message), msgspec.to_builtins(message))
+    if isinstance(message, LatchedSources | InterfaceStatus):
+        return encode_message(type_of(message), msgspec.to_builtins(message))
+    return encode_message(type_of(message), write_request(message))
 
 
 def encode_data(

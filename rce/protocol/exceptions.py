@@ -10,6 +10,14 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+from rce.model.faults import FaultCode, FieldFault
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from typing import Self
+
 
 class ProtocolError(Exception):
     """Base of all faults of the client protocol. ``str()`` is fit to be sent to the peer."""
@@ -18,18 +26,28 @@ class ProtocolError(Exception):
 class MessageError(ProtocolError):
     """A message is refused.
 
-    Attributes:
-        place: Where in the message, such as ``data.addNodes[2].pkg``; empty for the message as a whole.
+    Args:
+        place: The key that is wrong; empty for the message as a whole.
         problem: What is wrong there.
+        code: Which kind of fault that is.
+
+    Attributes:
+        faults: All that is wrong; never empty.
     """
 
-    def __init__(self, place: str, problem: str) -> None:
+    def __init__(self, place: str, problem: str, code: FaultCode = FaultCode.INVALID) -> None:
+        self.faults: tuple[FieldFault, ...] = (FieldFault((place,) if place else (), code, problem),)
         super().__init__(place, problem)
-        self.place = place
-        self.problem = problem
+
+    @classmethod
+    def of(cls, faults: Sequence[FieldFault]) -> Self:
+        """Make the error of what was found to be wrong."""
+        error = cls("", "; ".join(map(str, faults)))
+        error.faults = tuple(faults)
+        return error
 
     def __str__(self) -> str:
-        return f"{self.place}: {self.problem}" if self.place else self.problem
+        return "; ".join(map(str, self.faults))
 
 
 class AssemblyError(ProtocolError):

@@ -8,43 +8,27 @@ from __future__ import annotations
 
 import json
 import re
-from typing import TYPE_CHECKING, Annotated, Any, AnyStr, Literal, TypeVar, assert_never
+from typing import TYPE_CHECKING, Annotated, Any, AnyStr, Literal, TypeVar
 
 import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 
-from rce.model.names import Form
+from rce.model.spelling import fault_of, short
+from rce.model.written import MessageTypeName, Name
 from rce.protocol.calls import text_id
-from rce.protocol.container_checks import container_faults, resize_faults
 from rce.protocol.exceptions import MessageError
 from rce.protocol.limits import DEFAULT_LIMITS
 from rce.protocol.messages import (
-    CHOICES,
-    HUMAN_PATTERNS,
     NO_ID,
     REQUEST_TYPES,
     TYPES,
-    AddInterface,
-    AddNode,
     ClientMessage,
-    ConfigureComponents,
-    ConfigureConnections,
-    Connection,
-    CreateContainer,
     DataMessage,
-    DeleteParam,
-    DestroyContainer,
     ErrorReport,
     MessageId,
-    MessageTypeName,
-    Name,
-    RemoveInterface,
-    RemoveNode,
-    Request,
-    ResizeContainer,
-    SetParam,
     SourceName,
 )
+from rce.protocol.requests import kind_of, read_request
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -81,27 +65,8 @@ _decode_any = msgspec.json.Decoder().decode
 
 _DECODE_FAULTS = (msgspec.MsgspecError, UnicodeError, RecursionError)
 
-_ITEMS: dict[str, type[Struct]] = {
-    "addNodes": AddNode,
-    "removeNodes": RemoveNode,
-    "addInterfaces": AddInterface,
-    "removeInterfaces": RemoveInterface,
-    "setParam": SetParam,
-    "deleteParam": DeleteParam,
-}
-_CONNECTION_ITEMS: dict[str, type[Struct]] = {"connect": Connection, "disconnect": Connection}
-
-_MAX_ITEMS = 512
-"""Items of all lists of one ``CN`` or ``CX``: each is read on its own."""
-_MAX_FAULTS = 32
-"""Wrong items of one ``CN`` or ``CX`` after which no more are read."""
-_MAX_QUOTED = 80
 _SHORT = 4096
-
-_PLACE = re.compile(r"(?s)(.*) - at `(?:key in )?\$(.*)`")
-_MISSING = re.compile(r"Object missing required field `([^`]+)`")
 _ESCAPED_SURROGATE = re.compile(rb"\\u[dD]")
-_REPR_PATTERNS = {repr(pattern): text for pattern, text in HUMAN_PATTERNS.items()}
 
 
 def decode(text: str | bytes, *, max_depth: int = DEFAULT_LIMITS.max_depth) -> ClientMessage:
@@ -196,7 +161,7 @@ def check_request_size(value: Any, size: int, limit: int) -> None:
     kind = value.get("type") if isinstance(value, dict) else None
     if kind != "DM":
         raise MessageError(
-            "", f"{_short(kind)}: a request of {size} bytes is longer than the limit of {limit}"
+            "", f"{short(kind)}: a request of {size} bytes is longer than the limit of {limit}"
         )
 
 
@@ -239,11 +204,11 @@ def message_from_json(value: Any, accept: Collection[str] = TYPES) -> ClientMess
         MessageError: It is not a message, or one of another type.
     """
     if not isinstance(value, dict):
-        raise MessageError("", f"a message must be an object, not {_kind(value)}")
+        raise MessageError("", f"a message must be an object, not {kind_of(value)}")
     kind = value.get("type")
     if not isinstance(kind, str) or kind not in accept:
         known = ", ".join(sorted(accept))
-        problem = "is missing" if "type" not in value else f"unknown message type {_short(kind)}"
+        problem = "is missing" if "type" not in value else f"unknown message type {short(kind)}"
         raise MessageError("type", f"{problem}; use one of {known}")
     if "data" not in value:
         raise MessageError("data", "is missing")
@@ -257,131 +222,9 @@ def message_from_json(value: Any, accept: Collection[str] = TYPES) -> ClientMess
     return _convert(data, TYPES[kind], "data")
 
 
-def read_request(kind: str, data: Any) -> Request:
-    """Make a request of its type and its ``data``.
-
-    Raises:
-        MessageError: ``kind`` is not a request, or ``data`` as a whole is wrong. Wrong items of a ``CN`` or
-            ``CX`` do not raise: they are in ``faults``.
-    """
-    cls = REQUEST_TYPES.get(kind)
-    if cls is None:
-        raise MessageError("type", f"{_short(kind)} is not a request; use one of {', '.join(REQUEST_TYPES)}")
-    if not isinstance(data, dict):
-        raise MessageError("data", f"must be an object, not {_kind(data)}")
-    if cls is ConfigureComponents:
-        return msgspec.convert(_read_items(data, _ITEMS), ConfigureComponents)
-    if cls is ConfigureConnections:
-        return msgspec.convert(_read_items(data, _CONNECTION_ITEMS), ConfigureConnections)
-    if data.get("containerData", ...) is None:
-        data = {key: value for key, value in data.items() if key != "containerData"}
-    return _checked(_convert(data, cls, "data"))
-
-
-def _checked(request: Request) -> Request:
-    """Check what a container asks for; all that is wrong is told at once."""
-    match request:
-        case CreateContainer():
-            faults = list(container_faults(request.container_data))
-        case ResizeContainer():
-            faults = list(resize_faults(request.container_data))
-        case DestroyContainer() | ConfigureComponents() | ConfigureConnections():
-            return request
-        case _:
-            assert_never(request)
-    if faults:
-        texts = [f"{_below('data.containerData', fault.key)}: {fault.problem}" for fault in faults]
-        place, problem = texts[0].split(": ", 1)
-        raise MessageError(place, "; ".join((problem, *texts[1:])))
-    return request
-
-
-def _below(place: str, key: str) -> str:
-    return f"{place}.{key}" if key else place
-
-
-def _read_items(data: dict[str, Any], kinds: dict[str, type[Struct]]) -> dict[str, Any]:
-    """Read each item of each list on its own, so that a bad one harms no other."""
-    count = sum(len(items) for key in kinds if isinstance(items := data.get(key), list))
-    if count > _MAX_ITEMS:
-        raise MessageError(
-            "data", f"{count} items are over the limit of {_MAX_ITEMS}; send them in several messages"
-        )
-    read: dict[str, Any] = {}
-    faults: list[str] = []
-    for key, cls in kinds.items():
-        items = data.get(key)
-        if items is None:
-            continue
-        if not isinstance(items, list):
-            faults.append(f"data.{key}: must be a list, not {_kind(items)}")
-            continue
-        good = read[key] = []
-        for index, item in enumerate(items):
-            if len(faults) >= _MAX_FAULTS:
-                faults.append(
-                    f"data.{key}: the last {len(items) - index} items were not read, too many are wrong"
-                )
-                break
-            place = f"data.{key}[{index}]"
-            try:
-                made = _convert(item, cls, place)
-                _check_address(made, place)
-            except MessageError as error:
-                faults.append(str(error))
-            else:
-                good.append(made)
-    read["faults"] = faults
-    return read
-
-
-def _check_address(item: Struct, place: str) -> None:
-    if (
-        isinstance(item, AddInterface)
-        and not item.addr
-        and item.interface_type.endswith(Form.INTERFACE.value)
-    ):
-        raise MessageError(f"{place}.addr", f"is missing; a {item.interface_type} needs its ROS name")
-
-
 def _convert(value: Any, cls: type[T], place: str) -> T:
     """Convert with msgspec and give its complaint our words and our place."""
     try:
         return msgspec.convert(value, cls)
     except msgspec.ValidationError as error:
-        raise _reworded(str(error), value, place) from error
-
-
-def _reworded(text: str, value: Any, place: str) -> MessageError:
-    found = _PLACE.fullmatch(text)
-    problem, inner = found.groups() if found else (text, "")
-    key = inner.rpartition(".")[2]
-    if problem.startswith("Invalid enum value") and key in CHOICES:
-        given = _short(_look_up(value, inner))
-        return MessageError(place + inner, f"must be one of {', '.join(CHOICES[key])}, not {given}")
-    missing = _MISSING.fullmatch(problem)
-    if missing:
-        return MessageError(f"{place}{inner}.{missing[1]}", "is missing")
-    for pattern, words in _REPR_PATTERNS.items():
-        if problem.endswith(pattern):
-            problem = f"{words}, not {_short(_look_up(value, inner))}"
-            break
-    else:
-        problem = problem.replace("Expected", "must be", 1).replace(", got", ", not").replace("`", "")
-    return MessageError(place + inner, problem)
-
-
-def _look_up(value: Any, path: str) -> Any:
-    for key, index in re.findall(r"\.([^.\[]+)|\[(\d+)\]", path):
-        value = value[int(index)] if index else value[key]
-    return value
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= _MAX_QUOTED else f"{text[:_MAX_QUOTED]}..."
-
-
-def _kind(value: Any) -> str:
-    names = {dict: "an object", list: "a list", str: "a string", bool: "a boolean", type(None): "null"}
-    return names.get(type(value), "a number" if isinstance(value, int | float) else "binary")
+        raise MessageError.of([fault_of(str(error), value).below(place)]) from error

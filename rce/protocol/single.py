@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from msgspec import UNSET, Struct, UnsetType, field
 
+from rce.model.written import MessageTypeName, Name
 from rce.protocol.exceptions import AssemblyError, MessageError
 from rce.protocol.limits import DEFAULT_LIMITS
-from rce.protocol.messages import NO_ID, DataMessage, MessageId, MessageTypeName, Name, SourceName
+from rce.protocol.messages import NO_ID, DataMessage, MessageId, SourceName
 from rce.protocol.reading import parse_json
 
 if TYPE_CHECKING:

@@ -15,12 +15,7 @@ from rce.protocol.assembler import Assembler, Binary
 from rce.protocol.calls import CallId, call_at, call_of
 from rce.protocol.exceptions import ProtocolError
 from rce.protocol.limits import DEFAULT_LIMITS, Limits
-from rce.protocol.messages import (
-    DOWNWARD,
-    UPWARD,
-    ClientMessage,
-    DataMessage,
-)
+from rce.protocol.messages import DOWNWARD, UPWARD, ClientMessage, DataMessage
 from rce.protocol.reading import (
     SerializedData,
     check_depth,

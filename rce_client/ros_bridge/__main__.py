@@ -169,12 +169,15 @@ def summary(config: ClientConfig) -> str:
     lines = [f"{config.robot} of user {config.user} at {config.url}"]
     lines += [f"  container {item.tag}" for item in config.containers]
     lines += [
-        f"  node {item.container}/{item.tag}: {item.pkg} {item.exe} {item.args}".rstrip()
+        f"  node {item.container}/{item.node.tag}: {item.node.pkg} {item.node.exe} {item.node.args}".rstrip()
         for item in config.nodes
     ]
-    lines += [f"  parameter {item.container}: {item.name} = {item.value!r}" for item in config.parameters]
+    lines += [
+        f"  parameter {item.container}: {item.parameter.name} = {item.parameter.value!r}"
+        for item in config.parameters
+    ]
     lines += [f"  {span}" for span in plan.spans]
-    lines += [f"  connection {link.a} - {link.b}" for link in config.connections]
+    lines += [f"  connection {link.tag_a} - {link.tag_b}" for link in config.connections]
     lines += [f"  {bridge}: its type is read from the robot's graph" for bridge in config.untyped.values()]
     return "\n".join(lines)
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rce.config.client import ClientConfig
-    from rce.config.items import Interface
+    from rce.model.specs import InterfaceSpec
 
 _FORWARD = (Role.SUBSCRIBER, Role.SERVICE_PROVIDER)
 """Roles at the end where a message, or a service's request, comes from."""
@@ -32,12 +32,12 @@ class Wire(NamedTuple):
 
 def wires(config: ClientConfig) -> Iterator[Wire]:
     """Return the connections of a file; an interface that it does not list itself has its tag for a name."""
-    interfaces = {one.path: one for one in config.interfaces}
+    interfaces = {one.path: one.interface for one in config.interfaces}
     for link in config.connections:
-        a, b = interfaces.get(link.a), interfaces.get(link.b)
+        a, b = interfaces.get(link.tag_a), interfaces.get(link.tag_b)
         known = a or b
         forward = a.kind.role in _FORWARD if a else b is None or b.kind.role not in _FORWARD
-        source, target = (link.a, link.b) if forward else (link.b, link.a)
+        source, target = (link.tag_a, link.tag_b) if forward else (link.tag_b, link.tag_a)
         yield Wire(
             *_end(source, interfaces),
             *_end(target, interfaces),
@@ -46,7 +46,7 @@ def wires(config: ClientConfig) -> Iterator[Wire]:
         )
 
 
-def _end(path: str, interfaces: dict[str, Interface]) -> tuple[str, str]:
+def _end(path: str, interfaces: dict[str, InterfaceSpec]) -> tuple[str, str]:
     endpoint, _, tag = path.partition("/")
     found = interfaces.get(path)
     return endpoint, (found.addr or tag) if found else tag

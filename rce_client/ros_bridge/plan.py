@@ -13,12 +13,12 @@ import msgspec
 
 from rce.config.exceptions import ConfigError, Fault
 from rce.model.names import Form, InterfaceType, Role
-from rce.protocol.messages import ConfigureComponents
+from rce.model.requests import ConfigureComponents
 from rce.ros.types import TypesError
 
 if TYPE_CHECKING:
     from rce.config.client import ClientConfig
-    from rce.protocol.messages import Request
+    from rce.model.requests import Request
     from rce.ros.types import TypeRegistry
 
 
@@ -68,21 +68,21 @@ class Plan:
 def make_plan(config: ClientConfig) -> Plan:
     """Plan the bridge of a robot."""
     spans = tuple(
-        Span(item.tag, item.kind.role, item.message_type, item.addr)
-        for item in config.robot_interfaces
-        if item.addr
+        Span(own.tag, own.kind.role, own.message_type, own.addr)
+        for own in config.robot_interfaces
+        if own.addr
     )
     bridged = {span.tag for span in spans}
     requests = [_without(request, config.robot, bridged) for request in config.setup()]
     first = sum(1 for _ in config.containers)
-    ends = {end for link in config.connections for end in (link.a, link.b)}
+    ends = {end for link in config.connections for end in (link.tag_a, link.tag_b)}
     return Plan(
         robot=config.robot,
         spans=spans,
         requests=tuple(requests),
         first=first,
         awaited=frozenset(tag for tag in bridged if f"{config.robot}/{tag}" in ends),
-        unbridged=tuple(item.tag for item in config.robot_interfaces if not item.addr),
+        unbridged=tuple(own.tag for own in config.robot_interfaces if not own.addr),
     )
 
 
@@ -95,22 +95,23 @@ def check(config: ClientConfig, types: TypeRegistry, source: str) -> None:
     faults = []
     services: dict[str, Role] = {}
     for index, item in enumerate(config.interfaces):
-        if item.endpoint != config.robot or not item.addr:
+        own = item.interface
+        if item.endpoint != config.robot or not own.addr:
             continue
         place = f"interfaces[{index}]"
         try:
-            if item.kind.role.is_service:
-                types.service(item.message_type)
+            if own.kind.role.is_service:
+                types.service(own.message_type)
             else:
-                types.message(item.message_type)
+                types.message(own.message_type)
         except TypesError as error:
             faults.append(Fault(f"{place}.iCls", str(error)))
-        role = item.kind.role
-        if role.is_service and services.setdefault(item.addr.lstrip("/"), role) is role.complement:
+        role = own.kind.role
+        if role.is_service and services.setdefault(own.addr.lstrip("/"), role) is role.complement:
             faults.append(
                 Fault(
                     f"{place}.addr",
-                    f"service {item.addr} is answered in the cloud and called from it: a loop",
+                    f"service {own.addr} is answered in the cloud and called from it: a loop",
                 )
             )
     if faults:
@@ -122,8 +123,6 @@ def _without(request: Request, endpoint: str, tags: set[str]) -> Request:
     if not isinstance(request, ConfigureComponents):
         return request
     kept = tuple(
-        item
-        for item in request.add_interfaces
-        if item.endpoint_tag != endpoint or item.interface_tag not in tags
+        item for item in request.add_interfaces if item.endpoint != endpoint or item.interface.tag not in tags
     )
     return msgspec.structs.replace(request, add_interfaces=kept)

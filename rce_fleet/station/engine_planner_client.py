@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 from rce.config.client import ClientConfig
-from rce.protocol.messages import Request
+from rce.model.requests import Request
 from rce.tls.identity import Context
 from rce_client.connection import Connection, State
 from rce_client.exceptions import CallError, ClientError

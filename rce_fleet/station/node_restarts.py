@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from rce.config.client import ClientConfig
-from rce.protocol.messages import ConfigureComponents, RemoveNode, Request
+from rce.model.requests import ConfigureComponents, RemoveNode, Request
 
 _ENDED = frozenset({"failed", "exited"})
 _UP = frozenset({"running", "degraded"})
@@ -25,12 +25,12 @@ def node_requests(config: ClientConfig, engine: dict[str, Any]) -> list[Request]
         if container["state"] not in _UP:
             continue
         states = {node["tag"]: node["state"] for node in container["nodes"]}
-        for node in config.nodes:
-            if node.container != container["tag"]:
+        for add in config.nodes:
+            if add.container != container["tag"]:
                 continue
-            if node.tag not in states:
-                requests.append(ConfigureComponents(add_nodes=(node.message(),)))
-            elif states[node.tag] in _ENDED:
-                remove = RemoveNode(container_tag=node.container, node_tag=node.tag)
+            if add.node.tag not in states:
+                requests.append(ConfigureComponents(add_nodes=(add,)))
+            elif states[add.node.tag] in _ENDED:
+                remove = RemoveNode(container=add.container, tag=add.node.tag)
                 requests.append(ConfigureComponents(remove_nodes=(remove,)))
     return requests

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce_master.http import models
+from rce_master.http import models, spec_models
 from rce_master.http.routes import OF_USER, Call, route_table
 from rce_master.http.views import Views
 
@@ -26,42 +26,44 @@ async def list_robots(call: Call) -> models.RobotsOut:
     )
 
 
-@routes.route("GET", "/containers", "List containers", reply=models.ContainersOut, query=(OF_USER,))
-async def list_containers(call: Call) -> models.ContainersOut:
+@routes.route("GET", "/containers", "List containers", reply=spec_models.ContainersOut, query=(OF_USER,))
+async def list_containers(call: Call) -> spec_models.ContainersOut:
     """List containers."""
     views = _views(call)
     found = call.services.state_service.tables.containers(call.scope)
-    return models.ContainersOut(containers=[views.container(c) for c in found])
+    return spec_models.ContainersOut(containers=[views.container(c) for c in found])
 
 
-@routes.route("GET", "/nodes", "List nodes", reply=models.NodesOut, query=(OF_USER,))
-async def list_nodes(call: Call) -> models.NodesOut:
+@routes.route("GET", "/nodes", "List nodes", reply=spec_models.NodesOut, query=(OF_USER,))
+async def list_nodes(call: Call) -> spec_models.NodesOut:
     """List nodes."""
     views = _views(call)
     found = call.services.state_service.tables.containers(call.scope)
-    return models.NodesOut(nodes=[node for c in found for node in views.nodes(c)])
+    return spec_models.NodesOut(nodes=[node for c in found for node in views.nodes(c)])
 
 
-@routes.route("GET", "/parameters", "List parameters", reply=models.ParametersOut, query=(OF_USER,))
-async def list_parameters(call: Call) -> models.ParametersOut:
+@routes.route("GET", "/parameters", "List parameters", reply=spec_models.ParametersOut, query=(OF_USER,))
+async def list_parameters(call: Call) -> spec_models.ParametersOut:
     """List parameters."""
     views = _views(call)
     found = call.services.state_service.tables.containers(call.scope)
-    return models.ParametersOut(parameters=[p for c in found for p in views.parameters(c)])
+    return spec_models.ParametersOut(parameters=[p for c in found for p in views.parameters(c)])
 
 
-@routes.route("GET", "/interfaces", "List interfaces", reply=models.InterfacesOut, query=(OF_USER,))
-async def list_interfaces(call: Call) -> models.InterfacesOut:
+@routes.route("GET", "/interfaces", "List interfaces", reply=spec_models.InterfacesOut, query=(OF_USER,))
+async def list_interfaces(call: Call) -> spec_models.InterfacesOut:
     """List interfaces."""
     views = _views(call)
-    return models.InterfacesOut(interfaces=[i for e in _endpoints(call) for i in views.interfaces(e)])
+    return spec_models.InterfacesOut(interfaces=[i for e in _endpoints(call) for i in views.interfaces(e)])
 
 
-@routes.route("GET", "/connections", "List connections", reply=models.ConnectionsOut, query=(OF_USER,))
-async def list_connections(call: Call) -> models.ConnectionsOut:
+@routes.route("GET", "/connections", "List connections", reply=spec_models.ConnectionsOut, query=(OF_USER,))
+async def list_connections(call: Call) -> spec_models.ConnectionsOut:
     """List connections."""
     views = _views(call)
-    return models.ConnectionsOut(connections=[c for link in _links(call) for c in views.connections(link)])
+    return spec_models.ConnectionsOut(
+        connections=[c for link in _links(call) for c in views.connections(link)]
+    )
 
 
 @routes.route("GET", "/machines", "List task sets and machines", reply=models.MachinesOut, admin=True)

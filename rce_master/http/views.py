@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rce.control.model import EndpointUsage, InterfaceUsage, NodeStatus
-from rce_master.http import models
+from rce_master.http import models, spec_models
+from rce_master.http.spec_models import shown
 from rce_master.state import capacity
 from rce_master.state.records import Container
 from rce_master.state.wiring_records import open_end_key
@@ -14,7 +15,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rce.control.messages import Usage
-    from rce.model.specs import Resources
     from rce_master.state.records import Endpoint, Robot, TaskSet, User
     from rce_master.state.tables import Tables
     from rce_master.state.wiring_records import Connection, Link
@@ -57,12 +57,12 @@ class Views:
             interfaces=self._tables.interfaces.count("endpoint", robot.id),
         )
 
-    def container(self, container: Container) -> models.ContainerOut:
+    def container(self, container: Container) -> spec_models.ContainerOut:
         """Show a container."""
         live = self._tables.container_live(container.id)
         task_set = self._tables.task_sets.get(container.task_set)
         usage = self.usage_of(container)
-        return models.ContainerOut(
+        return spec_models.ContainerOut(
             id=container.id,
             user=container.user,
             tag=container.tag,
@@ -76,68 +76,55 @@ class Views:
             interfaces=self._tables.interfaces.count("endpoint", container.id),
             cpu_s=usage.cpu_s,
             memory=usage.memory,
-            wish=_requested(container.resources),
+            wish=spec_models.RequestedOut(**shown(container.resources)),
             moving_to=move.to if (move := self._tables.moves.get(container.id)) else "",
         )
 
-    def nodes(self, container: Container) -> list[models.NodeOut]:
+    def nodes(self, container: Container) -> list[spec_models.NodeOut]:
         """Show the nodes of a container."""
         status = self._tables.container_live(container.id).status
         reported = {node.tag: node for node in status.nodes} if status else {}
         return [self._node(container, tag, reported.get(tag)) for tag in container.nodes]
 
-    def _node(self, container: Container, tag: str, status: NodeStatus | None) -> models.NodeOut:
-        node = container.nodes[tag]
-        return models.NodeOut(
+    def _node(self, container: Container, tag: str, status: NodeStatus | None) -> spec_models.NodeOut:
+        return spec_models.NodeOut(
+            **shown(container.nodes[tag]),
             user=container.user,
             container=container.tag,
-            tag=tag,
-            pkg=node.pkg,
-            exe=node.exe,
-            args=node.args,
-            name=node.name,
-            namespace=node.namespace,
             state=status.state.value if status else "unknown",
             pid=status.pid if status else 0,
             exit_code=status.exit_code if status else None,
             detail=status.detail if status else "",
-            restart=node.restart.value,
-            max_restarts=node.max_restarts,
-            after=list(node.after),
-            heartbeat=node.heartbeat,
             restarts=status.restarts if status else 0,
         )
 
-    def parameters(self, container: Container) -> list[models.ParameterOut]:
+    def parameters(self, container: Container) -> list[spec_models.ParameterOut]:
         """Show the parameters of a container."""
         return [
-            models.ParameterOut(user=container.user, container=container.tag, name=name, value=value)
+            spec_models.ParameterOut(user=container.user, container=container.tag, name=name, value=value)
             for name, value in container.parameters.items()
         ]
 
-    def interfaces(self, endpoint: Endpoint) -> list[models.InterfaceOut]:
+    def interfaces(self, endpoint: Endpoint) -> list[spec_models.InterfaceOut]:
         """Show the interfaces of a robot or container."""
         usage = self.usage_of(endpoint).interfaces
         return [
-            models.InterfaceOut(
+            spec_models.InterfaceOut(
+                **shown(interface.spec),
                 user=endpoint.user,
                 endpoint=endpoint.tag,
-                tag=interface.spec.tag,
-                type=interface.spec.type,
-                cls=interface.spec.message_type,
-                addr=interface.spec.addr,
                 active=interface.id in self._tables.active,
                 **_counters(usage.get(interface.spec.tag, _NO_INTERFACE_USAGE)),
             )
             for interface in self._tables.interfaces.by("endpoint", endpoint.id)
         ]
 
-    def connections(self, link: Link) -> list[models.ConnectionOut]:
+    def connections(self, link: Link) -> list[spec_models.ConnectionOut]:
         """Show the connections of a link."""
         user, _, tag_a = link.a.partition("/")
         tag_b = link.b.partition("/")[2]
         return [
-            models.ConnectionOut(
+            spec_models.ConnectionOut(
                 id=c.id,
                 user=user,
                 tag_a=f"{tag_a}/{c.interface_a}",
@@ -201,20 +188,6 @@ class Views:
         """Tell whether both ends report a connection as established."""
         ends = (open_end_key(endpoint, connection.id) for endpoint in (connection.a, connection.b))
         return all(key in self._tables.open_ends for key in ends)
-
-
-def _requested(requested: Resources) -> models.RequestedOut:
-    return models.RequestedOut(
-        size=requested.size,
-        cpu=requested.cpu,
-        memory=requested.memory,
-        bandwidth=requested.bandwidth,
-        network=requested.network.value,
-        group=requested.group,
-        group_ip=requested.group_ip,
-        image=requested.image,
-        special_features=list(requested.special_features),
-    )
 
 
 def _counters(usage: InterfaceUsage) -> dict[str, int]:

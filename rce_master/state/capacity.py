@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from rce.control.limits import MEGABYTE, MIN_MEMORY
 from rce.control.messages import TaskSetKind
+from rce.model.checks import DEFAULT_PREFIX
 from rce.model.specs import Network, Resources
-from rce.protocol.container_checks import DEFAULT_PREFIX
 from rce_master.exceptions import ConflictError, ForbiddenError, InvalidRequestError
 from rce_master.state import limits
 from rce_master.state.placement import Room

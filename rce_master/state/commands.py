@@ -14,7 +14,7 @@ from rce.model.specs import Resources
 if TYPE_CHECKING:
     from rce.control.messages import Hello
     from rce.control.model import EndpointStatus, StatusPatch
-    from rce.model.specs import InterfaceSpec, NodeSpec, ParameterValue
+    from rce.model.specs import InterfaceSpec, NodeSpec, ParameterValue, ResourceChanges
     from rce_master.state.records import KnownLogin, PackageKey, Token, User, UserPackage, UserRole
 
 
@@ -258,18 +258,11 @@ class CreateContainer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResizeContainer:
-    """``RC``; None leaves a value as it is, zero withdraws the request."""
+    """``RC``."""
 
     user: str
     tag: str
-    size: int | None = None
-    """Slots."""
-    cpu: float | None = None
-    """Cores."""
-    memory: int | None = None
-    """Bytes."""
-    bandwidth: int | None = None
-    """Bytes per second."""
+    changes: ResourceChanges
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -18,14 +18,11 @@ if TYPE_CHECKING:
     from rce_master.state.commands import ResizeContainer
     from rce_master.state.records import Container
 
-_SIZES = ("size", "cpu", "memory", "bandwidth")
-
 
 def resize_container(tx: Transaction, command: ResizeContainer) -> None:
     """Change a container's resources; the same ones again are accepted silently."""
     container = find(tx, command.user, command.tag)
-    given = {key: value for key in _SIZES if (value := getattr(command, key)) is not None}
-    had, requested = container.resources, replace(container.resources, **given)
+    had, requested = container.resources, replace(container.resources, **command.changes.given())
     if requested == had:
         return
     capacity.check_resources(tx, command.user, container.id, requested)

@@ -15,6 +15,7 @@ import msgspec
 
 from rce.config.secret import Secret
 from rce.control.messages import (
+    TYPED_REQUESTS,
     ClientReply,
     ClientRequest,
     Drop,
@@ -47,6 +48,7 @@ from rce.control.server import ControlServer
 from rce.link import Endpoint, Interface, LinkHub
 from rce.model.names import EndpointId, InterfaceType
 from rce.model.specs import InterfaceSpec
+from rce.protocol.requests import write_request
 from rce_robot.app import App
 from rce_robot.settings import RobotSettings, SessionSettings
 from support.patches import patch_between
@@ -130,7 +132,8 @@ class FakeMaster:
             case Login():
                 peer.send(self._login(message))
             case ClientRequest():
-                self.requests.append((message.id, message.type, message.data))
+                assert message.content is not None
+                self.requests.append((message.id, message.type, write_request(message.content)))
                 peer.send(ClientReply(request=message.request, errors=await self.answer(message)))
             case Status():
                 self.statuses[message.status.id] = message.status
@@ -324,7 +327,7 @@ async def running_cloud(
             on_message=master.on_message,
             on_gone=master.on_gone,
             port=0,
-            features=(PATCHES,) if in_patches else (),
+            features=(TYPED_REQUESTS, PATCHES) if in_patches else (TYPED_REQUESTS,),
         )
         await stack.enter_async_context(server)
         cloud = Cloud(master, endpoint, ends, LinkAddress(machine=MACHINE, unix=str(folder / "s")))

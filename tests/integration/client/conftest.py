@@ -14,6 +14,7 @@ import pytest
 from support.cloud import PASSWORD, Cloud, PeerInterface, running_cloud
 
 from rce.aio.backoff import Backoff
+from rce.model.requests import ConfigureComponents
 from rce_client.connection import Connection, State
 from rce_client.engine_transport import Timing
 from rce_robot.websocket import RobotSocket
@@ -74,12 +75,13 @@ class Engine:
     async def _answer(self, request: ClientRequest) -> tuple[str, ...]:
         robot = request.id.partition("/")[2]
         errors = []
-        for item in request.data.get("addInterfaces", ()):
-            tag = item["interfaceTag"]
-            if tag in self.refuse:
-                errors.append(self.refuse[tag])
-            elif item["endpointTag"] == robot and f"{robot}_{tag}" not in self.cloud.ends:
-                await self.cloud.wire(tag, item["interfaceType"], item["className"], robot=robot)
+        added = request.content.add_interfaces if isinstance(request.content, ConfigureComponents) else ()
+        for item in added:
+            spec = item.interface
+            if spec.tag in self.refuse:
+                errors.append(self.refuse[spec.tag])
+            elif item.endpoint == robot and f"{robot}_{spec.tag}" not in self.cloud.ends:
+                await self.cloud.wire(spec.tag, spec.type, spec.message_type, robot=robot)
         return tuple(errors)
 
     def end(self, tag: str) -> PeerInterface:

@@ -10,7 +10,7 @@ import pytest
 from rce.config.client import ClientConfig, loads
 from rce.config.exceptions import ConfigError
 from rce.model.names import Role
-from rce.protocol.messages import ConfigureComponents, ConfigureConnections, CreateContainer
+from rce.model.requests import ConfigureComponents, ConfigureConnections, CreateContainer
 from rce.ros.types import TypeRegistry
 from rce_client.ros_bridge.plan import check, make_plan
 
@@ -48,7 +48,7 @@ def test_containers_first_own_interfaces_left_to_spans() -> None:
     assert plan.first == 1
     assert isinstance(first, CreateContainer)
     assert isinstance(second, ConfigureComponents)
-    assert [item.interface_tag for item in second.add_interfaces] == ["in"]
+    assert [item.interface.tag for item in second.add_interfaces] == ["in"]
     assert isinstance(third, ConfigureConnections)
     assert plan.awaited == {"a"}
 
@@ -59,7 +59,7 @@ def test_interfaces_without_addr_are_made_as_they_are() -> None:
     assert plan.unbridged == ("a",)
     (request,) = plan.requests
     assert isinstance(request, ConfigureComponents)
-    assert request.add_interfaces[0].interface_type == "SubscriberConverter"
+    assert request.add_interfaces[0].interface.type == "SubscriberConverter"
 
 
 def test_a_topic_may_be_bridged_in_both_directions() -> None:

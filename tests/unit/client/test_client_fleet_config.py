@@ -44,8 +44,8 @@ def made(number: int) -> ClientConfig:
 def test_any_number_of_robots(number: int) -> None:
     config = made(number)
     assert config.robot == f"testRobot_{number}"
-    assert config.nodes[0].namespace == f"Robot{number}"
-    assert {item.addr for item in config.interfaces if item.endpoint == "cTag_fleet"} == {
+    assert config.nodes[0].node.namespace == f"Robot{number}"
+    assert {item.interface.addr for item in config.interfaces if item.endpoint == "cTag_fleet"} == {
         "/map",
         *(
             f"/Robot{number}/{topic}"
@@ -62,11 +62,11 @@ def test_robots_do_not_get_in_each_others_way() -> None:
 
 def test_every_interface_is_connected_with_its_complement() -> None:
     config = made(1)
-    interfaces = {item.path: item for item in config.interfaces}
+    interfaces = {item.path: item.interface for item in config.interfaces}
     used = set()
     for link in config.connections:
-        a, b = interfaces[link.a], interfaces[link.b]
+        a, b = interfaces[link.tag_a], interfaces[link.tag_b]
         assert (a.kind.role, b.kind.role) == (Role.SUBSCRIBER, Role.PUBLISHER)
         assert a.message_type == b.message_type
-        used |= {link.a, link.b}
+        used |= {link.tag_a, link.tag_b}
     assert used == set(interfaces)

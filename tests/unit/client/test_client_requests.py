@@ -1,4 +1,4 @@
-"""The requests of a connection as methods: their keywords are the fields of the protocol's messages."""
+"""The requests of a connection as methods: their keywords are the fields of the specs."""
 
 from __future__ import annotations
 
@@ -7,29 +7,25 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pytest
-from msgspec import NODEFAULT, Struct
-from msgspec.structs import fields
 
-from rce.protocol.messages import AddInterface, AddNode, ContainerData, ResizeData, type_of
+from rce.model.requests import AddInterface, AddNode, CreateContainer, ResizeContainer
+from rce.model.spelling import fields_of
+from rce.protocol.messages import type_of
+from rce.protocol.requests import write_request
 from rce_client.requests import Requests
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rce.protocol.messages import Request
+    from rce.model.requests import Item, Request
 
-RENAMED = {
-    "node_tag": "tag",
-    "container_tag": "container",
-    "endpoint_tag": "endpoint",
-    "interface_tag": "tag",
-}
-METHODS: list[tuple[Callable[..., Any], type[Struct], set[str]]] = [
-    (Requests.create_container, ContainerData, {"tag"}),
-    (Requests.resize_container, ResizeData, {"tag"}),
-    (Requests.add_node, AddNode, set()),
-    (Requests.add_interface, AddInterface, set()),
+METHODS: list[tuple[Callable[..., Any], type[Request | Item]]] = [
+    (Requests.create_container, CreateContainer),
+    (Requests.resize_container, ResizeContainer),
+    (Requests.add_node, AddNode),
+    (Requests.add_interface, AddInterface),
 ]
+RENAMED = {"type": "interface_type"}
 
 
 class Noted(Requests):
@@ -39,23 +35,23 @@ class Noted(Requests):
         self.sent: list[tuple[str, Any]] = []
 
     async def request(self, request: Request) -> None:
-        self.sent.append((type_of(request), msgspec.json.decode(msgspec.json.encode(request))))
+        self.sent.append((type_of(request), msgspec.json.decode(msgspec.json.encode(write_request(request)))))
 
 
-@pytest.mark.parametrize(("method", "struct", "more"), METHODS)
-def test_a_method_has_the_fields_of_its_message(
-    method: Callable[..., Any], struct: type[Struct], more: set[str]
+@pytest.mark.parametrize(("method", "request_type"), METHODS)
+def test_a_method_has_the_fields_of_its_request(
+    method: Callable[..., Any], request_type: type[Request | Item]
 ) -> None:
-    """A field that is new in the protocol is a keyword here, with the same default."""
+    """A field that is new in the specs is a keyword here, with the same default as users write it."""
     parameters = dict(inspect.signature(method).parameters)
     del parameters["self"]
-    wanted = {RENAMED.get(field.name, field.name): field for field in fields(struct)}
-    assert parameters.keys() == wanted.keys() | more
+    wanted = {RENAMED.get(field.name, field.name): field for field in fields_of(request_type)}
+    assert parameters.keys() == wanted.keys()
     for name, field in wanted.items():
-        if field.default is not NODEFAULT:
-            assert parameters[name].default == field.default
-            assert type(parameters[name].default) is type(field.default)
         assert parameters[name].annotation not in (inspect.Parameter.empty, "Any")
+        if not field.required:
+            given = parameters[name].default
+            assert field.is_blank(given) or field.rule.read(given) == field.default
 
 
 @pytest.mark.parametrize(
@@ -63,16 +59,19 @@ def test_a_method_has_the_fields_of_its_message(
     [
         ({}, {}),
         ({"size": 1, "cpu": 0, "memory": 0.0, "special_features": [], "group": ""}, {}),
-        ({"size": 2, "cpu": "50%"}, {"size": 2, "cpu": "50%"}),
+        ({"size": 2, "cpu": "50%"}, {"size": 2, "cpu": 0.5}),
         ({"special_features": ("gpu", "arm")}, {"specialFeatures": ["gpu", "arm"]}),
-        ({"special_features": "gpu arm"}, {"specialFeatures": "gpu arm"}),
+        ({"special_features": "gpu arm"}, {"specialFeatures": ["gpu", "arm"]}),
+        ({"memory": 256, "bandwidth": "10Mbit"}, {"memory": 256, "bandwidth": 1_250_000}),
+        ({"memory": "1000B"}, {"memory": "1000B"}),
         ({"network": "group", "group": "g", "wait": True}, {"network": "group", "group": "g", "wait": True}),
     ],
 )
 async def test_only_requested_fields_are_sent(given: dict[str, Any], sent: dict[str, Any]) -> None:
     noted = Noted()
     await noted.create_container("c", **given)
-    assert noted.sent == [("CC", {"containerTag": "c", "containerData": sent})]
+    data = {"containerData": sent} if sent else {}
+    assert noted.sent == [("CC", {"containerTag": "c", **data})]
 
 
 @pytest.mark.parametrize(
@@ -90,6 +89,15 @@ async def test_a_node_is_sent_without_its_defaults(given: dict[str, Any], sent: 
     await noted.add_node("c", "n", "p", "e", **given)
     node = {"containerTag": "c", "nodeTag": "n", "pkg": "p", "exe": "e", **sent}
     assert noted.sent == [("CN", {"addNodes": [node]})]
+
+
+async def test_an_amount_that_cannot_be_read_is_an_error_at_once() -> None:
+    noted = Noted()
+    with pytest.raises(ValueError, match=r"^cpu: must be a number of cores"):
+        await noted.create_container("c", cpu="half")
+    with pytest.raises(ValueError, match=r"^restart: must be one of never, on-failure, always"):
+        await noted.add_node("c", "n", "p", "e", restart="sometimes")  # type: ignore[arg-type]
+    assert noted.sent == []
 
 
 async def test_unknown_keywords_are_refused() -> None:

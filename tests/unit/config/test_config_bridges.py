@@ -33,11 +33,14 @@ def faults(*bridges: dict[str, Any], **more: Any) -> list[str]:
 
 
 def interfaces(config: ClientConfig) -> dict[str, tuple[str, str, str]]:
-    return {one.path: (one.type, one.message_type, one.addr) for one in config.interfaces}
+    return {
+        one.path: (one.interface.type, one.interface.message_type, one.interface.addr)
+        for one in config.interfaces
+    }
 
 
 def connections(config: ClientConfig) -> list[tuple[str, str]]:
-    return [(one.a, one.b) for one in config.connections]
+    return [(one.tag_a, one.tag_b) for one in config.connections]
 
 
 def test_topic_from_the_robot_to_two_containers() -> None:
@@ -173,7 +176,7 @@ def test_names_that_make_the_same_tag_are_told_apart() -> None:
         {"topic": "/" + "x" * 200, "type": POSE, "from": "robot", "to": "c1"},
     )
     assert len(interfaces(config)) == 6
-    assert all(len(one.tag) <= 128 for one in config.interfaces)
+    assert all(len(one.interface.tag) <= 128 for one in config.interfaces)
 
 
 _names = st.from_regex(r"/[a-z][a-z0-9_]{0,3}(/[a-z0-9_]{1,3}){0,2}", fullmatch=True)
@@ -183,7 +186,7 @@ _names = st.from_regex(r"/[a-z][a-z0-9_]{0,3}(/[a-z0-9_]{1,3}){0,2}", fullmatch=
 def test_every_bridge_has_its_connections_in_any_order(names: list[str]) -> None:
     bridges = [{"topic": name, "type": POSE, "from": "robot", "to": ["c1", "c2"]} for name in names]
     config = read(*bridges)
-    addresses = {one.path: one.addr for one in config.interfaces}
+    addresses = {one.path: one.interface.addr for one in config.interfaces}
     assert {(addresses[a], addresses[b], b.partition("/")[0]) for a, b in connections(config)} == {
         (name, name, container) for name in names for container in ("c1", "c2")
     }

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from rce.config.client import ClientConfig, load, loads
 from rce.config.exceptions import ConfigError
-from rce.protocol.messages import (
+from rce.model.requests import (
     AddInterface,
     AddNode,
     ConfigureComponents,
@@ -21,8 +21,9 @@ from rce.protocol.messages import (
     Connection,
     CreateContainer,
     DestroyContainer,
-    SetParam,
+    SetParameter,
 )
+from rce.model.specs import InterfaceSpec, NodeSpec, ParameterSpec, Resources, RestartPolicy
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -96,7 +97,7 @@ def test_yaml_file(tmp_path: Path, name: str) -> None:
 def test_setup_makes_containers_then_components_then_connections() -> None:
     create, components, connections = loads(json.dumps(good())).setup()
     assert isinstance(create, CreateContainer)
-    assert (create.container_tag, create.container_data.cpu, create.container_data.features) == (
+    assert (create.tag, create.resources.cpu, create.resources.special_features) == (
         "cTag_01",
         1.0,
         ("gpu",),
@@ -104,23 +105,27 @@ def test_setup_makes_containers_then_components_then_connections() -> None:
     assert isinstance(components, ConfigureComponents)
     assert components.add_nodes == (
         AddNode(
-            container_tag="cTag_01",
-            node_tag="move",
-            pkg="fleet",
-            exe="move_client.py",
-            args="-v $(find fleet)/map.yaml",
-            namespace="Robot1",
+            container="cTag_01",
+            node=NodeSpec(
+                tag="move",
+                pkg="fleet",
+                exe="move_client.py",
+                args="-v $(find fleet)/map.yaml",
+                namespace="Robot1",
+            ),
         ),
     )
     assert components.set_param == (
-        SetParam(container_tag="cTag_01", name="cells", value=[1, 2.5, "x", True]),
+        SetParameter(container="cTag_01", parameter=ParameterSpec(name="cells", value=[1, 2.5, "x", True])),
     )
     assert components.add_interfaces[1] == AddInterface(
-        endpoint_tag="testRobot_1",
-        interface_tag="amclPoseSender_1",
-        interface_type="SubscriberForwarder",
-        message_type="geometry_msgs/PoseWithCovarianceStamped",
-        addr="/amcl_pose",
+        endpoint="testRobot_1",
+        interface=InterfaceSpec(
+            tag="amclPoseSender_1",
+            type="SubscriberForwarder",
+            message_type="geometry_msgs/PoseWithCovarianceStamped",
+            addr="/amcl_pose",
+        ),
     )
     assert connections == ConfigureConnections(
         connect=(Connection(tag_a="testRobot_1/amclPoseSender_1", tag_b="cTag_01/amclPoseReceiver_1"),)
@@ -137,7 +142,7 @@ def test_teardown_removes_the_same_in_reverse() -> None:
         len(components.remove_interfaces),
         len(components.delete_param),
     ) == (1, 2, 1)
-    assert destroy == DestroyContainer(container_tag="cTag_01")
+    assert destroy == DestroyContainer(tag="cTag_01")
 
 
 def test_empty_config_asks_for_nothing() -> None:
@@ -362,8 +367,17 @@ def test_amounts_are_read_as_the_protocol_reads_them() -> None:
     }
     data["containers"][0] |= requested
     (made,) = [r for r in loads(json.dumps(data)).setup() if isinstance(r, CreateContainer)]
-    for key, value in requested.items():
-        assert getattr(made.container_data, key) == value
+    assert made.wait
+    assert made.resources == Resources(
+        cpu=0.5,
+        memory=256 << 20,
+        bandwidth=1_250_000,
+        image="debian:12",
+        group=made.resources.group,
+        group_ip=made.resources.group_ip,
+        special_features=("gpu",),
+        size=made.resources.size,
+    )
 
 
 def test_faults_of_requests_are_named_by_their_keys() -> None:
@@ -378,13 +392,13 @@ def test_faults_of_requests_are_named_by_their_keys() -> None:
     data["nodes"] = []
     found = faults(data)
     assert [fault.split(": ")[0] for fault in found] == [
-        "containers[0].network",
         "containers[0].memory",
+        "containers[0].network",
         "containers[4].memory",
         "containers[1].group",
         "containers[3].groupIp",
     ]
-    assert "must be one of none, group, host" in found[0]
+    assert "must be one of none, group, host" in found[1]
     assert "is the address of containers[2] in the group 'g'" in found[-1]
 
 
@@ -399,9 +413,10 @@ def test_how_a_node_lives_is_passed_on() -> None:
     }
     data["nodes"][0] |= life
     (made,) = [r for r in loads(json.dumps(data)).setup() if isinstance(r, ConfigureComponents)]
-    (node,) = made.add_nodes
+    (add,) = made.add_nodes
+    node = add.node
     assert (node.restart, node.max_restarts, node.after, node.heartbeat, node.heartbeat_timeout) == (
-        "always", 2, ("map",), "/beat", 1.0,
+        RestartPolicy.ALWAYS, 2, ("map",), "/beat", 1.0,
     )  # fmt: skip
     data["nodes"][0] |= {"restart": "often", "heartbeatTimeout": 0}
     assert [fault.split(": ")[0] for fault in faults(data)] == [

@@ -8,7 +8,7 @@ import pytest
 from support.master_world import World
 
 from rce.control.model import EndpointState, EndpointStatus
-from rce.model.specs import Network, NodeSpec
+from rce.model.specs import Network, NodeSpec, ResourceChanges
 from rce_master.exceptions import (
     ConflictError,
     ForbiddenError,
@@ -28,7 +28,7 @@ def at(world: World, tag: str, user: str = "anna") -> str:
 
 
 def resize(world: World, tag: str = "c", user: str = "anna", **requested: object) -> object:
-    return world.do(commands.ResizeContainer(user=user, tag=tag, **requested))  # type: ignore[arg-type]
+    return world.do(commands.ResizeContainer(user=user, tag=tag, changes=ResourceChanges(**requested)))  # type: ignore[arg-type]
 
 
 def gone(world: World, tag: str, process: str = "c1") -> None:

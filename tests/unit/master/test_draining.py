@@ -8,7 +8,7 @@ import pytest
 from support.master_world import World
 
 from rce.control.model import EndpointState, EndpointStatus, LinkAddress, NodeState, NodeStatus
-from rce.model.specs import Network
+from rce.model.specs import Network, ResourceChanges
 from rce_master.exceptions import NoRoomError, NotFoundError
 from rce_master.state import commands
 from rce_master.state.changes import Changes
@@ -210,7 +210,7 @@ def test_copies_count_where_they_are_made(two: World) -> None:
     with pytest.raises(NoRoomError, match="m2 has 0 of 4 slots free"):
         two.container("more")
     with pytest.raises(NoRoomError, match="m2 has 1 of 4 slots free, 2 needed"):
-        two.do(commands.ResizeContainer(user="anna", tag="c", size=2))
+        two.do(commands.ResizeContainer(user="anna", tag="c", changes=ResourceChanges(size=2)))
 
 
 def test_a_group_moves_as_a_whole(world: World) -> None:

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from rce.control.desired import DesiredState, Fit
 from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, TaskSetKind
 from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress
-from rce.model.specs import InterfaceSpec, Network, NodeSpec, Resources
+from rce.model.specs import InterfaceSpec, Network, NodeSpec, ResourceChanges, Resources
 from rce_master.exceptions import RefusedError
 from rce_master.state import capacity, commands
 from rce_master.state.changes import Changes
@@ -204,7 +204,7 @@ class Histories(RuleBasedStateMachine):
 
     @rule(user=USERS, tag=TAGS, size=st.sampled_from([1, 2, 3, 4]))
     def resize(self, user: str, tag: str, size: int) -> None:
-        self.do(commands.ResizeContainer(user=user, tag=tag, size=size))
+        self.do(commands.ResizeContainer(user=user, tag=tag, changes=ResourceChanges(size=size)))
 
     @rule(process=CONTAINER_SETS, draining=st.booleans())
     def drain(self, process: str, draining: bool) -> None:

@@ -9,16 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce.protocol.container_checks import find_circle
+from rce.model.checks import find_circle
+from rce.model.requests import ConfigureComponents, CreateContainer, ResizeContainer
+from rce.model.specs import Network, ResourceChanges, Resources
 from rce.protocol.exceptions import MessageError
-from rce.protocol.messages import ConfigureComponents, ContainerData, CreateContainer, ResizeContainer
-from rce.protocol.reading import read_request
+from rce.protocol.requests import read_request
 
 
-def create(**data: Any) -> ContainerData:
+def create(**data: Any) -> Resources:
     request = read_request("CC", {"containerTag": "c", "containerData": data})
     assert isinstance(request, CreateContainer)
-    return request.container_data
+    return request.resources
 
 
 @pytest.mark.parametrize(
@@ -56,10 +57,11 @@ def test_all_faults_of_a_container_are_told_at_once() -> None:
 
 
 def test_an_address_in_a_group_means_the_network_of_the_group() -> None:
-    assert create(group="g", groupIp="10.0.0.2/24").joins_group
-    assert create(group="g", groupIp="10.0.0.2", network="group").joins_group
-    assert not create(group="g", groupIp="10.0.0.2", network="none").joins_group
-    assert not create(group="g").joins_group
+    given = {"group": "g", "groupIp": "10.0.0.2"}
+    assert create(**given).network is Network.GROUP
+    assert create(**given, network="group").network is Network.GROUP
+    assert create(**given, network="none").network is Network.NONE
+    assert create(group="g").network is Network.NONE
 
 
 def test_resizing_changes_what_it_names() -> None:
@@ -67,7 +69,7 @@ def test_resizing_changes_what_it_names() -> None:
         "RC", {"containerTag": "c", "containerData": {"memory": "1G", "cpu": None, "group": "g"}}
     )
     assert isinstance(request, ResizeContainer)
-    assert (request.container_data.memory, request.container_data.cpu) == ("1G", None)
+    assert request.changes == ResourceChanges(memory=1 << 30)
     for data in ({}, {"cpu": None}, {"group": "g"}):
         with pytest.raises(
             MessageError, match=r"data\.containerData: says nothing; give one or more of size, cpu"
@@ -95,7 +97,7 @@ def test_invalid_node_request_spares_other_nodes(keys: dict[str, Any], problem: 
     assert len(request.add_nodes) == 1
     (fault,) = request.faults
     with pytest.raises(MessageError, match=rf"^data\.addNodes\[0\]\.{problem}"):
-        raise MessageError("", fault)
+        raise MessageError.of([fault])
 
 
 TAGS = st.sampled_from("abcd")

@@ -6,10 +6,12 @@ import json
 
 import pytest
 
+from rce.model.requests import ConfigureComponents
 from rce.protocol.exceptions import MessageError
 from rce.protocol.limits import Limits
-from rce.protocol.messages import ConfigureComponents, DataMessage
-from rce.protocol.reading import decode, read_request
+from rce.protocol.messages import DataMessage
+from rce.protocol.reading import decode
+from rce.protocol.requests import read_request
 from rce.protocol.stream import Fault, ProtocolStream
 
 

@@ -11,9 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rce.model.requests import ConfigureComponents, CreateContainer
 from rce.protocol.codec import Frame, encode, encode_data, encode_message
 from rce.protocol.limits import Limits
-from rce.protocol.messages import ConfigureComponents, CreateContainer, DataMessage, InterfaceStatus
+from rce.protocol.messages import DataMessage, InterfaceStatus
 from rce.protocol.stream import Event, Fault, ProtocolStream
 
 ID = "0123456789abcdef0123456789ABCDEF"
@@ -102,7 +103,7 @@ def test_text_may_come_as_utf8() -> None:
 
 def test_sides_take_only_their_types() -> None:
     (status,) = encode(InterfaceStatus(i_tag="i", status=True))
-    (create,) = encode(CreateContainer(container_tag="c"))
+    (create,) = encode(CreateContainer(tag="c"))
     assert isinstance(ProtocolStream.for_client().feed(status, 0.0)[0], InterfaceStatus)
     assert isinstance(ProtocolStream.for_engine().feed(create, 0.0)[0], CreateContainer)
     assert ProtocolStream.for_engine().feed(status, 0.0) == [
@@ -117,7 +118,7 @@ def test_components_with_binary_value_are_reported_as_an_item() -> None:
         events = stream.feed(frame, 0.0)
     (message,) = events
     assert isinstance(message, ConfigureComponents)
-    assert message.faults[0].startswith("data.setParam[0].value: ")
+    assert str(message.faults[0]).startswith("data.setParam[0].value: ")
 
 
 @pytest.mark.parametrize(

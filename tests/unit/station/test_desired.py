@@ -6,7 +6,7 @@ from typing import Any
 
 from rce.config.client import loads
 from rce.config.documents import write_items
-from rce.protocol.messages import ConfigureComponents, RemoveNode
+from rce.model.requests import ConfigureComponents, RemoveNode
 from rce_fleet.station.desired import Desired, DesiredCell, DesiredGoal
 from rce_fleet.station.node_restarts import node_requests
 from rce_fleet.wiring import fleet_config
@@ -81,10 +81,10 @@ def test_a_running_node_needs_nothing() -> None:
 def test_a_node_that_failed_is_removed_and_then_added() -> None:
     (request,) = node_requests(CONFIG, engine("running", ("fleetPlanner", "failed")))
     assert isinstance(request, ConfigureComponents)
-    assert request.remove_nodes == (RemoveNode(container_tag="cTag_fleet", node_tag="fleetPlanner"),)
+    assert request.remove_nodes == (RemoveNode(container="cTag_fleet", tag="fleetPlanner"),)
     (request,) = node_requests(CONFIG, engine("running"))
     assert isinstance(request, ConfigureComponents)
-    assert [node.node_tag for node in request.add_nodes] == ["fleetPlanner"]
+    assert [node.node.tag for node in request.add_nodes] == ["fleetPlanner"]
 
 
 def test_container_that_does_not_run_gets_no_requests() -> None:

@@ -1,0 +1,70 @@
+"""What is wrong with something that a user wrote, as data: where, which kind of fault, and in which words.
+
+Each surface (client protocol, config file, REST API) makes one text of it, by ``str``.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import TYPE_CHECKING, TypeAlias
+
+from msgspec import Struct
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+Path: TypeAlias = tuple[str | int, ...]
+"""Keys and indexes, from the outermost, as the surface spells them: ``("data", "addNodes", 2, "pkg")``."""
+
+
+class FaultCode(Enum):
+    """Which kind of fault."""
+
+    MISSING = "missing"
+    """Something that must be there is not."""
+    INVALID = "invalid"
+    """A value that the field cannot have."""
+    LIMIT = "limit"
+    """Too much."""
+
+
+class FieldFault(Struct, frozen=True):
+    """One thing that is wrong."""
+
+    path: Path
+    """Where; empty for the whole."""
+    code: FaultCode
+    problem: str
+    """What is wrong there, and what would be right."""
+
+    def __str__(self) -> str:
+        place = join_path(self.path)
+        return f"{place}: {self.problem}" if place else self.problem
+
+    def at(self, path: Path) -> FieldFault:
+        """Return the same fault of another place."""
+        return FieldFault(path, self.code, self.problem)
+
+    def below(self, *place: str | int) -> FieldFault:
+        """Return the same fault of a part of something larger."""
+        return self.at((*place, *self.path))
+
+
+class SpecError(ValueError):
+    """Something that a user wrote is refused.
+
+    Attributes:
+        faults: What is wrong; never empty.
+    """
+
+    def __init__(self, faults: Sequence[FieldFault]) -> None:
+        super().__init__("; ".join(map(str, faults)))
+        self.faults = tuple(faults)
+
+
+def join_path(path: Path) -> str:
+    """Write a path for people: ``data.addNodes[2].pkg``."""
+    text = ""
+    for step in path:
+        text += f"[{step}]" if isinstance(step, int) else f".{step}" if text else step
+    return text
