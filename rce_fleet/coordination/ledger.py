@@ -2,7 +2,7 @@
 
 A joint plan says at which step robots enter cells. Real robots keep no steps, so the plan is carried out
 by order: a robot is granted a cell only once every robot that uses the cell before it has left it. Robots
-never follow each other around in a circle, so one of them can always drive, however slow the others are.
+never follow each other in a circle, so one of them can always drive, however slow the others are.
 
 An operation costs what it changes, not what the ledger holds: cells know their owner and their queue, and the
 ledger notes what became possible (:meth:`CellLedger.take_freed`, :meth:`CellLedger.take_ripe`).
@@ -44,7 +44,7 @@ class _Account:
 
 
 class CellLedger:
-    """The books of claims and turns.
+    """The record of claims and turns.
 
     Invariants, checked by :meth:`validate`:
 
@@ -65,21 +65,21 @@ class CellLedger:
     # Reading
 
     def claims(self, robot: str) -> frozenset[int]:
-        """Cells that are the robot's now."""
+        """Return the cells that the robot claims."""
         account = self._accounts.get(robot)
         return frozenset(account.claims) if account else frozenset()
 
     def owner(self, cell: int) -> str | None:
-        """The robot that claims a cell."""
+        """Return the robot that claims a cell."""
         return self._owners.get(cell)
 
     def route(self, robot: str) -> list[int]:
-        """The robot's cell and all cells that it will enter."""
+        """Return the robot's cell and all cells that it will enter."""
         account = self._accounts.get(robot)
         return list(account.route) if account else []
 
     def granted(self, robot: str) -> list[int]:
-        """The robot's cell and the cells that it may enter now."""
+        """Return the robot's cell and the cells that it may enter now."""
         account = self._accounts.get(robot)
         return account.route[: account.granted] if account else []
 
@@ -140,7 +140,7 @@ class CellLedger:
         self._settle_owners(robot, account)
 
     def overlap(self, robot: str, cells: Iterable[int]) -> None:
-        """Claim for a robot without a place those cells that nobody else claims."""
+        """Claim cells for a robot without a cell; skip those that other robots claim."""
         account = self._account(robot)
         if account.route:
             raise InvariantError(f"{robot} has a place")
@@ -148,7 +148,7 @@ class CellLedger:
         self._settle_owners(robot, account)
 
     def remove(self, robot: str) -> None:
-        """Forget a robot; its cells are free."""
+        """Remove a robot; its cells are free."""
         account = self._account(robot)
         self._withdraw(robot, account)
         account.route, account.granted, account.extra = [], 0, frozenset()
@@ -159,7 +159,7 @@ class CellLedger:
     # Plans
 
     def truncate(self, robot: str) -> None:
-        """Drop what a robot was not yet granted."""
+        """Drop the cells of a route that are not granted yet."""
         account = self._account(robot)
         if account.granted == len(account.route):
             return
@@ -169,7 +169,7 @@ class CellLedger:
         self._changed.add(robot)
 
     def adopt(self, starts: Mapping[str, int], visits: Iterable[tuple[str, int]]) -> None:
-        """Take a new plan. It begins where the granted cells end; the rest of older plans is dropped.
+        """Set a new plan. It begins where the granted cells end; the rest of older plans is dropped.
 
         Args:
             starts: For every robot with a plan its last granted cell.

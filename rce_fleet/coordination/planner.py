@@ -5,11 +5,11 @@ meet. Cells are taken back only from a robot that has stopped: it is told to (``
 acknowledges, its poses stand still, and then it keeps the cells that it overlaps. While a robot is being
 stopped no robot is granted anything new; then one plan is made for all from the cells they are committed to.
 
-Plans are made elsewhere, as they take long: :class:`MakePlan` goes out, :class:`PlanMade` comes in. Nothing
-new is granted meanwhile either. If the fleet has changed by then, what is still possible of the plan is
-taken, so that robots get on however often things change, and the next plan is asked for.
+Plans take long and are computed elsewhere: :class:`MakePlan` goes out, :class:`PlanMade` comes in, and
+nothing new is granted meanwhile. If the fleet has changed by then, the part of the plan that is still
+possible is used, so that robots make progress however often things change, and the next plan is requested.
 
-An event costs what it changes: whatever depends on other robots is found by indexes.
+The cost of an event depends on what it changes: records that depend on other robots are found by indexes.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ if TYPE_CHECKING:
 
 
 class FleetPlanner:
-    """Steers a fleet over a grid.
+    """Plans for a fleet on a grid, and grants cells to its robots.
 
     Args:
         grid: The map; its blocked cells are walls and never freed.
         settings: Sizes and times.
-        first_revision: Lists of cells are numbered from here. Move clients may remember an earlier life
-            of the planner; whatever they report moves the numbers on.
+        first_revision: Number of the first list of cells. If move clients report higher numbers, from
+            before a restart of the planner, the next lists continue from those.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class FleetPlanner:
     # The outside
 
     def handle(self, event: Event, now: float) -> list[Instruction]:
-        """Take an event that happened at ``now`` (seconds, never going back) and say what to do."""
+        """Handle an event at time ``now`` (seconds, monotonic); return the instructions."""
         dispatcher = self._dispatcher
         self._now = dispatcher.now = now
         dispatcher.out = []
@@ -96,7 +96,7 @@ class FleetPlanner:
         return dispatcher.out
 
     def snapshot(self) -> FleetSnapshot:
-        """The state as the outside sees it."""
+        """Return the state for publishing."""
         return self.state.snapshot()
 
     def take_changes(self) -> FleetChanges | None:
@@ -109,10 +109,10 @@ class FleetPlanner:
         return self.state.log.sequence
 
     def validate(self) -> None:
-        """Check the books, and that nothing is left undone that has become possible.
+        """Check that the records are consistent, and that everything possible was done.
 
         Raises:
-            InvariantError: They contradict each other, or something is undone.
+            InvariantError: Records contradict each other, or something was not done.
         """
         self.state.validate()
         self._dispatcher.validate()
@@ -150,7 +150,7 @@ class FleetPlanner:
             self._dispatcher.hold(record, "its move client knows an earlier planner")
         elif known is not None and report.revision < known.revision:
             if record.phase is Phase.ACTIVE:
-                self._dispatcher.hold(record, "its move client was started again")
+                self._dispatcher.hold(record, "its move client was restarted")
             self._deadlines.hasten(record.id, self._now)
 
     def _look_soon_if_silent(self, record: RobotRecord) -> None:
@@ -161,21 +161,21 @@ class FleetPlanner:
         for cell in event.cells:
             owner = self.state.ledger.owner(cell) if cell in self.state.grid else None
             standing = cell in self.state.ledger.route(event.robot)[:1]
-            # Cells of other robots are theirs: what was seen there was a robot.
+            # In cells of other robots the sensor has seen these robots.
             if cell in self.state.grid and owner in (None, event.robot) and not standing:
                 self._shut(cell)
 
     def _follow(self, record: RobotRecord) -> None:
-        """See how far an active robot has come."""
+        """Update the progress of an active robot."""
         if not self._dispatcher.arrive(record):
             here = self.state.grid.cell_at(record.x, record.y)
             if here not in self.state.ledger.claims(record.id):
-                record.rest = None  # It was carried away: it rests where it was put.
+                record.rest = None  # It was carried away: it stays where it was put.
                 self._dispatcher.hold(record, "it left its path")
                 self._make_room(record)
 
     def _watch_newcomer(self, record: RobotRecord) -> None:
-        """Keep the others away from a robot that has no cell yet."""
+        """Stop robots whose cells a robot without a cell overlaps."""
         before = self.state.ledger.claims(record.id)
         self.state.ledger.overlap(record.id, self._dispatcher.touched(record))
         if self.state.ledger.claims(record.id) != before:
@@ -183,7 +183,7 @@ class FleetPlanner:
         self._make_room(record)
 
     def _make_room(self, record: RobotRecord) -> None:
-        """Stop those that were granted cells which a robot overlaps without owning them."""
+        """Stop robots that were granted cells which another robot overlaps."""
         for cell in self._dispatcher.touched(record):
             owner = self.state.ledger.owner(cell)
             other = self.state.robots.get(owner) if owner is not None else None
@@ -197,7 +197,7 @@ class FleetPlanner:
     def _set_goal(self, event: GoalSet) -> Reply:
         record = self.state.robots.get(event.robot)
         if record is None:
-            return Reply(False, f"there is no robot {event.robot}")
+            return Reply(False, f"robot {event.robot} is unknown")
         if event.cell is not None:
             refusal = refuse_goal(self.state, record, event.cell)
             if refusal:
@@ -240,16 +240,16 @@ class FleetPlanner:
 
     def _remove_robot(self, event: RobotRemoved) -> Reply:
         if event.robot not in self.state.robots:
-            return Reply(False, f"there is no robot {event.robot}")
-        # Messages that are under way must not bring it back.
+            return Reply(False, f"robot {event.robot} is unknown")
+        # Messages that are still on the way must not add it again.
         self._deaf_until[event.robot] = self._now + self.settings.silence_timeout
         self._deadlines.forget(event.robot)
         self.state.remove(event.robot)
         self._dispatcher.outdated = True
-        return Reply(True, f"{event.robot} is gone")
+        return Reply(True, f"{event.robot} was removed")
 
     def _shut(self, cell: int) -> None:
-        """Block a cell as soon as no robot claims it; stop those whose paths lead through it."""
+        """Block a cell once no robot claims it; stop robots whose paths lead through it."""
         state = self.state
         if state.is_shut(cell):
             return
@@ -271,12 +271,12 @@ class FleetPlanner:
             self._deadlines.set(robot, self._due(record))
 
     def _look_at(self, record: RobotRecord) -> None:
-        """Do what time alone brings about."""
+        """Handle timeouts of one robot."""
         heard = record.heard(self._now, self.settings)
         if record.phase is Phase.SILENT:
             if heard:
-                self.state.change(record, Cause.HEARD, "it is back")
-                self._dispatcher.hold(record, "it is back")
+                self.state.change(record, Cause.HEARD, "it is heard again")
+                self._dispatcher.hold(record, "it is heard again")
         elif not heard:
             self._lose(record)
         elif record.phase is Phase.ACTIVE and self._stalled(record):
@@ -285,10 +285,10 @@ class FleetPlanner:
             self._repeat(record)
 
     def _due(self, record: RobotRecord) -> float:
-        """When a robot has to be looked at next, if nothing is heard of it and nothing sent to it until then.
+        """Return when to check a robot next, if no message from it or to it comes before.
 
-        What is sent later has to be repeated later too, so it is enough to look at a robot every
-        ``repeat_after`` seconds.
+        A message that is sent later is also repeated later, so a check every ``repeat_after`` seconds is
+        enough.
         """
         if record.phase is Phase.SILENT:
             return inf
@@ -303,27 +303,27 @@ class FleetPlanner:
 
     def _lose(self, record: RobotRecord) -> None:
         robot_first = record.posed_at < record.reported_at
-        reason = "the robot is not heard" if robot_first else "its move client is not heard"
+        reason = "the robot sends no poses" if robot_first else "its move client sends no reports"
         self.state.change(record, Cause.LOST, reason)
         self.state.ledger.truncate(record.id)
         self._dispatcher.outdated = True
 
     def _is_busy(self, record: RobotRecord) -> bool:
-        """Whether a robot has cells to drive to."""
+        """Return whether a robot has cells to drive to."""
         granted = self.state.ledger.granted(record.id)
         return record.phase is Phase.ACTIVE and (len(granted) > 1 or not record.centred)
 
     def _stalled(self, record: RobotRecord) -> bool:
-        """Whether a robot has had cells to drive to for long, and has not moved."""
+        """Return whether a robot has had cells to drive to for long and has not moved."""
         since = max(record.still_since(), record.sent_at)
         return self._is_busy(record) and self._now - since > self.settings.stall_timeout
 
     def _is_unconfirmed(self, record: RobotRecord) -> bool:
-        """Whether a move client has not said that it has the last list."""
+        """Return whether a move client has not acknowledged the last list."""
         return record.report is None or record.report.revision != record.revision
 
     def _repeat(self, record: RobotRecord) -> None:
-        """Say again what did not get through."""
+        """Send unacknowledged messages again."""
         if not self._is_unconfirmed(record):
             return
         if record.phase is Phase.HOLDING:
@@ -335,7 +335,7 @@ class FleetPlanner:
     # Small things
 
     def _gone(self, robot: str) -> bool:
-        """Whether a robot was removed just now."""
+        """Return whether a robot was removed recently."""
         return self._now < self._deaf_until.get(robot, self._now)
 
     def _record(self, robot: str) -> RobotRecord:

@@ -1,4 +1,4 @@
-"""Where every robot shall end up: at its goal, or somewhere out of the way."""
+"""The target of each robot in a plan: its goal, or a cell out of the way."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ def assign_targets(
 
     Args:
         grid: The map. Robots may stand in blocked cells; no robot can enter one.
-        starts: Where the robots are.
-        goals: Where some of them are sent, all different.
-        rests: Where those rest that have no goal; the start by default.
+        starts: Cells of the robots.
+        goals: Goals of some robots, all different.
+        rests: Cells where robots without a goal rest; the start by default.
     """
     cells: dict[str, int] = {}
     unreachable = set()
@@ -57,14 +57,14 @@ def assign_targets(
 
 
 class _Reach:
-    """Cells that can be reached; what is connected is searched once."""
+    """Cells that can be reached from a start; each connected part is searched once."""
 
     def __init__(self, grid: GridMap) -> None:
         self._grid = grid
         self._known: dict[int, set[int]] = {}
 
     def of(self, start: int) -> set[int]:
-        """Cells that can be reached from ``start``, with ``start`` itself."""
+        """Return the cells that can be reached from ``start``, with ``start`` itself."""
         found = self._known.get(start)
         if found is None:
             found = self._grid.reachable(start)
@@ -74,7 +74,7 @@ class _Reach:
 
 
 def _refuge(grid: GridMap, within: set[int], start: int, rest: int, taken: set[int]) -> int:
-    """The place of rest, or else the free cell nearest to it that can be reached and is no robot's target."""
+    """Return the cell of rest, or the nearest free cell that can be reached and is not a target."""
     seen = {rest}
     queue = deque(seen)
     while queue:

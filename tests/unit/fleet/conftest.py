@@ -99,7 +99,7 @@ class MakeBelieveRobot:
         return ended
 
 
-class MakeBelieveFleet:
+class SimulatedClients:
     """Runs planner, clients and robots in steps of 0.1 s. Messages are late, out of order and get lost.
 
     After every step it checks that each robot is within its claims, that no two touch, that none touches a
@@ -332,6 +332,6 @@ def without_poses(snapshot: FleetSnapshot) -> FleetSnapshot:
 
 
 @pytest.fixture
-def make_fleet() -> type[MakeBelieveFleet]:
+def make_fleet() -> type[SimulatedClients]:
     """Makes fleets of make-believe robots."""
-    return MakeBelieveFleet
+    return SimulatedClients

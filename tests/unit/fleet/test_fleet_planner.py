@@ -28,10 +28,10 @@ from rce_fleet.exceptions import TransitionError
 from rce_fleet.planning.grid import GridMap
 
 if TYPE_CHECKING:
-    from unit.fleet.conftest import MakeBelieveFleet
+    from unit.fleet.conftest import SimulatedClients
 
 
-def robot(fleet: MakeBelieveFleet, number: int = 1) -> RobotSnapshot:
+def robot(fleet: SimulatedClients, number: int = 1) -> RobotSnapshot:
     return fleet.planner.snapshot().robots[number - 1]
 
 
@@ -40,14 +40,14 @@ class Make(Protocol):
 
     def __call__(
         self, grid: GridMap, starts: list[int], goals: list[int] | None = None
-    ) -> MakeBelieveFleet: ...
+    ) -> SimulatedClients: ...
 
 
 @pytest.fixture
-def make(make_fleet: type[MakeBelieveFleet]) -> Make:
+def make(make_fleet: type[SimulatedClients]) -> Make:
     """Makes a fleet whose robots have joined, on a network that loses nothing."""
 
-    def of(grid: GridMap, starts: list[int], goals: list[int] | None = None) -> MakeBelieveFleet:
+    def of(grid: GridMap, starts: list[int], goals: list[int] | None = None) -> SimulatedClients:
         fleet = make_fleet(FleetPlanner(grid), starts, 1, loss=0.0)
         fleet.send(goals or [])
         return fleet
@@ -175,7 +175,7 @@ def test_silent_robot_keeps_its_cells_others_drive_around(make: Make) -> None:
     fleet = make(GridMap(3, 5), [7, 5])
     fleet.silent = {"Robot1"}
     fleet.run(lambda: robot(fleet).state is RobotState.SILENT)
-    assert "not heard" in robot(fleet).reason
+    assert "sends no poses" in robot(fleet).reason
     fleet.ask(GoalSet("Robot2", 9))
     fleet.run(lambda: robot(fleet, 2).state is RobotState.ARRIVED)
     assert robot(fleet).granted == (7,)
@@ -198,7 +198,7 @@ def test_a_new_robot_on_the_way_is_driven_around(make: Make) -> None:
     assert robot(fleet, 2).cell == 14
 
 
-def test_robot_in_a_blocked_cell_reports_why_it_cannot_join(make_fleet: type[MakeBelieveFleet]) -> None:
+def test_robot_in_a_blocked_cell_reports_why_it_cannot_join(make_fleet: type[SimulatedClients]) -> None:
     fleet = make_fleet(FleetPlanner(GridMap()), [], 1, loss=0.0)
     fleet.ask(CellBlocked(9))
     fleet.blocked = set()
@@ -268,7 +268,7 @@ def test_a_removed_robot_leaves_its_cells(make: Make) -> None:
 @pytest.mark.parametrize(
     ("event", "words"),
     [
-        (GoalSet("Nobody", 3), "no robot Nobody"),
+        (GoalSet("Nobody", 3), "robot Nobody is unknown"),
         (GoalSet("Robot1", 64), "not on the map"),
         (GoalSet("Robot1", 10), "is blocked"),
         (GoalSet("Robot1", 12), "is blocked"),
@@ -277,7 +277,7 @@ def test_a_removed_robot_leaves_its_cells(make: Make) -> None:
         (CellBlocked(10), "is a wall"),
         (CellFreed(10), "is a wall"),
         (CellFreed(99), "not on the map"),
-        (RobotRemoved("Nobody"), "no robot Nobody"),
+        (RobotRemoved("Nobody"), "robot Nobody is unknown"),
     ],
 )
 def test_invalid_request_is_refused_with_a_reason(make: Make, event: Event, words: str) -> None:

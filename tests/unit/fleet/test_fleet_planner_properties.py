@@ -17,7 +17,7 @@ from rce_fleet.planning.movingai import read_map, read_scenario
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from unit.fleet.conftest import MakeBelieveFleet
+    from unit.fleet.conftest import SimulatedClients
 
 
 def connected_map(rng: Random, boxes: int) -> GridMap:
@@ -30,7 +30,7 @@ def connected_map(rng: Random, boxes: int) -> GridMap:
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32), count=st.integers(1, 8))
 def test_every_robot_arrives_within_its_own_cells(
-    make_fleet: type[MakeBelieveFleet], seed: int, count: int
+    make_fleet: type[SimulatedClients], seed: int, count: int
 ) -> None:
     rng = Random(seed)
     grid = connected_map(rng, 3)
@@ -58,7 +58,7 @@ def test_every_robot_arrives_within_its_own_cells(
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32), count=st.integers(1, 8))
 def test_indexes_equal_a_recomputation_whatever_happens(
-    make_fleet: type[MakeBelieveFleet], seed: int, count: int
+    make_fleet: type[SimulatedClients], seed: int, count: int
 ) -> None:
     """After each step ``validate`` makes the indexes from scratch, and looks for what was left undone."""
     rng = Random(seed)
@@ -78,7 +78,7 @@ def test_indexes_equal_a_recomputation_whatever_happens(
         fleet.run(fleet.all_arrived)
 
 
-def disturb(fleet: MakeBelieveFleet, rng: Random) -> None:
+def disturb(fleet: SimulatedClients, rng: Random) -> None:
     """Let something happen, mostly nothing."""
     robots = sorted(fleet.robots)
     what = rng.randrange(100)
@@ -106,7 +106,7 @@ def disturb(fleet: MakeBelieveFleet, rng: Random) -> None:
 @pytest.mark.needs("data")
 @pytest.mark.parametrize("count", [4, 20])
 def test_robots_drive_on_a_benchmark_map(
-    make_fleet: type[MakeBelieveFleet], rce_data: Path, count: int
+    make_fleet: type[SimulatedClients], rce_data: Path, count: int
 ) -> None:
     grid = read_map(rce_data / "maps" / "random-32-32-20.map")
     rows = read_scenario(rce_data / "maps" / "random-32-32-20-random-1.scen", grid, limit=count)
