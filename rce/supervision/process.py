@@ -8,7 +8,7 @@ import ctypes
 import os
 import signal
 import sys
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
 from functools import partial
 from typing import Final, Protocol
 
@@ -123,11 +123,3 @@ class Child:
     def _signal(self, number: signal.Signals) -> None:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.pid, number)
-
-
-async def relay(child: Child, show: Callable[[str], None], ready: asyncio.Event | None = None) -> None:
-    """Show a child's lines; set ``ready`` at its first line that says so."""
-    async for line in child.lines():
-        show(f"[{child.name}] {line}")
-        if ready is not None and " ready: " in line:
-            ready.set()

@@ -7,18 +7,14 @@ from collections.abc import Callable, Coroutine, Mapping, Sequence
 from typing import Any
 
 from rce.aio.backoff import Backoff
-from rce.aio.tasks import cancel_and_wait
 from rce.supervision.final import FinalCommand
+from rce.supervision.keeper import Keeper, RestartPolicy
 from rce.supervision.prefork import ForkedProcess, Prepared
-from rce.supervision.process import Child, relay
+from rce.supervision.process import Child
 from rce.supervision.program import Program
 
-RESTARTS = Backoff(first=0.2, longest=5.0)
-"""Pauses before a program that ended is started again."""
-STABLE_AFTER_S = 10.0
+RESTARTS = RestartPolicy(Backoff(first=0.2, longest=5.0), stable_s=10.0)
 READY_TIMEOUT_S = 60.0
-OUTPUT_TIMEOUT_S = 1.0
-"""How long the output of an ended program is read on; something that it started may hold it open."""
 
 
 class StartError(Exception):
@@ -43,13 +39,13 @@ class Supervisor:
         self._programs = programs
         self._show = show
         self._prepared = dict(prepared or {})
-        self._children: dict[str, Child] = {}
-        """The last process of each program, by name."""
+        self._keepers: dict[str, Keeper] = {}
+        """By the program's name."""
         self._finals: dict[str, FinalCommand] = {}
 
     def hurry(self) -> None:
         """Pass on to the programs that the user wants the end at once."""
-        for child in self._children.values():
+        for child in self._children():
             child.hurry()
 
     async def run(self, on_ready: Callable[[], None]) -> None:
@@ -75,6 +71,10 @@ class Supervisor:
         finally:
             await _to_its_end(self._end_finally())
 
+    def _children(self) -> list[Child]:
+        """Return the last process of each program."""
+        return [keeper.child for keeper in self._keepers.values() if keeper.child is not None]
+
     async def _until_ready(self, program: Program, ready: asyncio.Event) -> None:
         try:
             async with asyncio.timeout(READY_TIMEOUT_S):
@@ -91,7 +91,7 @@ class Supervisor:
 
         One may have been killed before, and the next have ended before it removed what the first one left.
         """
-        is_clean = not any(child.returncode for child in self._children.values())
+        is_clean = not any(child.returncode for child in self._children())
         for name, final in self._finals.items():
             if is_clean:
                 await final.disarm()
@@ -99,29 +99,20 @@ class Supervisor:
                 self._show(f"[up] what {name} left could not be removed: exit code {code}")
 
     async def _keep(self, program: Program, ready: asyncio.Event) -> None:
-        loop = asyncio.get_running_loop()
-        pauses = RESTARTS.start()
-        while True:
-            started = loop.time()
-            code = await self._run_once(program, ready)
+        def take_line(line: str) -> None:
+            self._show(f"[{program.name}] {line}")
+            if " ready: " in line:
+                ready.set()
+
+        def on_end(code: int, pause: float | None) -> bool:
             if not ready.is_set():
                 raise StartError(f"{program.name} ended with exit code {code} before it was ready")
-            if loop.time() - started > STABLE_AFTER_S:
-                pauses.reset()
-            delay = pauses.next()
-            self._show(f"[up] {program.name} ended with exit code {code}; starting it again in {delay:.1f} s")
-            await asyncio.sleep(delay)
+            assert pause is not None, "the policy has no last end"
+            self._show(f"[up] {program.name} ended with exit code {code}; starting it again in {pause:.1f} s")
+            return True
 
-    async def _run_once(self, program: Program, ready: asyncio.Event) -> int:
-        child = await self._start(program)
-        self._children[program.name] = child
-        reader = asyncio.create_task(relay(child, self._show, ready))
-        try:
-            return await child.wait()
-        finally:
-            await child.stop()
-            await asyncio.wait([reader], timeout=OUTPUT_TIMEOUT_S)
-            await cancel_and_wait(reader)
+        keeper = self._keepers[program.name] = Keeper(lambda: self._start(program), take_line, RESTARTS)
+        await keeper.run(on_end)
 
     async def _start(self, program: Program) -> Child:
         prepared = self._prepared.pop(program.name, None)

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import sys
 from collections import deque
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, TypeAlias, TypeVar
+from typing import Any, Self, TypeVar
 
+from rce.aio.backoff import Backoff
+from rce.aio.tasks import cancel_and_wait
+from rce.supervision.keeper import Keeper, RestartPolicy
 from rce.supervision.process import Child
 from rce_fleet.demo.exceptions import NotReadyError, ProgramEndedError, describe_exit
 
@@ -21,53 +25,55 @@ TAIL_LINES = 25
 """How many of a program's last lines an error shows."""
 STOP_TIMEOUT = 15.0
 LAST_STOP_TIMEOUT = 90.0
-DRAIN_TIMEOUT = 1.0
-"""Seconds to read the rest of an ended program's output; its own children may keep the pipe open."""
-
-MIN_UPTIME = 10.0
-"""A program that ran this long started well: its count of early exits begins again."""
-MAX_EARLY_EXITS = 5
-MIN_RESTART_DELAY, MAX_RESTART_DELAY = 0.5, 5.0
-"""Seconds before the first and, after doubling each time, before any later restart."""
+RESTARTS = RestartPolicy(Backoff(first=0.5, longest=5.0), stable_s=10.0, max_ends=5)
 
 T = TypeVar("T")
-StartAgain: TypeAlias = Callable[[], Coroutine[Any, Any, Child]]
-"""Starts a program's process once more."""
 
 
 class Program:
     """A program of the demo.
 
     Attributes:
-        child: Its process; a new one after each restart.
         stop_last: Other programs need it while they stop: it is stopped after them.
         restartable: It can be restarted while the others run.
-        early_exits: How often in a row it ended soon after its start.
+        tail: The last lines that it printed.
     """
 
     def __init__(
-        self, child: Child, log: Path, start_again: StartAgain, *, stop_last: bool, restartable: bool
+        self,
+        name: str,
+        begin: Callable[[], Awaitable[Child]],
+        show: Callable[[str], None],
+        *,
+        stop_last: bool,
+        restartable: bool,
     ) -> None:
-        self.child = child
-        self.log = log
-        self.start_again = start_again
+        self.name = name
         self.stop_last = stop_last
         self.restartable = restartable
-        self.early_exits = 0
         self.tail: deque[str] = deque(maxlen=TAIL_LINES)
-        self.lines: deque[str] = deque(maxlen=1000)
+        self.keeper = Keeper(begin, self.add_line, RESTARTS)
+        self._lines: deque[str] = deque(maxlen=1000)
         self._printed = asyncio.Event()
+        self._show = show
+
+    @property
+    def child(self) -> Child:
+        """Its process; a new one after each restart."""
+        assert self.keeper.child is not None, "it is started when it is made"
+        return self.keeper.child
 
     def add_line(self, line: str) -> None:
         """Add a line that it printed."""
         self.tail.append(line)
-        self.lines.append(line)
+        self._lines.append(line)
+        self._show(line)
         self._printed.set()
 
     async def wait_line(self, start: str) -> str:
         """Wait for a line that begins with ``start``; return the rest of the line."""
         while True:
-            for line in self.lines:
+            for line in self._lines:
                 if line.startswith(start):
                     return line[len(start) :].strip()
             self._printed.clear()
@@ -129,14 +135,21 @@ class ProgramGroup:
             stop_last: Other programs need it while they stop: stop it after them.
             restartable: It can be restarted while the others run; see :meth:`enable_restarts`.
         """
+        log = (self._folder / f"{name}.log").open("a", encoding="utf-8", buffering=1)
 
-        async def start_again() -> Child:
+        def show(line: str) -> None:
+            log.write(f"{line}\n")
+            self._show(f"[{name}] {line}")
+
+        async def begin() -> Child:
             return await Child.start(name, argv, env=env)
 
-        log = self._folder / f"{name}.log"
-        program = Program(await start_again(), log, start_again, stop_last=stop_last, restartable=restartable)
-        self._programs.append(program)
-        self._readers.create_task(self._supervise(program), name=f"output of {name}")
+        program = Program(name, begin, show, stop_last=stop_last, restartable=restartable)
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(log)
+            await program.keeper.start()
+            self._programs.append(program)
+            self._readers.create_task(self._supervise(program, stack.pop_all()), name=f"output of {name}")
         return program
 
     async def wait_line(self, program: Program, start: str, timeout: float) -> str:
@@ -150,9 +163,7 @@ class ProgramGroup:
                 return await program.wait_line(start)
         except TimeoutError:
             printed = "".join(f"\n    {line}" for line in program.tail)
-            raise NotReadyError(
-                f"{program.child.name} was not ready within {timeout:.0f} s{printed}"
-            ) from None
+            raise NotReadyError(f"{program.name} was not ready within {timeout:.0f} s{printed}") from None
 
     async def run_while_alive(self, work: Coroutine[Any, Any, T]) -> T:
         """Run ``work`` and return its result, as long as all programs run or are restarted.
@@ -164,71 +175,35 @@ class ProgramGroup:
         try:
             await asyncio.wait((task, self._failure), return_when=asyncio.FIRST_COMPLETED)
         finally:
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
+            await cancel_and_wait(task)
         if self._failure.done():
             raise self._failure.result()
         return task.result()
 
-    async def _supervise(self, program: Program) -> None:
+    async def _supervise(self, program: Program, log: contextlib.ExitStack) -> None:
         """Log a program's output, and restart it if enabled."""
-        while True:
-            code = await self._watch(program)
-            if not await self._restart(program, code):
-                if not self._stopping.done() and not self._failure.done():
-                    self._failure.set_result(ProgramEndedError(program.child.name, code, program.tail))
-                return
 
-    async def _restart(self, program: Program, code: int) -> bool:
-        """Restart a program that ended; return False if it must not or cannot be restarted."""
-        over = self._stopping.done() or self._failure.done()
-        if (
-            over
-            or self._report_restart is None
-            or not program.restartable
-            or program.early_exits >= MAX_EARLY_EXITS
-        ):
-            return False
-        delay = min(MAX_RESTART_DELAY, MIN_RESTART_DELAY * 2 ** (program.early_exits - 1))
-        self._report_restart(f"{program.child.name} {describe_exit(code)}; restarting it")
-        await asyncio.wait((self._stopping,), timeout=delay)
-        if self._stopping.done():
-            return False
-        try:
-            program.child = await program.start_again()
-        except OSError as error:
-            program.add_line(str(error))
-            return False
-        if self._stopping.done():
-            await program.child.stop(timeout=STOP_TIMEOUT)
-        return True
+        def on_end(code: int, pause: float | None) -> bool:
+            report = self._report_restart
+            if self._failure.done() or report is None or not program.restartable or pause is None:
+                return False
+            report(f"{program.name} {describe_exit(code)}; restarting it")
+            return True
 
-    async def _watch(self, program: Program) -> int:
-        """Log what a program prints until it ends; return its exit code."""
-        child, started = program.child, asyncio.get_running_loop().time()
-        reading = asyncio.create_task(self._log(program))
-        try:
-            code = await child.wait()
-            await asyncio.wait((reading,), timeout=DRAIN_TIMEOUT)
-        finally:
-            reading.cancel()
-            await asyncio.gather(reading, return_exceptions=True)
-        uptime = asyncio.get_running_loop().time() - started
-        program.early_exits = program.early_exits + 1 if uptime < MIN_UPTIME else 1
-        return code
-
-    async def _log(self, program: Program) -> None:
-        with program.log.open("a", encoding="utf-8", buffering=1) as log:
-            async for line in program.child.lines():
-                log.write(f"{line}\n")
-                program.add_line(line)
-                self._show(f"[{program.child.name}] {line}")
+        with log:
+            try:
+                code = await program.keeper.run(on_end)
+            except OSError as error:  # it cannot be restarted
+                program.add_line(str(error))
+                code = program.child.returncode or 0
+        if not self._stopping.done() and not self._failure.done():
+            self._failure.set_result(ProgramEndedError(program.name, code, program.tail))
 
     async def _stop_all(self) -> None:
         async with asyncio.TaskGroup() as stops:
             for program in self._programs:
                 if not program.stop_last:
-                    stops.create_task(program.child.stop(timeout=STOP_TIMEOUT))
+                    stops.create_task(program.keeper.stop(timeout=STOP_TIMEOUT))
         for program in reversed(self._programs):
             if program.stop_last:
-                await program.child.stop(timeout=LAST_STOP_TIMEOUT)
+                await program.keeper.stop(timeout=LAST_STOP_TIMEOUT)

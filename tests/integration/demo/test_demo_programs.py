@@ -12,6 +12,8 @@ from pathlib import Path
 import psutil
 import pytest
 
+from rce.aio.backoff import Backoff
+from rce.supervision.keeper import RestartPolicy
 from rce_fleet.demo import programs as programs_module
 from rce_fleet.demo.exceptions import DemoError, NotReadyError, ProgramEndedError
 from rce_fleet.demo.programs import ProgramGroup
@@ -76,20 +78,21 @@ async def test_restartable_program_is_restarted(tmp_path: Path) -> None:
 async def test_program_that_keeps_ending_is_not_restarted_forever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(programs_module, "MIN_RESTART_DELAY", 0.01)
+    quick = RestartPolicy(Backoff(0.01, 0.01), stable_s=10, max_ends=5)
+    monkeypatch.setattr(programs_module, "RESTARTS", quick)
     told: list[str] = []
     async with ProgramGroup(tmp_path, ignore) as group:
         group.enable_restarts(told.append)
         await group.start("dying", python(DYING), restartable=True)
         with pytest.raises(ProgramEndedError, match="dying ended with exit code 3"):
             await asyncio.wait_for(group.run_while_alive(for_ever()), 30)
-    assert len(told) == programs_module.MAX_EARLY_EXITS - 1
+    assert len(told) == quick.max_ends - 1
 
 
 async def test_no_program_is_restarted_while_the_group_stops(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(programs_module, "MIN_RESTART_DELAY", 100.0)
+    monkeypatch.setattr(programs_module, "RESTARTS", RestartPolicy(Backoff(100.0, 100.0), stable_s=10))
     told = asyncio.Event()
     async with ProgramGroup(tmp_path, ignore) as group:
         group.enable_restarts(lambda _: told.set())
@@ -158,7 +161,7 @@ async def test_stop_last_programs_are_stopped_last(tmp_path: Path) -> None:
         for name, stop_last in (("network", True), ("core", True), ("node", False)):
             program = await group.start(name, python(leaving), stop_last=stop_last)
             await group.wait_line(program, "up", 20)
-            stop = program.child.stop
+            stop = program.keeper.stop
 
             async def noted(
                 name: str = name, stop: Callable[..., Awaitable[None]] = stop, **options: float
@@ -166,5 +169,5 @@ async def test_stop_last_programs_are_stopped_last(tmp_path: Path) -> None:
                 await stop(**options)
                 ended.append(name)
 
-            program.child.stop = noted  # type: ignore[method-assign]  # to see when it is called
+            program.keeper.stop = noted  # type: ignore[method-assign]  # to see when it is called
     assert ended == ["node", "core", "network"]
