@@ -19,9 +19,8 @@ from msgspec import Struct, field
 
 from rce.model.names import EndpointId
 from rce_container.exceptions import StateError
+from rce_container.files import remove, size_of, write_whole
 from rce_container.logs import last_line
-from rce_container.trees import remove, size_of
-from rce_container.writing import write_whole
 
 _log = logging.getLogger(__name__)
 

@@ -24,8 +24,7 @@ from msgspec import Struct, field
 from rce_container.archive import LOG_DAYS, LOG_SPACE, LogArchive
 from rce_container.environment import proc
 from rce_container.exceptions import StateBusyError, StateError
-from rce_container.trees import remove
-from rce_container.writing import write_whole
+from rce_container.files import remove, write_whole
 
 _INCARNATION_ID = re.compile(r"[0-9a-f]{12}")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,127}")

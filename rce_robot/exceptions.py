@@ -3,9 +3,11 @@
 ::
 
     RobotError
-    +-- UnreadableError    a data message is not what its interface carries
-    +-- MisdirectedError   a data message is for no interface, or for one that takes none
-    +-- BusyError          too much waits already
+    +-- UnreadableError        a data message is not what its interface carries
+    |   +-- ConversionError    a JSON value does not fit the message type, or bytes are not a message of it
+    +-- MisdirectedError       a data message is for no interface, or for one that takes none
+    +-- BusyError              too much waits already
+    +-- ConversionFailedError  another process took too long or too much for a conversion, or too many wait
 """
 
 from __future__ import annotations
@@ -19,9 +21,31 @@ class UnreadableError(RobotError):
     """A data message is not what its interface carries."""
 
 
+class ConversionError(UnreadableError, ValueError):
+    """A message cannot be converted; the text is fit for an ``ER``.
+
+    Attributes:
+        field: Path of the faulty field, such as ``header.seq`` or ``poses[2].position.x``; the type's name
+            where the fault is of the whole message.
+        reason: What is wrong with it.
+    """
+
+    def __init__(self, field: str, reason: str) -> None:
+        super().__init__(field, reason)
+        self.field = field
+        self.reason = reason
+
+    def __str__(self) -> str:
+        return f"{self.field}: {self.reason}"
+
+
 class MisdirectedError(RobotError):
     """A data message is for no interface, for one of another class, or for one that only sends."""
 
 
 class BusyError(RobotError):
     """Too much waits already."""
+
+
+class ConversionFailedError(RobotError):
+    """A conversion was given up; the text is fit for an ``ER``."""

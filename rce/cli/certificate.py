@@ -8,7 +8,7 @@ from typing import Annotated, TypeVar
 
 import typer
 
-from rce.cli.tls_options import Certificates
+from rce.cli.options import Certificates
 from rce.tls.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS, RENEWAL_DAYS, Details
 from rce.tls.choice import default_folder
 from rce.tls.exceptions import CertificateError

@@ -14,8 +14,7 @@ from rce.cli.settings import SettingsOptions
 from rce.config.fields import SettingError, fields_of
 from rce.config.loading import as_document
 from rce.config.settings import LOOPBACK, EngineSettings, MasterSettings
-from rce.supervision.plan import Plan
-from rce.supervision.program import Program
+from rce.supervision.plan import Plan, Program
 from rce.tls.choice import WARNED_VARIABLE, plain_warning
 
 OPTIONS = SettingsOptions(

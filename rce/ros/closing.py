@@ -1,10 +1,13 @@
-"""Closing many connections in an orderly way."""
+"""Giving back in order what was taken: handles of a node, and many connections at once."""
 
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Iterable
 from typing import Protocol
+
+from rce.ros.errors import MasterError
 
 CLOSE_TIMEOUT = 1.0
 """Seconds that peers get to take what was written before their connections are cut."""
@@ -37,3 +40,21 @@ async def close_all(connections: Iterable[Closable]) -> None:
             connection.abort()
         for connection in pending:
             await connection.gone.wait()
+
+
+_log = logging.getLogger(__name__)
+
+
+class Handle(Protocol):
+    """A publisher, subscriber or service of a node."""
+
+    async def close(self) -> None:
+        """Give it back."""
+
+
+async def release(handle: Handle) -> None:
+    """Close a handle at the end of a block; that the master cannot be told any more is not worth an error."""
+    try:
+        await handle.close()
+    except MasterError as error:
+        _log.info("closed without telling the master: %s", error)

@@ -24,7 +24,7 @@ from rce.supervision.title import set_title
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from rce.supervision.program import Program
+    from rce.supervision.plan import Program
 
 _READY = b"\n"
 _GO = b"g"

@@ -9,9 +9,9 @@ from typing import Any
 from rce.aio.backoff import Backoff
 from rce.supervision.final import FinalCommand
 from rce.supervision.keeper import Keeper, RestartPolicy
+from rce.supervision.plan import Program
 from rce.supervision.prefork import ForkedProcess, Prepared
 from rce.supervision.process import Child
-from rce.supervision.program import Program
 
 RESTARTS = RestartPolicy(Backoff(first=0.2, longest=5.0), stable_s=10.0)
 READY_TIMEOUT_S = 60.0

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 import uvloop
 
+from rce.cli.options import Authority
 from rce.cli.streams import open_missing_streams
-from rce.cli.tls_options import Authority
 from rce.config.documents import read_file
 from rce.config.exceptions import ConfigError, ShippedFileError
 from rce.config.logs import start_logging

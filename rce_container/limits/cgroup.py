@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import ClassVar
 
 from rce_container.exceptions import KillError, LimitError
+from rce_container.files import write_whole
 from rce_container.limits import files, hierarchy
 from rce_container.limits.base import ControlGroup, Limiter, Limits, in_megabytes
 from rce_container.limits.rlimit import rlimits_of
-from rce_container.writing import write_whole
 
 PERIOD_US = 100_000
 """A CPU limit holds over each period of this length."""

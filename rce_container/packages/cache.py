@@ -22,10 +22,10 @@ from rce.packages.exceptions import ArchiveError
 from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
 from rce.packages.signing import statement, verify
 from rce.packages.unpacking import unpack
+from rce_container.files import remove, size_of
 from rce_container.packages.disk import forget_before_boot, in_thread, scratch_aside
 from rce_container.packages.exceptions import FetchError, NoSpaceError, PackageTroubleError, VerificationError
 from rce_container.packages.locks import Locks
-from rce_container.trees import remove, size_of
 
 Fetch = Callable[[str, int], Awaitable[Piece]]
 """Fetches the piece of a content, by its hash, that begins at an offset; raises :class:`ContentError`."""

@@ -11,7 +11,7 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
-from rce_container.trees import remove
+from rce_container.files import remove
 
 P = ParamSpec("P")
 R = TypeVar("R")

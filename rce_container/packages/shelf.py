@@ -6,8 +6,8 @@ from collections.abc import Collection
 from pathlib import Path
 
 from rce_container.environment.user_packages import REQUIREMENTS
+from rce_container.files import remove
 from rce_container.packages.disk import replicate, scratch
-from rce_container.trees import remove
 
 KEPT = 8
 """How many packages that no node names any more stay: a node that still runs may read from them."""

@@ -15,8 +15,8 @@ from urllib.parse import urlsplit
 import typer
 import uvloop
 
+from rce.cli.options import Authority, CertificateName, Certificates, Tls, TlsCert, TlsKey, tls_of
 from rce.cli.program_files import from_file
-from rce.cli.tls_options import Authority, CertificateName, Certificates, Tls, TlsCert, TlsKey, tls_of
 from rce.config.client import ClientConfig, load
 from rce.config.exceptions import ConfigError, Fault
 from rce.config.logs import start_logging

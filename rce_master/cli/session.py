@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from rce.cli.tls_options import Authority
+from rce.cli.options import Authority
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
 from rce_master.cli.exceptions import ApiError, CliError

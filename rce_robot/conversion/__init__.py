@@ -1,9 +1,9 @@
 """Conversions that would hold the event loop for too long: queues of them, and processes that do them."""
 
-from rce_robot.conversion.exceptions import ConversionFailedError
 from rce_robot.conversion.jobs import ReadText, ReadValue, Result, Show
 from rce_robot.conversion.pool import ConversionPool
 from rce_robot.conversion.queue import ConversionQueue
+from rce_robot.exceptions import ConversionFailedError
 
 __all__ = [
     "ConversionFailedError",

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rce.aio.tasks import BackgroundTasks
-from rce_robot.conversion.exceptions import ConversionFailedError
 from rce_robot.conversion.process import WorkerProcess
+from rce_robot.exceptions import ConversionFailedError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -11,8 +11,8 @@ import sys
 from typing import TYPE_CHECKING
 
 from rce.buffers import unfilled
-from rce_robot.conversion.exceptions import ConversionFailedError
 from rce_robot.conversion.jobs import HEAD, MAX_PARTS, decode_result, pack
+from rce_robot.exceptions import ConversionFailedError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -25,8 +25,8 @@ from rce.ros.types.faults import read_fault
 from rce.ros.types.fields import LARGE
 from rce_robot.converters.codec import make_reader, make_writer
 from rce_robot.converters.custom import load_custom_converters
-from rce_robot.converters.exceptions import ConversionError
 from rce_robot.converters.faults import find_fault, unknown_fields
+from rce_robot.exceptions import ConversionError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -6,9 +6,9 @@ import struct
 from typing import TYPE_CHECKING, Any
 
 from rce.ros.types.values import NUMBERS
-from rce_robot.converters.exceptions import ConversionError
 from rce_robot.converters.stamps import duration_from_json, time_from_json
 from rce_robot.converters.values import BINARY, describe, to_octets
+from rce_robot.exceptions import ConversionError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

@@ -17,7 +17,7 @@ from rce.ros.actions.goal_id import GoalId
 from rce.ros.actions.patience import PatientClock
 from rce.ros.actions.states import CommState, GoalState
 from rce.ros.actions.tracker import GoalTracker
-from rce.ros.handles import release
+from rce.ros.closing import release
 
 if TYPE_CHECKING:
     from rce.ros.node import Node, Publisher, Subscriber

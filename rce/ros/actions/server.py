@@ -15,7 +15,7 @@ from rce.ros.actions.ledger import MEMORY, Arrival, Entry, GoalLedger
 from rce.ros.actions.policy import MAX_GOALS, Drop, ManyGoals, Policy, Refuse, SingleGoal, Start, Step, Stop
 from rce.ros.actions.server_goal import Content, ServerGoal
 from rce.ros.actions.states import GoalEvent
-from rce.ros.handles import release
+from rce.ros.closing import release
 
 if TYPE_CHECKING:
     from rce.ros.node import Node, Publisher

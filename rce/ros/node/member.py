@@ -18,13 +18,14 @@ from rce.ros.errors import (
     TypeMismatchError,
 )
 from rce.ros.logfiles import LogFile
-from rce.ros.node import clock, rosout, signals
+from rce.ros.node import clock, rosout
 from rce.ros.node.clock import NANOSECONDS, Clock
 from rce.ros.node.local import neighbour
 from rce.ros.node.loggers import Loggers
 from rce.ros.node.master import MasterClient
 from rce.ros.node.parameters import Parameters
 from rce.ros.node.registrar import Registrar
+from rce.ros.node.running import stop_signals
 from rce.ros.node.runtime import Runtime, Types
 from rce.ros.node.service import SerializedHandler, Service
 from rce.ros.node.service_client import ServiceClient
@@ -137,7 +138,7 @@ class GraphMember:
         if self._signals:
             await self._stop.wait()
             return
-        with signals.handled(self.shutdown):
+        with stop_signals(self.shutdown):
             await self._stop.wait()
 
     async def sleep(self, seconds: float) -> bool:
@@ -193,7 +194,7 @@ class GraphMember:
             await self._join_graph(stack)
             tasks.spawn(self._registrar(master).keep(), name=f"{self.name} stays registered")
             if self._signals:
-                stack.enter_context(signals.handled(self.shutdown))
+                stack.enter_context(stop_signals(self.shutdown))
             self._stack = stack.pop_all()
         return self
 

@@ -6,7 +6,7 @@ from contextlib import AsyncExitStack
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
-from rce.ros.handles import release
+from rce.ros.closing import release
 from rce.ros.tf.frames import PARAMETER, resolve
 from rce.ros.tf.stamped import StampedTransform
 from rce.ros.tf.transform import Transform

@@ -10,8 +10,8 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from rce.aio.tasks import TaskScope
+from rce.ros.closing import release
 from rce.ros.errors import NodeClosedError
-from rce.ros.handles import release
 from rce.ros.tf.broadcaster import KIND, TF, TF_STATIC, find_prefix
 from rce.ros.tf.buffer import Buffer
 from rce.ros.tf.exceptions import (

@@ -52,7 +52,7 @@ import asyncio, json, os, signal, sys
 from rce.supervision.__main__ import run
 from rce.supervision.plan import Plan
 from rce.supervision.prefork import prepare
-from rce.supervision.program import Program
+from rce.supervision.plan import Program
 import uvloop
 
 wanted = json.loads(sys.argv[1])

