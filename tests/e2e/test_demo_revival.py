@@ -40,7 +40,7 @@ async def test_killed_bridge_and_station_return_killed_world_is_named() -> None:
         kill_program(demo.process.pid, "rce_client.ros_bridge", f"{robot.id.lower()}.config")
         kill_program(demo.process.pid, "rce_fleet.station")
         await until(
-            lambda: demo.output().count("was ended by SIGKILL; it restarting it") == 2,
+            lambda: demo.output().count("was ended by SIGKILL; restarting it") == 2,
             timeout=30,
             what="the demo tells what it starts again",
         )
