@@ -45,6 +45,7 @@ from rce_fleet.navigation.angles import yaw_of
 from rce_fleet.navigation.occupancy import occupancy
 from rce_fleet.nodes.parameters import make_grid
 from rce_fleet.nodes.plan_worker import PlanWorker
+from rce_fleet.nodes.state_publisher import StatePublisher
 
 if TYPE_CHECKING:
     from rce.ros.node import Publisher
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
     from rce_fleet.coordination.replanning import PlanRequest
 
 TICK = 0.1
-"""Seconds between two looks at the clock; the state is published at most as often."""
+"""Seconds between two looks at the clock; changes of the state are published at most as often."""
 LOOK_AROUND = 0.5
 """Seconds between two looks for new robots."""
 POSE = "geometry_msgs/PoseWithCovarianceStamped"
@@ -76,8 +77,7 @@ class PlannerNode:
         self._cells: dict[str, Publisher] = {}
         self._cancels: dict[str, Publisher] = {}
         self._requests: asyncio.Queue[PlanRequest] = asyncio.Queue()
-        self._started = Time.now()
-        self._state: Publisher
+        self._state = StatePublisher(node, planner)
         self._blocked: Publisher
         self._map: Publisher
 
@@ -88,16 +88,15 @@ class PlannerNode:
             blocked: Cells that are blocked from the beginning, and can be freed.
         """
         node = self._node
-        self._state = await node.advertise("/fleet/state", "fleet/FleetState", latch=True)
         self._blocked = await node.advertise("/fleet/blockedCells", "std_msgs/Int32MultiArray", latch=True)
         self._map = await node.advertise("/map", "nav_msgs/OccupancyGrid", latch=True)
         self._publish_blocked(())
         for cell in blocked:
             self._handle(CellBlocked(cell))
+        await self._state.start()
         await node.advertise_service("/fleet/set_goal", "fleet/SetGoal", self._set_goal)
         await node.advertise_service("/fleet/block_cell", "fleet/BlockCell", self._block_cell)
         await node.advertise_service("/fleet/remove_robot", "fleet/RemoveRobot", self._remove_robot)
-        self._publish_state()
         async with PlanWorker(node.log) as worker, asyncio.TaskGroup() as tasks:
             planning = tasks.create_task(self._make_plans(worker))
             tasks.create_task(self._look_around())
@@ -174,8 +173,7 @@ class PlannerNode:
     async def _keep_time(self) -> None:
         while await self._node.sleep(TICK):
             self._handle(Tick())
-            if self._planner.take_changes() is not None:
-                self._publish_state()
+            self._state.update(time.monotonic())
 
     async def _make_plans(self, worker: PlanWorker) -> None:
         while True:
@@ -237,39 +235,6 @@ class PlannerNode:
             },
             data=picture.data.tolist(),
         )
-
-    def _publish_state(self) -> None:
-        grid, snapshot = self._planner.state.grid, self._planner.snapshot()
-        walls = sorted(grid.blocked)
-        self._state.publish(
-            started=self._started,
-            rows=grid.rows,
-            columns=grid.columns,
-            cell_size=grid.cell_size,
-            origin_x=grid.origin[0],
-            origin_y=grid.origin[1],
-            blocked=sorted({*walls, *snapshot.blocked}),
-            pending=list(snapshot.pending),
-            walls=walls,
-            robots=[
-                {
-                    "id": robot.id,
-                    "state": robot.state.value,
-                    "reason": robot.reason,
-                    "cell": _or_none(robot.cell),
-                    "goal": _or_none(robot.goal),
-                    "plan": list(robot.plan),
-                    "granted": list(robot.granted),
-                    "replans": robot.replans,
-                }
-                for robot in snapshot.robots
-            ],
-        )
-
-
-def _or_none(cell: int | None) -> int:
-    """A cell as messages say it: -1 for none."""
-    return -1 if cell is None else cell
 
 
 def _pose(robot: str, message: Message) -> PoseSeen:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
-import json
 import logging
 from collections.abc import Callable
 from contextlib import AsyncExitStack
@@ -33,9 +32,9 @@ from rce_fleet.station.authentication import Authenticator, TokenAuthenticator
 from rce_fleet.station.engine_authenticator import EngineAuthenticator, StationAccount
 from rce_fleet.station.engine_planner_client import EnginePlannerClient
 from rce_fleet.station.engine_watch import EngineWatch
+from rce_fleet.station.feed import Feed
 from rce_fleet.station.fleet_link import FleetLink, PlannerClient
 from rce_fleet.station.graph_watch import GraphWatch
-from rce_fleet.station.live import Broadcast
 from rce_fleet.station.ros_planner_client import RosPlannerClient
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
@@ -153,40 +152,6 @@ def _is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-class Feed:
-    """Sends changes of the view to the pages."""
-
-    def __init__(self, view: FleetView, pages: Broadcast) -> None:
-        self._view = view
-        self._pages = pages
-
-    def on_change(self, what: str) -> None:
-        """Send what changed in the view: ``state`` or ``poses``."""
-        if what == "poses":
-            poses = {
-                robot: (round(p.x, 3), round(p.y, 3), round(p.theta, 3))
-                for robot, p in self._view.poses.items()
-            }
-            self._send("poses", {"poses": poses})
-            return
-        self._send("map", self._view.map() or {})
-        robots = [{key: value for key, value in r.items() if key != "pose"} for r in self._view.robots()]
-        self._send(
-            "state", {"robots": robots, "blocked": self._view.blocked(), "pending": self._view.pending()}
-        )
-
-    def on_engine(self, state: dict[str, Any]) -> None:
-        """Send the engine's state."""
-        self._send("engine", state)
-
-    def on_event(self, text: str, tone: str) -> None:
-        """Send an event."""
-        self._pages.send_event(json.dumps({"type": "event", "text": text, "tone": tone}))
-
-    def _send(self, topic: str, message: dict[str, Any]) -> None:
-        self._pages.send(topic, json.dumps({"type": topic, **message}))
-
-
 class Backend(Protocol):
     """Where the planner runs: in the engine, or in a ROS graph."""
 
@@ -243,13 +208,15 @@ async def serve(
     tls: Context | None = None,
 ) -> None:
     """Serve until SIGINT or SIGTERM."""
-    view, pages = FleetView(), Broadcast()
-    feed = Feed(view, pages)
-    fleet = FleetLink(backend.client, view, on_change=feed.on_change, on_event=feed.on_event)
+    view = FleetView()
+    feed = Feed(view)
+    fleet = FleetLink(
+        backend.client, view, on_change=feed.on_change, on_pose=feed.on_pose, on_event=feed.on_event
+    )
     stop = asyncio.Event()
     for number in end_signals():
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    station = Station(view, fleet, pages, authenticator=authenticator, names=names)
+    station = Station(view, fleet, feed.pages, authenticator=authenticator, names=names)
     async with AsyncExitStack() as stack:
         if isinstance(authenticator, EngineAuthenticator):
             await stack.enter_async_context(authenticator)
@@ -258,7 +225,7 @@ async def serve(
         async def announce() -> None:
             typer.echo(f"rce ui ready: {server.url}")
 
-        await _until(stop.wait, lambda: fleet.run(announce), lambda: backend.watch(feed.on_engine))
+        await _until(stop.wait, lambda: fleet.run(announce), feed.run, lambda: backend.watch(feed.on_engine))
 
 
 async def _until(done: Callable[[], Any], *work: Callable[[], Any]) -> None:

@@ -12,9 +12,13 @@ from rce.tls.identity import Context
 from rce_client.connection import Connection, State
 from rce_client.exceptions import CallError, ClientError
 from rce_client.services import ServiceClient
+from rce_client.topics import Subscriber
 from rce_fleet.station.fleet_link import (
     BLOCK_CELL,
     CALL_TIMEOUT_S,
+    CHANGES,
+    CHANGES_TOPIC,
+    GET_STATE,
     POSE,
     SET_GOAL,
     STATE,
@@ -47,6 +51,7 @@ class EnginePlannerClient(PlannerClient):
         self._container = config.containers[0].tag
         self._node_requests: asyncio.Queue[Request] = asyncio.Queue()
         self._listener: PlannerListener
+        self._states: Subscriber[dict[str, Any]]
 
     async def run(self, listener: PlannerListener, ready: Callable[[], Awaitable[None]]) -> None:
         """Create the planner's container, connect to it, and receive messages until cancelled."""
@@ -69,6 +74,7 @@ class EnginePlannerClient(PlannerClient):
                 async with asyncio.TaskGroup() as group:
                     group.create_task(self._follow_robots(connection))
                     group.create_task(self._restart_nodes(connection))
+                    group.create_task(self._follow_changes(connection))
             finally:
                 await connection.remove_all()
 
@@ -78,13 +84,25 @@ class EnginePlannerClient(PlannerClient):
             self._node_requests.put_nowait(request)
 
     async def _join_planner(self, connection: Connection) -> None:
-        await connection.subscriber("fleetState", STATE, self._listener.take_state)
+        self._states = await connection.subscriber("fleetState", STATE, self._listener.take_state)
         await self._join(connection, "fleetState", "SubscriberInterface", STATE, STATE_TOPIC)
         for tag, service in _SERVICES:
             self._calls[service] = _caller(await connection.service_client(tag, service.type_name))
             await self._join(connection, tag, "ServiceClientInterface", service.type_name, service.name)
         for tag in ("fleetState", *(tag for tag, _ in _SERVICES)):
             await connection.wait_active(tag)
+
+    async def _follow_changes(self, connection: Connection) -> None:
+        """Receive changes instead of whole states, once the planner is known to publish them."""
+        service = GET_STATE
+        self._calls[service] = _caller(await connection.service_client("getState", service.type_name))
+        await self._join(connection, "getState", "ServiceClientInterface", service.type_name, service.name)
+        await connection.subscriber("fleetChanges", CHANGES, self._listener.take_changes)
+        await self._join(connection, "fleetChanges", "SubscriberInterface", CHANGES, CHANGES_TOPIC)
+        self._listener.may_have_missed()
+        await self._changes_followed.wait()
+        await self._states.close()
+        await connection.remove_interface(self._container, "fleetState")
 
     async def _follow_robots(self, connection: Connection) -> None:
         while True:
@@ -111,6 +129,7 @@ class EnginePlannerClient(PlannerClient):
             self._listener.take_event(f"connection to the engine lost: {words}", "bad")
         elif state is State.RESTORED:
             self._listener.take_event("connection to the engine restored", "good")
+            self._listener.may_have_missed()
 
 
 def _caller(client: ServiceClient[dict[str, Any]]) -> Call:

@@ -9,15 +9,20 @@ from collections.abc import Awaitable, Callable
 from typing import Any, NamedTuple, Protocol, TypeAlias, assert_never
 
 from rce_fleet.station.desired import Desired, DesiredCell, DesiredGoal
-from rce_fleet.station.view import FleetView
+from rce_fleet.station.following import ChangeFollower
+from rce_fleet.station.view import FleetView, ViewChange
 
 STATE = "fleet/FleetState"
 STATE_TOPIC = "/fleet/state"
+CHANGES = "fleet/FleetChanges"
+CHANGES_TOPIC = "/fleet/changes"
 POSE = "geometry_msgs/PoseWithCovarianceStamped"
 CALL_TIMEOUT_S = 10.0
 RESEND_FOR_S = 20.0
 """How long goals and blocked cells are sent again to a restarted planner."""
 RESEND_EVERY_S = 0.5
+ASK_AGAIN_S = 1.0
+"""Seconds until the whole state is requested again after no answer came."""
 
 
 class PlannerService(NamedTuple):
@@ -29,6 +34,7 @@ class PlannerService(NamedTuple):
 
 SET_GOAL = PlannerService("/fleet/set_goal", "fleet/SetGoal")
 BLOCK_CELL = PlannerService("/fleet/block_cell", "fleet/BlockCell")
+GET_STATE = PlannerService("/fleet/get_state", "fleet/GetState")
 
 
 def pose_topic(robot: str) -> str:
@@ -49,6 +55,12 @@ class PlannerListener(Protocol):
 
     def take_state(self, message: dict[str, Any]) -> None:
         """Handle a ``fleet/FleetState``."""
+
+    def take_changes(self, message: dict[str, Any]) -> None:
+        """Handle a ``fleet/FleetChanges``."""
+
+    def may_have_missed(self) -> None:
+        """Handle that changes may have been missed: they are received from now on, or again."""
 
     def take_pose(self, robot: str, message: dict[str, Any]) -> None:
         """Handle a robot's pose message."""
@@ -72,6 +84,7 @@ class PlannerClient(ABC):
         self._away = away
         self._new_robots: asyncio.Queue[str] = asyncio.Queue()
         self._calls: dict[PlannerService, Call] = {}
+        self._changes_followed = asyncio.Event()
 
     @abstractmethod
     async def run(self, listener: PlannerListener, ready: Callable[[], Awaitable[None]]) -> None:
@@ -80,6 +93,10 @@ class PlannerClient(ABC):
     def follow(self, robot: str) -> None:
         """Subscribe to a robot's poses."""
         self._new_robots.put_nowait(robot)
+
+    def stop_states(self) -> None:
+        """Receive no more whole states, only changes."""
+        self._changes_followed.set()
 
     async def call(self, service: PlannerService, request: dict[str, Any]) -> dict[str, Any]:
         """Call a service of the planner.
@@ -99,7 +116,8 @@ class FleetLink:
     Args:
         client: The client of the planner.
         view: Updated with state and poses.
-        on_change: Called with ``state`` or ``poses`` after the view changed.
+        on_change: Called with what changed after the view took a state or changes.
+        on_pose: Called with a robot's id after the view took its pose.
         on_event: Called with a text and a tone (``good``, ``warn``, ``bad`` or empty) for each event.
     """
 
@@ -108,12 +126,16 @@ class FleetLink:
         client: PlannerClient,
         view: FleetView,
         *,
-        on_change: Callable[[str], None],
+        on_change: Callable[[ViewChange], None],
+        on_pose: Callable[[str], None],
         on_event: Callable[[str, str], None],
     ) -> None:
         self._client = client
         self._view = view
         self._on_change = on_change
+        self._on_pose = on_pose
+        self._follower = ChangeFollower()
+        self._state_needed = asyncio.Event()
         self._on_event = on_event
         self._desired = Desired()
         self._planner_started: str | None = None
@@ -125,6 +147,7 @@ class FleetLink:
         async with asyncio.TaskGroup() as group:
             group.create_task(self._client.run(self, ready))
             group.create_task(self._resend())
+            group.create_task(self._keep_up())
 
     async def set_goal(self, robot: str, cell: int | None) -> str:
         """Send a robot to a cell, or stop it (None); return the planner's answer.
@@ -164,6 +187,27 @@ class FleetLink:
                         await self._send_unmet()
                         await asyncio.sleep(RESEND_EVERY_S)
 
+    async def _keep_up(self) -> None:
+        """Request the whole state whenever changes are missing."""
+        while True:
+            await self._state_needed.wait()
+            try:
+                answer = await self._client.call(GET_STATE, {})
+            except PlannerUnavailableError:
+                await asyncio.sleep(ASK_AGAIN_S)
+                continue
+            self._state_needed.clear()
+            early = self._follower.take_snapshot(answer)
+            self._client.stop_states()
+            self._take(answer["state"]["started"], self._view.on_state(answer["state"]))
+            for message in early:
+                self._take(message["started"], self._view.on_changes(message))
+            self._request_if_behind()
+
+    def _request_if_behind(self) -> None:
+        if self._follower.is_behind:
+            self._state_needed.set()
+
     async def _send_unmet(self) -> None:
         for desired in self._desired.unmet(self._view.state) if self._view.state else ():
             with contextlib.suppress(PlannerError):
@@ -178,21 +222,36 @@ class FleetLink:
     # What comes in
 
     def take_state(self, message: dict[str, Any]) -> None:
-        """Handle a ``fleet/FleetState``."""
-        self._view.on_state(message)
-        if self._planner_started not in (None, message["started"]):
+        """Handle a ``fleet/FleetState``; of a planner that publishes changes, those are followed instead."""
+        if not self._follower.follows:
+            self._take(message["started"], self._view.on_state(message))
+
+    def take_changes(self, message: dict[str, Any]) -> None:
+        """Handle a ``fleet/FleetChanges``."""
+        if self._follower.take_changes(message):
+            self._take(message["started"], self._view.on_changes(message))
+        self._request_if_behind()
+
+    def may_have_missed(self) -> None:
+        """Request the whole state."""
+        self._follower.lose()
+        self._request_if_behind()
+
+    def _take(self, planner_started: str, change: ViewChange) -> None:
+        """Do what a change of the view calls for."""
+        if self._planner_started not in (None, planner_started):
             self._planner_restarted.set()
-        self._planner_started = message["started"]
-        for robot in self._view.robot_ids():
+        self._planner_started = planner_started
+        for robot in change.robots:
             if robot not in self._known:
                 self._known.add(robot)
                 self._client.follow(robot)
-        self._on_change("state")
+        self._on_change(change)
 
     def take_pose(self, robot: str, message: dict[str, Any]) -> None:
         """Handle a robot's pose message."""
         self._view.on_pose(robot, message)
-        self._on_change("poses")
+        self._on_pose(robot)
 
     def take_event(self, text: str, tone: str) -> None:
         """Handle an event."""

@@ -1,25 +1,48 @@
-"""Sends changes to every open page, each at its own pace.
+"""Sends what changes to every open page, each at its own pace.
 
-A message has a *topic*; a page that is slow gets only the newest message of each topic (events, which must
-not be lost, are kept in a short queue). A page that stops reading costs some memory and slows no other page.
+A page first gets everything, then what changes. Changes that a page has not taken yet wait in a queue; if the
+page is too slow, its queue is emptied, and it gets everything anew. Of other messages, each of a *topic*, a
+page gets the newest; events wait in a short queue. A page that stops reading costs some memory and slows no
+other page.
 """
 
 from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
+MAX_CHANGES = 50
+"""Changes that wait for one page at most."""
 MAX_EVENTS = 100
 
 
 class Page:
-    """The messages that an open page still has to get."""
+    """The messages that an open page still has to get.
 
-    def __init__(self) -> None:
+    Args:
+        whole: Gives the messages that tell everything.
+        takes_changes: Whether it understands changes; else it gets everything whenever something changes.
+    """
+
+    def __init__(self, whole: Callable[[], list[str]], *, takes_changes: bool) -> None:
+        self._whole = whole
+        self._takes_changes = takes_changes
+        self._is_behind = True
+        self._changes: deque[str] = deque()
         self._newest: dict[str, str] = {}
         self._events: deque[str] = deque(maxlen=MAX_EVENTS)
         self._wake = asyncio.Event()
+        self._wake.set()
+
+    def put_change(self, text: str) -> None:
+        """Queue a change; a page that takes none, or is too slow, gets everything instead."""
+        if not self._takes_changes or len(self._changes) >= MAX_CHANGES:
+            self._is_behind = True
+            self._changes.clear()
+        if not self._is_behind:
+            self._changes.append(text)
+        self._wake.set()
 
     def put(self, topic: str, text: str) -> None:
         """Queue a message; it replaces an older one of its topic."""
@@ -33,27 +56,41 @@ class Page:
 
     async def take(self) -> list[str]:
         """Wait for messages, and return them."""
-        await self._wake.wait()
-        self._wake.clear()
-        texts = [*self._newest.values(), *self._events]
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            texts = self._take_now()
+            if texts:
+                return texts
+
+    def _take_now(self) -> list[str]:
+        state = self._whole() if self._is_behind else list(self._changes)
+        self._is_behind = self._is_behind and not state
+        texts = [*state, *self._newest.values(), *self._events]
+        self._changes.clear()
         self._newest.clear()
         self._events.clear()
         return texts
 
 
 class Broadcast:
-    """The open pages, and the newest message of each topic for a page that opens."""
+    """The open pages, and the newest message of each topic for a page that opens.
 
-    def __init__(self) -> None:
+    Args:
+        whole: Gives the messages that tell everything that changes are about; none if nothing is known yet.
+    """
+
+    def __init__(self, whole: Callable[[], list[str]] = list) -> None:
+        self._whole = whole
         self._pages: set[Page] = set()
         self._newest: dict[str, str] = {}
 
     def __iter__(self) -> Iterator[Page]:
         return iter(self._pages)
 
-    def open(self) -> Page:
-        """Add a page; it gets the newest message of every topic first."""
-        page = Page()
+    def open(self, *, takes_changes: bool = True) -> Page:
+        """Add a page; it gets everything first, and the newest message of every topic."""
+        page = Page(self._whole, takes_changes=takes_changes)
         for topic, text in self._newest.items():
             page.put(topic, text)
         self._pages.add(page)
@@ -62,6 +99,11 @@ class Broadcast:
     def close(self, page: Page) -> None:
         """Remove a page."""
         self._pages.discard(page)
+
+    def send_change(self, text: str) -> None:
+        """Send a change to the pages that are open now; later ones find it in everything that they get."""
+        for page in self._pages:
+            page.put_change(text)
 
     def send(self, topic: str, text: str) -> None:
         """Send a message to all pages, and keep it for pages that open later."""

@@ -13,6 +13,9 @@ from rce.ros.types import Duration, Message, Time, TypeRegistry
 from rce_fleet.station.fleet_link import (
     BLOCK_CELL,
     CALL_TIMEOUT_S,
+    CHANGES,
+    CHANGES_TOPIC,
+    GET_STATE,
     POSE,
     SET_GOAL,
     STATE,
@@ -50,13 +53,23 @@ class RosPlannerClient(PlannerClient):
             self._heard.set()
 
         async with self._node as node:
-            for service in (SET_GOAL, BLOCK_CELL):
+            for service in (SET_GOAL, BLOCK_CELL, GET_STATE):
                 self._calls[service] = _caller(node.service_client(service.name, service.type_name))
-            await node.subscribe(STATE_TOPIC, STATE, take_state)
+            states = await node.subscribe(STATE_TOPIC, STATE, take_state)
             await self._heard.wait()
             await ready()
-            while True:
-                await self._follow(listener, await self._new_robots.get())
+            await node.subscribe(
+                CHANGES_TOPIC, CHANGES, lambda message: listener.take_changes(plain(message))
+            )
+            listener.may_have_missed()
+            async with asyncio.TaskGroup() as group:
+                group.create_task(self._follow_robots(listener))
+                await self._changes_followed.wait()
+                await states.close()
+
+    async def _follow_robots(self, listener: PlannerListener) -> None:
+        while True:
+            await self._follow(listener, await self._new_robots.get())
 
     async def _follow(self, listener: PlannerListener, robot: str) -> None:
         await self._node.subscribe(

@@ -232,10 +232,13 @@ class Station:
         return _reply(Answer(message=message))
 
     async def live(self, request: web.Request) -> web.StreamResponse:
-        """Send changes to a page until it disconnects."""
+        """Send changes to a page until it disconnects.
+
+        Without ``?changes=1`` it gets everything whenever something changes, as pages of 0.1 expect.
+        """
         socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, compress=False)
         await socket.prepare(request)
-        page = self._pages.open()
+        page = self._pages.open(takes_changes=request.query.get("changes") == "1")
         writer = asyncio.create_task(_write(socket, page))
         watcher = asyncio.create_task(self._close_when_logged_out(socket, request))
         try:

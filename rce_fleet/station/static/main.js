@@ -109,7 +109,7 @@ document.querySelector("#logout").addEventListener("click", async () => {
 const LOGIN_ENDED = 1008;
 
 function connect(delay = 500) {
-  const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/v1/live`);
+  const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/v1/live?changes=1`);
   let opened = false;
   socket.addEventListener("open", () => {
     opened = true;
@@ -117,8 +117,8 @@ function connect(delay = 500) {
     badge.classList.add("live");
   });
   socket.addEventListener("message", (event) => {
-    const received = JSON.parse(event.data);
-    fleet.apply(received);
+    fleet.apply(JSON.parse(event.data));
+    if (fleet.isBehind) socket.close();  // The next connection begins with everything.
   });
   socket.addEventListener("close", ({ code }) => {
     if (code === LOGIN_ENDED) return location.replace("/login");

@@ -40,8 +40,11 @@ class RunningStation:
     """A station with its parts at hand."""
 
     def __init__(self) -> None:
-        self.view, self.fleet, self.pages = FleetView(), RecordingFleet(), Broadcast()
+        self.view, self.fleet, self.pages = FleetView(), RecordingFleet(), Broadcast(self.everything)
         self.client: TestClient[web.Request, web.Application]
+
+    def everything(self) -> list[str]:
+        return [json.dumps({"type": "everything"})]
 
     async def start(self, token: str = "") -> None:
         app = Station(self.view, self.fleet, self.pages, authenticator=TokenAuthenticator(token)).make_app()
@@ -165,10 +168,27 @@ async def test_live_socket_sends_changes(running: RunningStation) -> None:
     await running.start()
     running.pages.send("state", json.dumps({"type": "state"}))
     async with running.client.ws_connect("/api/v1/live") as socket:
+        assert (await socket.receive_json())["type"] == "everything"
         assert (await socket.receive_json())["type"] == "state"
         running.pages.send_event(json.dumps({"type": "event", "text": "news"}))
         assert (await socket.receive_json())["text"] == "news"
     assert (await running.client.get("/")).status == 200
+
+
+async def test_a_page_that_takes_changes_gets_them(running: RunningStation) -> None:
+    await running.start()
+    async with running.client.ws_connect("/api/v1/live?changes=1") as socket:
+        assert (await socket.receive_json())["type"] == "everything"
+        running.pages.send_change(json.dumps({"type": "changes"}))
+        assert (await socket.receive_json())["type"] == "changes"
+
+
+async def test_a_page_of_an_earlier_release_gets_everything(running: RunningStation) -> None:
+    await running.start()
+    async with running.client.ws_connect("/api/v1/live") as socket:
+        assert (await socket.receive_json())["type"] == "everything"
+        running.pages.send_change(json.dumps({"type": "changes"}))
+        assert (await socket.receive_json())["type"] == "everything"
 
 
 async def test_the_document_describes_every_route(running: RunningStation) -> None:
