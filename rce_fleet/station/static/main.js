@@ -117,8 +117,10 @@ function connect(delay = 500) {
     badge.classList.add("live");
   });
   socket.addEventListener("message", (event) => {
-    fleet.apply(JSON.parse(event.data));
-    if (fleet.isBehind) socket.close();  // The next connection begins with everything.
+    const received = JSON.parse(event.data);
+    fleet.apply(received);
+    // A change is missing; the next connection begins with everything.
+    if (received.type === "changes" && fleet.isBehind) socket.close();
   });
   socket.addEventListener("close", ({ code }) => {
     if (code === LOGIN_ENDED) return location.replace("/login");
