@@ -2,6 +2,7 @@
 
 ``planner``: what a pose costs, by the number of robots; it should not depend on that. ``planning``: the
 longest step of the event loop while a plan is made by the process beside it, and how long the plan takes.
+``bytes``: what the planner publishes and a page gets while robots drive, as whole states and as changes.
 
 Times are those of the processor that the measured thread used, so that other load does not count.
 """
@@ -11,6 +12,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import gc
+import json
 import logging
 from dataclasses import dataclass, field
 from math import ceil, sqrt
@@ -22,6 +24,8 @@ import uvloop
 
 from benchmarks.figures import percentile, save, show
 from benchmarks.summary import main as summarize
+from rce.ros.packages import PackageIndex
+from rce.ros.types import Time, TypeRegistry
 from rce_fleet.coordination.events import (
     BlockedChanged,
     Event,
@@ -39,8 +43,12 @@ from rce_fleet.coordination.move_client import ClientReport, ClientState
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.replanning import PlanRequest, compute_plan
 from rce_fleet.nodes.plan_worker import PlanWorker
+from rce_fleet.nodes.state_publisher import changes_fields, state_fields
 from rce_fleet.planning.grid import GridMap
+from rce_fleet.station.feed import Feed
+from rce_fleet.station.view import FleetView, Pose
 
+STARTED = Time(1)
 SIZES = (50, 200, 800, 2000)
 CELLS_PER_ROBOT = 5
 BATCH = 2000
@@ -198,6 +206,95 @@ async def plan_cost(count: int) -> dict[str, Any]:
     }
 
 
+class Traffic:
+    """Robots that drive a cell every two seconds, and what the planner and the station send meanwhile.
+
+    Attributes:
+        spent: Bytes so far: from the planner as whole states and as changes, to one page likewise.
+    """
+
+    def __init__(self, fleet: Fleet) -> None:
+        self.spent = dict.fromkeys(("planner, whole", "planner, changes", "page, whole", "page, changes"), 0)
+        self._fleet = fleet
+        rng = Random(len(fleet.places))
+        self._progress = {robot: rng.random() for robot in fleet.places}
+        types = TypeRegistry(PackageIndex([]))
+        self._state, self._changes = types.message("fleet/FleetState"), types.message("fleet/FleetChanges")
+        self._view = FleetView()
+        self._feed = Feed(self._view)
+        self._page = self._feed.pages.open()
+        fleet.planner.take_changes()
+        self._feed.on_change(self._view.on_state(state_fields(STARTED, fleet.planner)))
+
+    async def run(self, seconds: int) -> None:
+        """Drive."""
+        await self._tick()
+        self.spent = dict.fromkeys(self.spent, 0)  # The page has everything now.
+        for _ in range(seconds * 10):
+            await self._tick()
+
+    async def _tick(self) -> None:
+        """A tenth of a second."""
+        fleet = self._fleet
+        fleet.now += 0.1
+        for robot in fleet.places:
+            self._move(robot)
+            fleet.tell(fleet.report(robot))
+        fleet.tell(Tick())
+        finish_plans(fleet)
+        self._publish()
+        self._feed.send_poses(fleet.now)
+        self._feed.on_event("", "")  # so that there is something to take
+        self.spent["page, changes"] += sum(map(len, (await self._page.take())[:-1]))
+
+    def _move(self, robot: str) -> None:
+        fleet = self._fleet
+        grid, granted = fleet.planner.state.grid, fleet.planner.state.ledger.granted(robot)
+        self._progress[robot] += 0.05
+        if len(granted) < 2:
+            self._progress[robot] = 0.0
+        (x, y), (to_x, to_y) = grid.centre(granted[0]), grid.centre(granted[min(1, len(granted) - 1)])
+        share = min(self._progress[robot], 1.0)
+        self._progress[robot] %= 1.0
+        fleet.places[robot] = x + share * (to_x - x), y + share * (to_y - y)
+        fleet.tell(fleet.pose(robot))
+        self._view.poses[robot] = Pose(*fleet.places[robot], 0.0)
+        self._feed.on_pose(robot)
+
+    def _publish(self) -> None:
+        fleet, view, spent = self._fleet, self._view, self.spent
+        poses = {robot: (round(p.x, 3), round(p.y, 3), round(p.theta, 3)) for robot, p in view.poses.items()}
+        spent["page, whole"] += 2 * len(json.dumps({"type": "poses", "poses": poses}))
+        changes = fleet.planner.take_changes()
+        if changes is None:
+            return
+        whole = state_fields(STARTED, fleet.planner)
+        fields = changes_fields(STARTED, changes, changes.sequence)
+        spent["planner, whole"] += len(self._state.serialize(self._state.new(**whole)))
+        spent["planner, changes"] += len(self._changes.serialize(self._changes.new(**fields)))
+        self._feed.on_change(view.on_changes(fields))
+        shown = {"type": "state", "robots": view.robots(), "blocked": view.blocked(), "pending": []}
+        spent["page, whole"] += len(json.dumps(shown)) + len(
+            json.dumps({"type": "map", **(view.map() or {})})
+        )
+
+
+async def byte_rates(count: int, *, seconds: int) -> dict[str, Any]:
+    """Bytes a second while robots drive, from the planner and to one page.
+
+    ``whole`` is what it was before there were changes: the state ten times a second, and to a page also the
+    map and, twenty times a second, all poses.
+    """
+    fleet = joined(count)
+    finish_plans(fleet)
+    traffic = Traffic(fleet)
+    await traffic.run(seconds)
+    return {
+        "robots": count,
+        **{f"{what}, kB/s": round(spent / seconds / 1e3, 1) for what, spent in traffic.spent.items()},
+    }
+
+
 async def measure(*, quick: bool) -> None:
     """Run all suites."""
     sizes = SIZES[:2] if quick else SIZES
@@ -205,7 +302,9 @@ async def measure(*, quick: bool) -> None:
     show("Cost of a pose", poses)
     plans = [await plan_cost(count) for count in sizes]
     show("Event loop while a plan is made", plans)
-    print("results:", save("fleet", {"planner": poses, "planning": plans}))
+    rates = [await byte_rates(count, seconds=5 if quick else 10) for count in sizes[:3]]
+    show("Bytes a second while robots drive", rates)
+    print("results:", save("fleet", {"planner": poses, "planning": plans, "bytes": rates}))
     if not quick:
         summarize()
 

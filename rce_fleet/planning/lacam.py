@@ -8,7 +8,7 @@ a plan whenever one exists; after a limit on the work it returns the best config
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from dataclasses import dataclass, field
 from math import inf
 from random import Random
@@ -193,24 +193,37 @@ def _straighten(steps: list[Configuration]) -> tuple[Configuration, ...]:
     blocks none, so each such loop is cut out.
     """
     paths = [list(cells) for cells in zip(*steps, strict=True)]
+    occupants: dict[int, dict[int, int]] = defaultdict(dict)
+    for step, cells in enumerate(steps):
+        for robot, cell in enumerate(cells):
+            occupants[cell][step] = robot
     shortened = True
     while shortened:
         shortened = False
         for robot, path in enumerate(paths):
-            others = [other for index, other in enumerate(paths) if index != robot]
-            shortened |= _cut_loop(path, others)
+            shortened |= _cut_loop(robot, path, occupants)
     return tuple(zip(*paths, strict=True))
 
 
-def _cut_loop(path: list[int], others: list[list[int]]) -> bool:
-    """Cut the longest loop of ``path`` from its earliest cell that allows one."""
+def _cut_loop(robot: int, path: list[int], occupants: dict[int, dict[int, int]]) -> bool:
+    """Cut the longest loop of ``path`` from its earliest cell that allows one.
+
+    Args:
+        robot: Whose path it is.
+        path: Its cell at every step; changed.
+        occupants: For every cell the robot that is in it, by step; changed.
+    """
     last = {cell: step for step, cell in enumerate(path)}
     for step, cell in enumerate(path[:-1]):
         if path[step + 1] == cell:
             continue
         back = last[cell]
+        robots = occupants[cell]
         while back > step + 1:
-            if path[back] == cell and all(cell not in other[step + 1 : back] for other in others):
+            if path[back] == cell and all(robots.get(at, robot) == robot for at in range(step + 1, back)):
+                for at in range(step, back):
+                    del occupants[path[at]][at]
+                    robots[at] = robot
                 path[step:back] = [cell] * (back - step)
                 return True
             back -= 1
