@@ -36,8 +36,7 @@ def follower() -> ChangeFollower:
 
 def test_a_late_joiner_needs_the_whole_state() -> None:
     follower = ChangeFollower()
-    assert follower.is_behind
-    assert not follower.follows
+    assert (follower.is_behind, follower.follows) == (True, False)
     assert not follower.take_changes(change(7))
     assert follower.take_snapshot(snapshot(7)) == []
     assert not follower.is_behind
