@@ -142,7 +142,7 @@ async def test_a_station_follows_changes_and_stops_whole_states() -> None:
             assert late.view.robot_ids() == ["Robot1"]
 
 
-async def test_a_station_that_missed_the_last_change_asks_for_the_state() -> None:
+async def test_missed_last_change_makes_a_station_ask_for_the_state() -> None:
     async with Core(port=0) as core, planner(core):
         station = Station(core)
         async with station.running():
