@@ -58,7 +58,7 @@ format: install
 	$(BIN)/ruff check --fix .
 
 docs: install
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 reference: install
 	$(BIN)/python -m tools.reference

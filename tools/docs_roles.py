@@ -46,6 +46,8 @@ def _places(package: griffe.Module) -> dict[str, str]:
             for member in item.all_members.values():
                 if isinstance(member, griffe.Alias) and not member.inherited:
                     continue  # it is only imported there
+                if not member.has_docstring:
+                    continue  # it is not shown
                 anchor = f"{name}.{member.name}"
                 places |= {anchor: anchor, f"{item.path}.{member.name}": anchor}
                 places.setdefault(member.canonical_path, anchor)

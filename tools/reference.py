@@ -241,7 +241,7 @@ def _cells(option: Any) -> tuple[str, str, str]:
     shown = option.show_default and kind and default not in (None, "", ()) and not callable(default)
     unset = f" (default: {default})" if shown else ""
     text = " ".join((option.help or "").split()) + unset + variable
-    return names.replace("|", r"\|"), kind.replace("|", r"\|"), text.replace("|", r"\|")
+    return names.replace("|", r"\|"), kind.replace("|", r"\|").replace("[", r"\["), text.replace("|", r"\|")
 
 
 def _kind(annotation: Any) -> str:
