@@ -12,58 +12,43 @@ from pathlib import Path
 from typing import assert_never
 
 import msgspec
-from msgspec.structs import replace
 
 from rce.control.desired import DesiredState, Fit
-from rce.control.execution import FEATURE as EXEC
 from rce.control.model import (
-    PATCHES,
     EndpointKind,
     EndpointSpec,
     EndpointState,
     EndpointStatus,
     InterfaceUsage,
     SpecPatch,
-    StatusPatch,
 )
 from rce.control.tags import Unknown
 from rce.link import Endpoint, LinkHub
 from rce.link.handover import HandoverReceiver
-from rce.link.wiring import WiringNews
 from rce.model.names import EndpointId
-from rce.ros.core import Core
-from rce.ros.core.events import Change
-from rce.ros.core.rosout import AGGREGATE
-from rce.ros.errors import RosError
-from rce.ros.logrecord import KIND, MD5SUM
-from rce.ros.node import Node
-from rce.ros.node.runtime import TypeName
-from rce.ros.node.settings import is_loopback
-from rce.ros.types import TypeRegistry
-from rce.ros.xmlrpc import RpcClient
 from rce_container.environment import messages as m
 from rce_container.environment.channel import Channel, accept
 from rce_container.environment.exceptions import ChannelError
 from rce_container.environment.executions import Executions
-from rce_container.environment.interfaces import InterfaceMaker, Readiness
+from rce_container.environment.graph import Graph
 from rce_container.environment.logs.rosout import RosoutLog
 from rce_container.environment.nodes.causes import Causes
 from rce_container.environment.nodes.fork_server import NodeForkServer
 from rce_container.environment.nodes.heartbeats import Heartbeats
-from rce_container.environment.nodes.launch import OWN_NODE
 from rce_container.environment.nodes.node_life import NodeContext
 from rce_container.environment.nodes.node_set import NodeSet
 from rce_container.environment.nodes.reaper import Reaper
 from rce_container.environment.parameters import Values, difference, evaluate_all
 from rce_container.environment.process import kill_marked
 from rce_container.environment.reach import DialProxy
+from rce_container.environment.reporting import Reporter
+from rce_container.environment.ros1_graph import ros1_graph
 from rce_container.environment.user_packages import UserPackages
 
 _log = logging.getLogger(__name__)
 
 _MAX_UNTOLD = 100
 _UNUSED = InterfaceUsage()
-_GET_PID_TIMEOUT_S = 5.0
 
 
 class Environment:
@@ -106,9 +91,6 @@ class Environment:
         self._channel: Channel | None = None
         self._grace: asyncio.TimerHandle | None = None
         self._untold: deque[str] = deque(maxlen=_MAX_UNTOLD)
-        self._told: EndpointStatus | None = None
-        """What the manager was told last; without interfaces and connections, if it takes patches."""
-        self._manager_features: frozenset[str] = frozenset()
         self._report_due: asyncio.Handle | None = None
         self._handover: HandoverReceiver | None = None
         self._user_packages = UserPackages(boot.user_packages, boot.packages)
@@ -121,11 +103,11 @@ class Environment:
         async with contextlib.AsyncExitStack() as stack:
             reaper = stack.enter_context(Reaper(self._node_server))
             self._executions = Executions(reaper, self._environ, self._boot.mark, self._boot.home)
-            self._core = await stack.enter_async_context(self._make_core())
-            types = TypeRegistry(self._packages)
-            node = await stack.enter_async_context(
-                Node(OWN_NODE, argv=[f"__ip:={self._boot.address}"], master_uri=self._core.uri, types=types)
+            boot = self._boot
+            graph = await stack.enter_async_context(
+                ros1_graph(boot.address, boot.ros_port, self._packages, lambda: self._nodes.is_settling)
             )
+            self._graph: Graph = graph
             dial = self._dial_proxy.connect if self._boot.isolated else None
             hub = LinkHub(self._boot.machine, dial=dial, tls=self._boot.tls)
             stack.push_async_callback(hub.close)
@@ -135,19 +117,19 @@ class Environment:
                 self._tasks = tasks
                 self._nodes = NodeSet(self._context(reaper), tasks)
                 self._rosout = stack.enter_context(contextlib.closing(self._keep_records()))
-                await node.subscribe_serialized(AGGREGATE, TypeName(KIND, MD5SUM), self._rosout.take)
-                self._heartbeats = Heartbeats(node, self._nodes.beat, self._fault)
-                readiness = Readiness(lambda: self._nodes.is_settling)
+                await graph.follow_records(self._rosout.take)
+                self._heartbeats = Heartbeats(graph, self._nodes.beat, self._fault)
                 self._endpoint = Endpoint(
                     EndpointId.parse(self._boot.id),
-                    InterfaceMaker(node, types, readiness),
+                    graph.make_interface,
                     hub,
                     on_change=self._changed,
                     on_fault=self._fault,
                 )
+                self._reporter = Reporter(self._endpoint)
                 applying = tasks.create_task(self._apply_for_ever(), name="endpoint")
                 serving = tasks.create_task(self._accept_managers(), name="control socket")
-                watching = tasks.create_task(self._watch_graph(), name="graph")
+                watching = tasks.create_task(graph.watch_nodes(self), name="graph")
                 self._wait_for_manager()
                 await self._ending.wait()
                 applying.cancel()
@@ -155,12 +137,6 @@ class Environment:
                 serving.cancel()
                 watching.cancel()
         _log.info("ended: %s", self._end_reason)
-
-    def _make_core(self) -> Core:
-        """The container's core, at its loopback and, if it has one, at its address in its group."""
-        address = self._boot.address
-        host = address if is_loopback(address) else "0.0.0.0"  # noqa: S104 - of the container's own network
-        return Core(host, self._boot.ros_port, advertised=address, rosout=True)
 
     def end(self, reason: str) -> None:
         """Begin to end the container, whole."""
@@ -204,8 +180,7 @@ class Environment:
         packages = os.pathsep.join(map(str, self._packages.path))
         return {
             **os.environ,
-            "ROS_MASTER_URI": self._core.uri,
-            "ROS_IP": self._boot.address,
+            **self._graph.variables,
             "PYTHONUNBUFFERED": "1",
             "RCE_PACKAGE_PATH": packages,
             "ROS_PACKAGE_PATH": packages,
@@ -258,9 +233,9 @@ class Environment:
         desired, faults = evaluate_all(parameters, self._packages, self._environ())
         change = difference(self._parameters, desired)
         for name in change.delete:
-            self._core.delete_param(name)
+            self._graph.delete_parameter(name)
         for name, value in change.set.items():
-            self._core.set_param(name, value)
+            self._graph.set_parameter(name, value)
         self._parameters = desired
         if self._user_packages.is_waiting:  # they may name a package that is still to come
             return
@@ -310,27 +285,7 @@ class Environment:
             state=self._state,
             nodes=self._nodes.statuses,
         )
-        news = self._endpoint.take_news()
-        if self._told is not None and PATCHES in self._manager_features:
-            self._report_patch(self._channel, header, news)
-            return
-        interfaces = dict(self._endpoint.interfaces)
-        status = replace(header, interfaces=interfaces, connections=self._endpoint.connections)
-        if status != self._told:
-            self._told = status
-            self._channel.send(m.encode(m.Report(status=status, features=(EXEC, PATCHES))))
-
-    def _report_patch(self, channel: Channel, header: EndpointStatus, news: WiringNews) -> None:
-        """Report what changed since the last report on this channel."""
-        if header == self._told and not news:
-            return
-        self._told = header
-        patch = StatusPatch(
-            status=replace(header, interfaces=news.interfaces, connections=tuple(news.connections)),
-            removed_interfaces=tuple(news.removed_interfaces),
-            lost_connections=tuple(news.lost_connections),
-        )
-        channel.send(m.encode(m.ReportPatch(patch=patch)))
+        self._reporter.report(self._channel, header)
 
     @property
     def _state(self) -> EndpointState:
@@ -345,29 +300,19 @@ class Environment:
         else:
             self._untold.append(text)
 
-    async def _watch_graph(self) -> None:
-        """Notice which of the container's nodes are up."""
-        with self._core.watch() as events:
-            async with RpcClient() as client, asyncio.TaskGroup() as tasks:
-                async for event in events:
-                    if event.change is not Change.NODE_APPEARED:
-                        continue
-                    if self._nodes.registered(event.node):
-                        self._rosout.known(event.node)
-                    else:
-                        tasks.create_task(self._identify(client, event.node), name="identify")
+    # rce_container.environment.graph.NodeListener
 
-    async def _identify(self, client: RpcClient, name: str) -> None:
-        """Ask a node whose name tells nothing for its process."""
-        uri = self._core.graph.nodes.get(name)
-        if uri is None or name == f"/{OWN_NODE}":
-            return
-        try:
-            _, _, pid = await client.call(uri, "getPid", (OWN_NODE,), timeout=_GET_PID_TIMEOUT_S)
-            if self._nodes.registered_process(name, int(pid)):
-                self._rosout.known(name)
-        except (RosError, TypeError, ValueError) as error:
-            _log.info("node %s does not tell its process: %s", name, error)
+    def node_appeared(self, name: str) -> bool:
+        """Take note of a node of the container that is up."""
+        if not self._nodes.registered(name):
+            return False
+        self._rosout.known(name)
+        return True
+
+    def node_identified(self, name: str, pid: int) -> None:
+        """Take note of the process of a node that is up."""
+        if self._nodes.registered_process(name, pid):
+            self._rosout.known(name)
 
     # Managers
 
@@ -386,8 +331,7 @@ class Environment:
         elif self._grace is not None:
             self._grace.cancel()
         self._channel = Channel(sock)
-        self._told = None
-        self._manager_features = frozenset()
+        self._reporter.begin()
         self._report()
         while self._untold:
             self._channel.send(m.encode(m.Fault(text=self._untold.popleft())))
@@ -423,7 +367,7 @@ class Environment:
             case m.Cause(request=request, text=text):
                 self._causes.answered(request, text)
             case m.Handover(features=features):
-                self._manager_features = frozenset(features)
+                self._reporter.learn(features)
                 if self._handover is not None:
                     await self._handover.close()
                 self._handover = HandoverReceiver(socket.socket(fileno=channel.take_fd()), self._hub.adopt)
