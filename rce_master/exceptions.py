@@ -19,6 +19,7 @@
     +-- TransitionError            an event that a life cycle does not allow in the present state
     +-- StoreError                 the store cannot be read or written
     |   +-- StoreBusyError         another process owns the state folder
+    |   +-- StaleTermError         another master has begun a newer term
     +-- TaskSetAwayError           the task set that is to be asked is not there
 """
 
@@ -142,6 +143,26 @@ class StoreError(MasterError):
 
 class StoreBusyError(StoreError):
     """Another process owns the state folder."""
+
+
+class StaleTermError(StoreError):
+    """Another master has begun a newer term: this one must write no more.
+
+    Args:
+        term: In which it was to be written.
+        newest: The newest term of the store.
+    """
+
+    def __init__(self, term: int, newest: int) -> None:
+        super().__init__(term, newest)
+        self.term = term
+        self.newest = newest
+
+    def __str__(self) -> str:
+        return (
+            f"the store is in term {self.newest}, and this master writes in term {self.term}: another master"
+            " has taken over; restart this one"
+        )
 
 
 class TaskSetAwayError(MasterError):

@@ -51,13 +51,17 @@ class StateService:
         state: The state.
         store: Keeps what must survive.
         clock: Seconds that never go back.
+        term: The term of the store in which this writes.
 
     Attributes:
         listeners: Called with the changes of each command after they were stored; must not block or raise.
     """
 
-    def __init__(self, state: State, store: Store, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, state: State, store: Store, clock: Callable[[], float] = time.monotonic, term: int = 0
+    ) -> None:
         self.state = state
+        self._term = term
         self.listeners: list[Callable[[Changes], None]] = []
         self._store = store
         self._clock = clock
@@ -72,7 +76,7 @@ class StateService:
         clock: Callable[[], float] = time.monotonic,
         revision: int | None = None,
     ) -> StateService:
-        """Go on from what a store holds.
+        """Go on from what a store holds, in a new term of it.
 
         Args:
             store: The store.
@@ -85,8 +89,9 @@ class StateService:
         """
         if revision is None:
             revision = time.time_ns() // 1_000_000
-        state = State.load(await load_converted(store), clock(), settings, revision=revision)
-        return cls(state, store, clock)
+        term = await store.begin_term()
+        state = State.load(await load_converted(store, term), clock(), settings, revision=revision)
+        return cls(state, store, clock, term)
 
     @property
     def tables(self) -> Tables:
@@ -183,7 +188,7 @@ class StateService:
         rows = [make_row(table, key) for (_, key), table in keys.items()]
         try:
             if rows:
-                await self._store.save(rows)
+                await self._store.save(rows, self._term)
                 self._store_fault = ""
         except BaseException as error:
             self._store_fault = str(error) if isinstance(error, StoreError) else self._store_fault
@@ -218,8 +223,12 @@ class StateService:
                 job.done.set_result([outcome or error for outcome in job.outcomes])
 
 
-async def load_converted(store: Store) -> Snapshot:
+async def load_converted(store: Store, term: int) -> Snapshot:
     """Read a store; one of the release before is converted in it, in one transaction.
+
+    Args:
+        store: The store.
+        term: The term of it in which the caller writes.
 
     Raises:
         StoreError: It cannot be read or written.
@@ -229,7 +238,7 @@ async def load_converted(store: Store) -> Snapshot:
     if not rows:
         return snapshot
     _log.info("converting the store of an earlier release: %d records", len(rows))
-    await store.save(rows)
+    await store.save(rows, term)
     return await store.load()
 
 

@@ -61,10 +61,11 @@ class OfflineState:
         folder: Where it is.
     """
 
-    def __init__(self, state: State, store: Store, audit: AuditLog, folder: Path) -> None:
+    def __init__(self, state: State, store: Store, term: int, audit: AuditLog, folder: Path) -> None:
         self.state = state
         self.folder = folder
         self._store = store
+        self._term = term
         self._audit = audit
 
     async def do(self, command: Command, action: str, subject: str) -> None:
@@ -78,7 +79,8 @@ class OfflineState:
         Raises:
             MasterError: The state does not allow it, or it cannot be kept.
         """
-        await self._store.save(self.state.apply(command, time.monotonic()).rows())
+        rows = self.state.apply(command, time.monotonic()).rows()
+        await self._store.save(rows, self._term)
         self._audit.add(_caller(), action, subject, address=OFFLINE)
 
 
@@ -101,8 +103,9 @@ async def open_state(state_dir: Path) -> AsyncIterator[OfflineState]:
         raise CliError(f"{error}; to work over its API, log in there: rce login") from error
     audit = AuditLog(folder / "audit", time.time)
     try:
-        state = State.load(await load_converted(store), time.monotonic(), settings=settings)
-        yield OfflineState(state, store, audit, folder)
+        term = await store.begin_term()
+        state = State.load(await load_converted(store, term), time.monotonic(), settings=settings)
+        yield OfflineState(state, store, term, audit, folder)
     finally:
         audit.close()
         await store.close()

@@ -34,10 +34,25 @@ class Store(Protocol):
             StoreError: It cannot be read.
         """
 
-    async def save(self, rows: Sequence[Row]) -> None:
-        """Write rows, all or none; when this returns, they survive a crash.
+    async def begin_term(self) -> int:
+        """Take over: begin a new term, and end that of whoever wrote before.
+
+        Returns:
+            The term, greater than all before; it survives a crash.
 
         Raises:
+            StoreError: None was begun.
+        """
+
+    async def save(self, rows: Sequence[Row], term: int = 0) -> None:
+        """Write rows, all or none; when this returns, they survive a crash.
+
+        Args:
+            rows: What to write.
+            term: The writer's own, as :meth:`begin_term` returned it; 0 if no term was begun yet.
+
+        Raises:
+            StaleTermError: A newer term was begun; nothing was written.
             StoreError: Nothing was written.
         """
 

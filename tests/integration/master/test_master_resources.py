@@ -358,10 +358,10 @@ class BrokenStore(MemoryStore):
 
     broken = False
 
-    async def save(self, rows: Sequence[Row]) -> None:
+    async def save(self, rows: Sequence[Row], term: int = 0) -> None:
         if self.broken:
             raise StoreError("cannot write the store: no space is left")
-        await super().save(rows)
+        await super().save(rows, term)
 
 
 async def test_health_tells_of_a_broken_store(

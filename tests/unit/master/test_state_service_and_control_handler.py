@@ -64,12 +64,12 @@ class FragileStore(MemoryStore):
         self.free = asyncio.Event()
         self.free.set()
 
-    async def save(self, rows: Sequence[Row]) -> None:
+    async def save(self, rows: Sequence[Row], term: int = 0) -> None:
         await self.free.wait()
         self.saves += 1
         if self.broken:
             raise StoreError("disk full")
-        await super().save(rows)
+        await super().save(rows, term)
 
 
 class FakePeer:
