@@ -19,9 +19,8 @@ from rce.config.secret import Secret
 from rce.control.channel import TaskSetChannel
 from rce.control.contents import ContentClient
 from rce.control.dialing import RunDialer
-from rce.control.limits import MEMORY_PER_SLOT
+from rce.control.machine import MEMORY_PER_SLOT, machine_memory
 from rce.control.messages import MachineInfo
-from rce.control.usage import machine_memory
 from rce.link.address import in_url, is_any, own_address
 from rce.link.handover import LinkAcceptor
 from rce.link.listening import listen_on

@@ -9,7 +9,7 @@ import math
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
-from rce.control.limits import MEGABYTE, MIN_MEMORY
+from rce.control.machine import MEGABYTE, MIN_MEMORY
 from rce.model.quantities import write_cores, write_memory
 from rce.model.specs import Resources
 from rce_master.usage import STEP_S, WINDOW_S, rates_between

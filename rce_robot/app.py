@@ -16,9 +16,9 @@ from rce.config.exceptions import ShippedFileError
 from rce.config.folders import run_dir
 from rce.config.resources import examples_dir
 from rce.control.channel import TaskSetChannel
+from rce.control.machine import machine_memory
 from rce.control.messages import MachineInfo
 from rce.control.model import LinkAddress
-from rce.control.usage import machine_memory
 from rce.guard.lobby import Lobby
 from rce.guard.proxies import TrustedProxies
 from rce.link import LinkHub

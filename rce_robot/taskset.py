@@ -12,6 +12,7 @@ import logging
 from typing import TYPE_CHECKING, Protocol, assert_never
 
 from rce.control.exceptions import ControlError
+from rce.control.machine import cpu_seconds, machine_memory, resident_bytes
 from rce.control.messages import (
     CONTROL_VERSION,
     TYPED_REQUESTS,
@@ -40,7 +41,6 @@ from rce.control.messages import (
     Welcome,
 )
 from rce.control.model import PATCHES, StatusPatch
-from rce.control.usage import cpu_seconds, machine_memory, resident_bytes
 from rce.guard.budget import Ledger
 from rce.model.names import EndpointId
 from rce.protocol.exceptions import HandshakeError

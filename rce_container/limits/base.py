@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
 from typing import ClassVar, NamedTuple, Protocol
 
-from rce.control.limits import MEGABYTE, MIN_MEMORY
+from rce.control.machine import MEGABYTE, MIN_MEMORY
 from rce.model.specs import Resources
 
 

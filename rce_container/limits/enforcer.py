@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from rce.control.limits import MEGABYTE
+from rce.control.machine import MEGABYTE
 from rce.model.specs import Resources
 from rce_container.exceptions import LimitError
 from rce_container.limits.base import ControlGroup, SlotSettings, in_megabytes, limits_of

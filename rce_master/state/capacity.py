@@ -6,7 +6,7 @@ import ipaddress
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from rce.control.limits import MEGABYTE, MIN_MEMORY
+from rce.control.machine import MEGABYTE, MIN_MEMORY
 from rce.control.messages import TaskSetKind
 from rce.model.checks import DEFAULT_PREFIX
 from rce.model.specs import Network, Resources

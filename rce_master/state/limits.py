@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from msgspec.structs import asdict, replace
 
-from rce.control.limits import MEGABYTE
+from rce.control.machine import MEGABYTE
 from rce.control.messages import TaskSetKind
 from rce.model.quantities import write_cores
 from rce_master.exceptions import LimitReachedError, NotFoundError

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from rce.control.limits import MEGABYTE
+from rce.control.machine import MEGABYTE
 from rce.model.quantities import write_bandwidth, write_cores
 from rce.model.specs import Resources
 from rce_master.exceptions import NoRoomError

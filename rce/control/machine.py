@@ -1,4 +1,4 @@
-"""What this process uses and what this machine has, as task sets report it.
+"""What processes use and machines have, as task sets report it, and what the master assumes of it.
 
 The kernel is asked directly: a library for it would cost each task set 4 MB.
 """
@@ -8,6 +8,13 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path
+
+MEGABYTE = 1 << 20
+"""What is called MB where memory is spoken of: bytes."""
+MIN_MEMORY = 32 * MEGABYTE
+"""A container cannot live with less memory (bytes): its environment alone needs most of this."""
+MEMORY_PER_SLOT = 64 * MEGABYTE
+"""A machine offers one slot for so many bytes of its memory, unless its operator says otherwise."""
 
 _STATM = Path("/proc/self/statm")
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
