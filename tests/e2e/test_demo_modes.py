@@ -7,6 +7,7 @@ import contextlib
 import re
 import shutil
 from collections.abc import Awaitable
+from functools import partial
 from typing import Any
 
 import aiohttp
@@ -137,7 +138,7 @@ async def test_a_killed_planner_and_a_killed_move_client_come_back(mode: str) ->
             await _send(station, "Robot1", cell)
             kill_program(demo.process.pid, *words)
             await until(
-                lambda cell=cell: _arrives(station, "Robot1", cell),  # type: ignore[misc]
+                partial(_arrives, station, "Robot1", cell),
                 timeout=80,
                 what=f"Robot1 is at cell {cell}",
             )

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.async_api import Page, async_playwright
+from playwright.async_api import Page, ViewportSize, async_playwright
 from support.demo import Demo, running_demo
 
 from rce_fleet.demo.scenario import FLOOR
@@ -29,7 +29,7 @@ BROWSER = (
     "--disable-component-update",
     "--disable-sync",
 )
-DESKTOP, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
+DESKTOP, PHONE = ViewportSize(width=1280, height=800), ViewportSize(width=390, height=844)
 WAIT_MS = 40_000
 
 
@@ -40,7 +40,7 @@ def artifact(name: str) -> Path:
 
 
 @contextlib.asynccontextmanager
-async def opened(demo: Demo, viewport: Any = DESKTOP, *, expected: str = "") -> AsyncIterator[Page]:
+async def opened(demo: Demo, viewport: ViewportSize = DESKTOP, *, expected: str = "") -> AsyncIterator[Page]:
     """The page in a browser; what the browser complains of and is not ``expected`` fails the test."""
     complaints: list[str] = []
     async with async_playwright() as playwright:

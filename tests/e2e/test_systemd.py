@@ -6,6 +6,7 @@ import asyncio
 import json
 import shlex
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,7 @@ async def install(machine: Booted) -> None:
     assert "made /etc/systemd/system/rce-robot.service" in "".join(await asyncio.gather(*roles))
     for unit in UNITS:
         await until(
-            lambda unit=unit: f"{unit} ready: " in machine.journal(unit),  # type: ignore[misc]
+            partial(_is_ready, machine, unit),
             timeout=TIMEOUT_S,
             what=f"{unit} is ready\n{machine.run(f'systemctl status {unit}', code=None)}",
         )
@@ -87,6 +88,10 @@ def node_pid(machine: Booted) -> int:
     (container,) = ask(machine, "GET", "/containers")["containers"]
     pids = machine.run("pgrep -f '[s]tringEcho.py'", code=None).split()
     return int(pids[0]) if len(pids) == 1 and container["state"] == "running" else 0
+
+
+def _is_ready(machine: Booted, unit: str) -> bool:
+    return f"{unit} ready: " in machine.journal(unit)
 
 
 async def test_services_survive_kills_and_reloads_and_stop_whole() -> None:

@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import AsyncIterator, Callable
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import aiohttp
 import pytest
@@ -30,6 +30,8 @@ from rce_client import Connection
 from rce_client.exceptions import RefusedError
 
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("curl", "openssl")]
+
+T = TypeVar("T")
 
 BIN = Path(sys.executable).parent
 START_S = 120.0
@@ -159,7 +161,7 @@ async def stranger(world: World) -> AsyncIterator[aiohttp.ClientWebSocketRespons
             yield socket
 
 
-def frame(type_: str, **data: Any) -> str:
+def frame(type_: str, **data: object) -> str:
     return json.dumps({"type": type_, "data": data})
 
 
@@ -237,7 +239,7 @@ class OneSegment:
         self._reader = reader
         self._writer = writer
 
-    async def complete(self, step: Callable[[], Any]) -> Any:
+    async def complete(self, step: Callable[[], T]) -> T:
         """Do what needs the other end's answers."""
         while True:
             try:

@@ -9,7 +9,7 @@ import tempfile
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, Unpack
 
 import msgspec
 
@@ -50,6 +50,7 @@ from rce.model.names import EndpointId, InterfaceType
 from rce.model.specs import InterfaceSpec
 from rce.protocol.requests import write_request
 from rce_robot.app import App
+from rce_robot.conversion.pool import ConversionSettings
 from rce_robot.settings import RobotSettings, SessionSettings
 from support.patches import patch_between
 
@@ -67,6 +68,25 @@ PASSWORD = "testUser"
 DIGEST = hashlib.sha256(PASSWORD.encode()).hexdigest()
 EXAMPLES = Path(__file__).parents[2] / "examples"
 MACHINE = "here"
+
+
+class Wiring(TypedDict, total=False):
+    """What a spec says of connections."""
+
+    interfaces: tuple[InterfaceSpec, ...]
+    links: tuple[LinkSpec, ...]
+    connections: tuple[ConnectionSpec, ...]
+
+
+class RobotOptions(TypedDict, total=False):
+    """Fields of :class:`rce_robot.settings.RobotSettings` that tests give."""
+
+    origins: tuple[str, ...]
+    login_timeout: float
+    user_memory: int
+    memory: int
+    strangers_per_address: int
+    conversion: ConversionSettings
 
 
 class Signal:
@@ -175,7 +195,7 @@ class FakeMaster:
     def spec(self, id_: str) -> EndpointSpec:
         return self.specs.setdefault(id_, EndpointSpec(id=id_, kind=EndpointKind.ROBOT, revision=1))
 
-    def put(self, id_: str, **changes: Any) -> None:
+    def put(self, id_: str, **changes: Unpack[Wiring]) -> None:
         spec = former = self.spec(id_)
         self.specs[id_] = spec = msgspec.structs.replace(spec, revision=spec.revision + 1, **changes)
         if self.peer is not None and self.in_patches:
@@ -300,7 +320,7 @@ def _grown(
 
 @asynccontextmanager
 async def running_cloud(
-    session: SessionSettings | None = None, *, in_patches: bool = False, **settings: Any
+    session: SessionSettings | None = None, *, in_patches: bool = False, **settings: Unpack[RobotOptions]
 ) -> AsyncIterator[Cloud]:
     """Run it all on loopback; ``in_patches`` with a master of this release, else with one of the former."""
     master = FakeMaster()
@@ -338,7 +358,7 @@ async def running_cloud(
 
 @asynccontextmanager
 async def running_robots(
-    cloud: Cloud, control_port: int, session: SessionSettings | None = None, **settings: Any
+    cloud: Cloud, control_port: int, session: SessionSettings | None = None, **settings: Unpack[RobotOptions]
 ) -> AsyncIterator[None]:
     """Run a robot task set for the cloud's master."""
     ready: asyncio.Queue[str] = asyncio.Queue()

@@ -8,7 +8,7 @@ import os
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypedDict, TypeVar, Unpack
 
 import msgspec
 import pytest
@@ -37,11 +37,12 @@ from rce.control.model import (
     LinkSpec,
     NodeState,
     NodeStatus,
+    PackageSpec,
 )
 from rce.link import Buffer, Endpoint, Interface, LinkHub, Port
 from rce.link.handover import LinkAcceptor
 from rce.model.names import EndpointId
-from rce.model.specs import InterfaceSpec, NodeSpec
+from rce.model.specs import InterfaceSpec, NodeSpec, ParameterSpec, Resources
 from rce_container.environment import proc
 from rce_container.folder import Record, StateFolder
 from rce_container.limits import choose_limiter
@@ -50,7 +51,7 @@ from rce_container.manager import Manager
 from rce_container.packages.cache import PackageCache
 from rce_container.packages.supply import Library
 from rce_container.runtimes.base import Runtime
-from rce_container.runtimes.namespace import NamespaceRuntime
+from rce_container.runtimes.namespace import HOME_BYTES, NamespaceRuntime
 from rce_container.runtimes.podman import PodmanRuntime
 from rce_container.runtimes.process import ProcessRuntime
 from rce_container.settings import ContainerSettings
@@ -131,13 +132,47 @@ async def until(
     return found
 
 
+class ManagerOptions(TypedDict, total=False):
+    """Fields of :class:`rce_container.settings.ContainerSettings` that tests give."""
+
+    grace: float
+    interrupt_timeout: float
+    terminate_timeout: float
+    cleanup_timeout: float
+    starts_at_once: int
+    slot_memory: int
+    slot_processes: int
+
+
+class SpecParts(TypedDict, total=False):
+    """What a container's spec says beside its name."""
+
+    nodes: tuple[NodeSpec, ...]
+    interfaces: tuple[InterfaceSpec, ...]
+    links: tuple[LinkSpec, ...]
+    connections: tuple[ConnectionSpec, ...]
+    resources: Resources
+    parameters: tuple[ParameterSpec, ...]
+    packages: tuple[PackageSpec, ...]
+
+
+class ContainerParts(SpecParts, total=False):
+    """What :func:`container` makes a spec of."""
+
+    peer: str
+    dial: LinkAddress | None
+
+
 class Machine:
     """A machine's disk, and the managers that run on it one after the other."""
 
-    def __init__(self, folder: Path, runtime: str, images: Sequence[str] = (), **options: Any) -> None:
+    def __init__(
+        self, folder: Path, runtime: str, images: Sequence[str] = (), home_bytes: int = HOME_BYTES
+    ) -> None:
         self.folder = folder
-        podman = PodmanRuntime(images, **options)
-        runtimes: tuple[Runtime, ...] = (NamespaceRuntime(**options), podman, ProcessRuntime())
+        podman = PodmanRuntime(images, home_bytes=home_bytes)
+        namespaces = NamespaceRuntime(home_bytes=home_bytes)
+        runtimes: tuple[Runtime, ...] = (namespaces, podman, ProcessRuntime())
         self.runtimes = {one.name: one for one in runtimes}
         self.runtime = self.runtimes[runtime]
         self.runtime.probe()
@@ -166,12 +201,11 @@ class Machine:
         return Piece(found[offset : offset + 1000], len(found))
 
     @contextlib.asynccontextmanager
-    async def managed(self, **options: Any) -> AsyncIterator[Manager]:
+    async def managed(self, **options: Unpack[ManagerOptions]) -> AsyncIterator[Manager]:
         """Run a manager; it dies at the end of the block without a word to its containers."""
+        options.setdefault("interrupt_timeout", 5.0)
         settings = ContainerSettings(
-            machine=MACHINE,
-            packages=(self.packages, examples_dir()),
-            **{"usage_interval": 0.2, "interrupt_timeout": 5.0, **options},
+            machine=MACHINE, packages=(self.packages, examples_dir()), usage_interval=0.2, **options
         )
         acceptor = LinkAcceptor()
         port = await acceptor.listen("127.0.0.1", 0)
@@ -209,7 +243,7 @@ class Machine:
                 await acceptor.close()
 
     @contextlib.asynccontextmanager
-    async def engine(self, **options: Any) -> AsyncIterator[Manager]:
+    async def engine(self, **options: Unpack[ManagerOptions]) -> AsyncIterator[Manager]:
         """Run a manager that ends properly, and check that nothing is left."""
         async with self.managed(**options) as manager:
             yield manager
@@ -257,7 +291,7 @@ class Machine:
 
     # What it is told
 
-    async def put(self, id_: str, revision: int = 1, **parts: Any) -> None:
+    async def put(self, id_: str, revision: int = 1, **parts: Unpack[ContainerParts]) -> None:
         await self.manager.handle(Put(endpoint=container(id_, revision, **parts)))
 
     async def drop(self, id_: str, revision: int = 100) -> None:
@@ -393,26 +427,28 @@ def container(
     id_: str,
     revision: int,
     *,
-    nodes: tuple[NodeSpec, ...] = (),
     peer: str = "",
     dial: LinkAddress | None = None,
-    **parts: Any,
+    **parts: Unpack[SpecParts],
 ) -> EndpointSpec:
     """A container's spec; with ``peer``, wired to it over one link."""
-    wires = wiring(peer, dial, [i.tag for i in parts.get("interfaces", ())]) if peer else {}
-    return EndpointSpec(
-        id=id_, kind=EndpointKind.CONTAINER, revision=revision, nodes=nodes, **{**parts, **wires}
-    )
+    if peer:
+        parts["links"], parts["connections"] = wiring(
+            peer, dial, [i.tag for i in parts.get("interfaces", ())]
+        )
+    return EndpointSpec(id=id_, kind=EndpointKind.CONTAINER, revision=revision, **parts)
 
 
-def wiring(peer: str, dial: LinkAddress | None, tags: list[str]) -> dict[str, Any]:
+def wiring(
+    peer: str, dial: LinkAddress | None, tags: list[str]
+) -> tuple[tuple[LinkSpec, ...], tuple[ConnectionSpec, ...]]:
     """The link to a peer, and a connection over it for each tag, with the interface of the same tag there."""
     link = LinkSpec(id="link", peer=peer, token="token", dial=dial is not None, address=dial or LinkAddress())
     connections = tuple(
         ConnectionSpec(id=number, link="link", interface=tag, peer_interface=tag)
         for number, tag in enumerate(tags, 1)
     )
-    return {"links": (link,), "connections": connections}
+    return (link,), connections
 
 
 STRING = "std_msgs/String"
@@ -487,13 +523,15 @@ class Peer:
         own = tuple(
             InterfaceSpec(tag=i.tag, type=COMPLEMENT[i.type], message_type=i.message_type) for i in interfaces
         )
+        links, connections = wiring(id_, address, [i.tag for i in interfaces])
         await self.endpoint.apply(
             EndpointSpec(
                 id="user/robot",
                 kind=EndpointKind.ROBOT,
                 revision=revision,
                 interfaces=own,
-                **wiring(id_, address, [i.tag for i in interfaces]),
+                links=links,
+                connections=connections,
             )
         )
 

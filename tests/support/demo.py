@@ -10,7 +10,7 @@ import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ def environment(folder: Path) -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def clean_folder() -> Any:
+def clean_folder() -> Iterator[Path]:
     """A short-named folder; at the end no process of a demo in it may be left, and no file."""
     folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
     try:

@@ -21,7 +21,7 @@ import sys
 import time
 from collections.abc import AsyncIterator, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, Unpack
 from unittest import mock
 
 import msgspec
@@ -32,7 +32,17 @@ from rce.link import LinkError
 from rce.model.specs import InterfaceSpec, NodeSpec, Resources
 from rce_container.environment import proc
 from rce_container.seccomp.library import FilterUnavailableError
-from support.containers import ECHO, ECHO_INTERFACES, MACHINE, Machine, Peer, container, until
+from support.containers import (
+    ECHO,
+    ECHO_INTERFACES,
+    MACHINE,
+    ContainerParts,
+    Machine,
+    ManagerOptions,
+    Peer,
+    container,
+    until,
+)
 from support.persons import SECRET
 
 HOSTILE = Path(__file__).parent / "hostile"
@@ -77,7 +87,7 @@ class World:
         self.facts = self.machine.packages / "hostile" / "facts.json"
 
     @contextlib.asynccontextmanager
-    async def running(self, **options: Any) -> AsyncIterator[None]:
+    async def running(self, **options: Unpack[ManagerOptions]) -> AsyncIterator[None]:
         """Run the manager and the neighbour."""
         async with self.machine.engine(**options):
             await self.machine.manager.handle(_put_neighbour())
@@ -157,7 +167,7 @@ class Bait:
         self.port = 0
 
     def __enter__(self) -> Self:
-        addresses: tuple[Any, ...] = (self.abstract, self.path, ("127.0.0.1", 0))
+        addresses: tuple[str | tuple[str, int], ...] = (self.abstract, self.path, ("127.0.0.1", 0))
         for sock, address in zip(self._sockets, addresses, strict=True):
             sock.bind(address)
             sock.listen()
@@ -352,10 +362,11 @@ class Hunger:
                 tag="flap", type="PublisherInterface", message_type="std_msgs/String", addr="/flap"
             ),
         )
-        parts: dict[str, Any] = {"resources": limits, "interfaces": interfaces, "peer": "user/robot"}
+        parts: ContainerParts = {"resources": limits, "interfaces": interfaces, "peer": "user/robot"}
         await machine.put(self._id, **parts)
         async with self._robot(interfaces):
-            await machine.put(self._id, 2, nodes=(node,), **parts)
+            parts["nodes"] = (node,)
+            await machine.put(self._id, 2, **parts)
             text = await self._outcome()
             if thing == "stop":
                 await until(lambda: _is_stopped(self._world.environment(self._id).pid))

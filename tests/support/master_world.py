@@ -2,16 +2,51 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypedDict, Unpack
 
 from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, TaskSetKind
-from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress
-from rce.model.specs import InterfaceSpec, NodeSpec, Resources
+from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress, NodeStatus
+from rce.model.specs import InterfaceSpec, Network, NodeSpec, Resources
 from rce_master.state import commands
 from rce_master.state.changes import Changes
 from rce_master.state.core import State
 from rce_master.state.records import User, UserRole
 from rce_master.state.settings import StateSettings
+
+
+class MachineParts(TypedDict, total=False):
+    """Fields of :class:`rce.control.messages.MachineInfo` beside its name."""
+
+    slots: int
+    cores: int
+    memory: int
+    labels: tuple[str, ...]
+    runtimes: tuple[str, ...]
+    networks: tuple[str, ...]
+    draining: bool
+
+
+class ResourceParts(TypedDict, total=False):
+    """Fields of :class:`rce.model.specs.Resources`."""
+
+    group: str
+    group_ip: str
+    network: Network
+    image: str
+    size: int
+    cpu: float
+    memory: int
+    bandwidth: int
+    special_features: tuple[str, ...]
+
+
+class StatusParts(TypedDict, total=False):
+    """Fields of :class:`rce.control.model.EndpointStatus` that tests give."""
+
+    incarnation: str
+    address: LinkAddress
+    nodes: tuple[NodeStatus, ...]
+    detail: str
 
 
 class World:
@@ -49,7 +84,11 @@ class World:
         )
 
     def container_set(
-        self, process: str = "c1", endpoints: tuple[EndpointStatus, ...] = (), name: str = "m", **machine: Any
+        self,
+        process: str = "c1",
+        endpoints: tuple[EndpointStatus, ...] = (),
+        name: str = "m",
+        **machine: Unpack[MachineParts],
     ) -> Changes:
         return self.do(
             commands.TaskSetArrived(
@@ -77,7 +116,7 @@ class World:
         return changes
 
     def container(
-        self, tag: str = "c", user: str = "anna", *, wait: bool = False, **resources: Any
+        self, tag: str = "c", user: str = "anna", *, wait: bool = False, **resources: Unpack[ResourceParts]
     ) -> Changes:
         requested = Resources(**resources)
         return self.do(commands.CreateContainer(user=user, tag=tag, resources=requested, wait=wait))
@@ -106,7 +145,7 @@ class World:
     def report(self, process: str, status: EndpointStatus) -> Changes:
         return self.do(commands.StatusReported(process=process, status=status))
 
-    def run(self, tag: str = "c", process: str = "c1", **fields: Any) -> Changes:
+    def run(self, tag: str = "c", process: str = "c1", **fields: Unpack[StatusParts]) -> Changes:
         """A container reports that it runs."""
         fields.setdefault("address", LinkAddress(machine="m", unix=f"/run/{tag}"))
         return self.report(

@@ -8,7 +8,6 @@ import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
 
 from rce.ros.core import Core, Graph
 from rce.ros.multimaster.discovery import Discovery
@@ -16,6 +15,7 @@ from rce.ros.multimaster.filters import SyncLists
 from rce.ros.multimaster.settings import DiscoverySettings
 from rce.ros.multimaster.sync import MasterSync, SyncSettings
 from rce.ros.node import Node
+from rce.ros.types import TypeRegistry
 from support.ports import free_port
 from support.processes import finish
 
@@ -24,8 +24,8 @@ FAST = 10.0
 """Heartbeats and questions per second in tests."""
 
 
-def node(name: str, uri: str, **more: Any) -> Node:
-    return Node(name, argv=[], master_uri=uri, **more)
+def node(name: str, uri: str, types: TypeRegistry | None = None) -> Node:
+    return Node(name, argv=[], master_uri=uri, types=types)
 
 
 class DiscoveryNetwork:

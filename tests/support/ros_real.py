@@ -8,7 +8,7 @@ import os
 import signal
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from rce.ros.core import Core
 from rce.ros.errors import XmlRpcError
@@ -35,6 +35,9 @@ def ros_environment(uri: str, home: Path) -> dict[str, str]:
         "HOME": str(home),
         "PYTHONUNBUFFERED": "1",
     }
+
+
+T = TypeVar("T")
 
 
 class Graph:
@@ -125,7 +128,7 @@ class Graph:
         state = await self.ask("getSystemState") or [[], [], []]
         return next((nodes for name, nodes in state[0] if name == topic), [])
 
-    async def until(self, condition: Callable[[], Awaitable[Any]], *, what: str) -> Any:
+    async def until(self, condition: Callable[[], Awaitable[T | None]], *, what: str) -> T:
         """Wait until ``condition`` gives something true."""
         try:
             async with asyncio.timeout(TIMEOUT_S):

@@ -11,7 +11,6 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from support.containers import ECHO, Machine, until
@@ -24,8 +23,14 @@ BOX = "user/box"
 MB = 1 << 20
 
 
-def own(exe: str, args: str = "", tag: str = "node", **parts: Any) -> NodeSpec:
-    return NodeSpec(tag=tag, pkg="own", exe=exe, args=args, **parts)
+def own(
+    exe: str,
+    args: str = "",
+    tag: str = "node",
+    restart: RestartPolicy = RestartPolicy.NEVER,
+    max_restarts: int = 5,
+) -> NodeSpec:
+    return NodeSpec(tag=tag, pkg="own", exe=exe, args=args, restart=restart, max_restarts=max_restarts)
 
 
 async def running(machine: Machine, id_: str = BOX) -> None:

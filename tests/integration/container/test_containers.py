@@ -9,10 +9,9 @@ import signal
 import socket
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
-from support.containers import ECHO, ECHO_INTERFACES, MACHINE, Machine, is_in, joined, until
+from support.containers import ECHO, ECHO_INTERFACES, MACHINE, Machine, Peer, is_in, joined, until
 
 from rce.control.model import EndpointState, LinkAddress, NodeState
 from rce.model.specs import InterfaceSpec, NodeSpec, ParameterSpec
@@ -34,7 +33,7 @@ async def start_echo(machine: Machine) -> LinkAddress:
     return status.address
 
 
-async def echo(peer: Any, text: str) -> None:
+async def echo(peer: Peer, text: str) -> None:
     payload = STRING.serialize(STRING.new(data=text))
     peer.ends["req"].port.send(payload)
     async with asyncio.timeout(10):

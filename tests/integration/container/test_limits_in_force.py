@@ -7,13 +7,12 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 from support.containers import Machine, until
 
 from rce.control.messages import Gone
-from rce.control.model import EndpointState, NodeState, NodeUsage
+from rce.control.model import EndpointState, EndpointUsage, NodeState, NodeUsage
 from rce.model.specs import NodeSpec, Resources
 from rce_container.environment import proc
 from rce_container.folder import StateFolder
@@ -73,13 +72,13 @@ def greedy(tag: str, args: str = "") -> NodeSpec:
     return NodeSpec(tag=tag, pkg="greedy", exe=f"{tag}.py", args=args)
 
 
-def usage(machine: Machine, id_: str) -> Any:
-    return machine.usage[-1].endpoints.get(id_) if machine.usage else None
+def usage(machine: Machine, id_: str) -> EndpointUsage:
+    """The newest that a machine told of a container; nothing used if it told nothing yet."""
+    return machine.usage[-1].endpoints.get(id_, EndpointUsage()) if machine.usage else EndpointUsage()
 
 
 def node_usage(machine: Machine, id_: str, tag: str) -> NodeUsage:
-    known = usage(machine, id_)
-    return known.nodes.get(tag, NodeUsage()) if known else NodeUsage()
+    return usage(machine, id_).nodes.get(tag, NodeUsage())
 
 
 async def test_who_takes_too_much_memory_dies_alone(packages: Machine) -> None:
@@ -94,7 +93,8 @@ async def test_who_takes_too_much_memory_dies_alone(packages: Machine) -> None:
         assert any(OUT_OF_MEMORY in fault for fault in machine.faults)
         await machine.log_holds(OTHER, "hog", "has all")
         pid = await machine.node_pid(BOX, "talk")
-        seen = await until(lambda: (one := usage(machine, BOX)) and one.oom_kills and one)
+        await until(lambda: usage(machine, BOX).oom_kills)
+        seen = usage(machine, BOX)
         assert (seen.oom_kills, seen.memory_limit) == (1, 64 * MB)
         assert 50 * MB < seen.memory_peak <= 64 * MB
         await until(lambda: node_usage(machine, OTHER, "hog").memory > 100_000_000)
@@ -157,7 +157,7 @@ async def test_limits_change_while_it_runs(packages: Machine) -> None:
         await machine.log_holds(BOX, "hog", "has all")
         before = machine.status(BOX)
         await machine.put(BOX, 2, resources=Resources(memory=200 * MB, cpu=0.5), nodes=nodes)
-        await until(lambda: usage(machine, BOX) and usage(machine, BOX).memory_limit == 200 * MB)
+        await until(lambda: usage(machine, BOX).memory_limit == 200 * MB)
         assert usage(machine, BOX).cpu_limit == pytest.approx(0.5)
         await machine.put(BOX, 3, resources=Resources(memory=64 * MB, cpu=0.25), nodes=nodes)
         fault = await until(lambda: next((f for f in machine.faults if "cannot be limited" in f), None))
@@ -208,7 +208,8 @@ async def test_the_next_manager_keeps_the_limits_of_what_it_adopts(packages: Mac
         control_groups = machine.control_groups()
     async with machine.engine():
         assert machine.control_groups() == control_groups
-        seen = await until(lambda: usage(machine, BOX))
+        await until(lambda: machine.usage and BOX in machine.usage[-1].endpoints)
+        seen = usage(machine, BOX)
         assert seen.memory_limit == 64 * MB
         nodes = (greedy("hog", "200"),)
         await machine.put(BOX, 2, resources=SMALL, nodes=nodes)
@@ -253,7 +254,8 @@ async def test_without_cgroups_each_process_is_limited(
         died = await machine.node_is(BOX, "hog", NodeState.FAILED)
         assert "MemoryError" in died.detail
         assert "has 60" in await machine.log(BOX, "hog")
-        seen = await until(lambda: usage(machine, BOX))
+        await until(lambda: machine.usage and BOX in machine.usage[-1].endpoints)
+        seen = usage(machine, BOX)
         assert (seen.memory_limit, seen.memory_peak) == (0, 0)
         assert seen.memory > MB
         await machine.put(BOX, 2, resources=Resources(memory=256 * MB))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-from typing import Any
+from typing import TypedDict, Unpack
 
 import pytest
 from support.containers import Machine, joined, until
@@ -76,16 +76,34 @@ def _nodes(machine: Machine) -> None:
         (machine.packages / "own" / "nodes" / name).write_text(text)
 
 
-def own(exe: str, args: str = "", tag: str = "node", **options: Any) -> NodeSpec:
+class NodeOptions(TypedDict, total=False):
+    after: tuple[str, ...]
+    heartbeat: str
+    heartbeat_timeout: float
+    restart: RestartPolicy
+    max_restarts: int
+
+
+class QueryParts(TypedDict, total=False):
+    level: LogLevel
+    incarnation: str
+    previous: bool
+
+
+def own(exe: str, args: str = "", tag: str = "node", **options: Unpack[NodeOptions]) -> NodeSpec:
     return NodeSpec(tag=tag, pkg="own", exe=exe, args=args, **options)
 
 
-async def read(machine: Machine, node: str, *streams: LogStream, id_: str = BOX, **query: Any) -> LogChunk:
+async def read(
+    machine: Machine, node: str, *streams: LogStream, id_: str = BOX, **query: Unpack[QueryParts]
+) -> LogChunk:
     request = ReadLog(request=1, id=id_, node=node, limit=1 << 20, query=LogQuery(streams=streams, **query))
     return await machine.read_log(request)
 
 
-async def holds(machine: Machine, node: str, text: str, *streams: LogStream, **query: Any) -> str:
+async def holds(
+    machine: Machine, node: str, text: str, *streams: LogStream, **query: Unpack[QueryParts]
+) -> str:
     async with asyncio.timeout(20):
         while text not in (found := (await read(machine, node, *streams, **query)).text):
             await asyncio.sleep(0.02)
@@ -291,7 +309,7 @@ async def test_logs_outlive_their_container(machine: Machine) -> None:
         assert after.incarnation not in ("", first)
         assert "hello one" in after.text
         assert after.text.endswith("-- ended: it was told to by SIGINT --\n")
-        assert (await read(machine, "node", life=first)).text == before.text
+        assert (await read(machine, "node", incarnation=first)).text == before.text
         assert "no logs" in (await read(machine, "node", id_="another/box")).error
         machine.check_clean()
 
@@ -312,7 +330,9 @@ async def test_logs_outlive_killed_manager_and_unseen_end(
         assert "no manager for 0.5 s" in chunk.reason
 
 
-async def test_the_logs_of_what_could_not_be_made_say_so(machine: Machine, monkeypatch: Any) -> None:
+async def test_the_logs_of_what_could_not_be_made_say_so(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from rce_container.exceptions import StartError
 
     def refuse(*_: object) -> None:

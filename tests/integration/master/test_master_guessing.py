@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import signal
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import aiohttp
 import pytest
@@ -32,7 +32,7 @@ HOME, BAD, ELSEWHERE = "127.0.0.1", "127.0.0.66", "127.0.0.7"
 
 async def log_in(
     url: str, password: str, address: str = HOME, user: str = "testUser", **headers: str
-) -> tuple[int, Any]:
+) -> tuple[int, str | None]:
     """Log in from an address of the loopback; returns the status and ``Retry-After``."""
     connector = aiohttp.TCPConnector(local_addr=(address, 0))
     async with (

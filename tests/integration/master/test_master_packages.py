@@ -9,7 +9,7 @@ import io
 import stat
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -27,7 +27,7 @@ from rce_master.state.settings import StateSettings
 from rce_master.store import MemoryStore
 
 if TYPE_CHECKING:
-    from integration.master.conftest import RunSite, Site
+    from integration.master.conftest import RunSite, Site, TaskSet
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def stored(folder: Path) -> set[str]:
     return {path.name for path in kept.iterdir() if path.is_file()} if kept.exists() else set()
 
 
-async def until(condition: Callable[[], Any]) -> None:
+async def until(condition: Callable[[], object]) -> None:
     async with asyncio.timeout(10):
         while not condition():
             await asyncio.sleep(0.01)
@@ -129,7 +129,7 @@ async def test_nodes_get_what_they_name(shop: Site, tmp_path: Path) -> None:
         await shop.api("DELETE", "/packages/nav/1.10", status=204)
 
 
-async def newest_spec(containers: Any, wanted: Callable[[EndpointSpec], bool]) -> EndpointSpec:
+async def newest_spec(containers: TaskSet, wanted: Callable[[EndpointSpec], bool]) -> EndpointSpec:
     while True:
         put: Put = await containers.get(Put)
         if wanted(put.endpoint):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import io
 import json
+from collections.abc import Awaitable
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -34,8 +35,8 @@ if TYPE_CHECKING:
 MB = 1 << 20
 
 
-def small(name: str = "m1", **fields: Any) -> MachineInfo:
-    return MachineInfo(name=name, cores=2, memory=1024 * MB, slots=8, **fields)
+def small(name: str = "m1") -> MachineInfo:
+    return MachineInfo(name=name, cores=2, memory=1024 * MB, slots=8)
 
 
 @pytest.fixture
@@ -45,9 +46,9 @@ def logged_in(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Si
     return site
 
 
-async def put_of(task_set: TaskSet, id_: str, **wanted: Any) -> Put:
+async def put_of(task_set: TaskSet, id_: str, **wanted: float) -> Put:
     while True:
-        put: Put = await task_set.get(Put)
+        put = await task_set.get(Put)
         resources = put.endpoint.resources
         if put.endpoint.id == id_ and all(getattr(resources, key) == value for key, value in wanted.items()):
             return put
@@ -102,7 +103,7 @@ async def test_amounts_are_read_and_out_of_capacity_is_a_conflict(site: Site) ->
         ("/connections", {"tag_a": "x", "tag_b": "a/b"}, "tag_a: "),
     ],
 )
-async def test_faults_name_the_keys_of_this_api(site: Site, path: str, body: Any, place: str) -> None:
+async def test_faults_name_the_keys_of_this_api(site: Site, path: str, body: object, place: str) -> None:
     reply = await site.api("POST", path, body, status=422)
     assert reply["error"].startswith(place)
 
@@ -132,7 +133,7 @@ async def test_how_a_node_lives_reaches_its_machine(site: Site) -> None:
         assert "restart: must be one of never, on-failure, always" in reply["error"]
 
 
-async def _is(read: Callable[[], Any], key: str, value: object) -> bool:
+async def _is(read: Callable[[], Awaitable[dict[str, Any]]], key: str, value: object) -> bool:
     return bool((await read())[key] == value)
 
 

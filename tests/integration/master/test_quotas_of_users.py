@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import AsyncExitStack, asynccontextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import aiohttp
 
-from rce.control.messages import LogChunk, ReadLog
+from rce.control.messages import LogChunk, ReadLog, ToTaskSet
 from rce_master.auth import client_digest
 from rce_master.quotas import QuotaSettings
 
@@ -109,7 +109,7 @@ async def test_reads_of_logs(run_site: RunSite) -> None:
 def silent(machine: TaskSet, user: str) -> None:
     """Have a machine keep its answers to one user's reads of logs to itself."""
 
-    async def handle(message: Any) -> None:
+    async def handle(message: ToTaskSet) -> None:
         if not isinstance(message, ReadLog):
             machine.inbox.put_nowait(message)
             return

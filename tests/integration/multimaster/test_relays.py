@@ -20,6 +20,7 @@ from rce.ros.multimaster.relay.link import STRANGERS_PER_ADDRESS
 from rce.ros.multimaster.relay.throttle import MessageThrottle
 from rce.ros.multimaster.relay.topic import TopicRelay
 from rce.ros.multimaster.sync import MasterSync, SyncSettings
+from rce.ros.node import Publisher, Subscriber
 
 
 @pytest.fixture
@@ -144,7 +145,7 @@ async def test_a_namespace_for_a_master(network: DiscoveryNetwork) -> None:
         assert {"/Robot1/secret", "/amcl_pose", "/secret"} & station.graph.topic_types.keys() == set()
 
 
-async def heard_within(subscriber: Any, publisher: Any) -> bool:
+async def heard_within(subscriber: Subscriber, publisher: Publisher) -> bool:
     """Publish once; tell whether it arrived soon. A relay takes a moment until it is wanted."""
     publisher.publish(data="go")
     try:
@@ -155,7 +156,9 @@ async def heard_within(subscriber: Any, publisher: Any) -> bool:
 
 
 @asynccontextmanager
-async def linked(token: str = "", **lists: Any) -> AsyncIterator[tuple[Core, Core, MasterSync, MasterSync]]:
+async def linked(
+    token: str = "", **lists: list[str]
+) -> AsyncIterator[tuple[Core, Core, MasterSync, MasterSync]]:
     """Two cores that know each other by one connection only: no discovery, no direct way."""
     chosen = SyncLists.read(lists)
     async with Core(port=0) as cloud, Core(port=0) as robot:

@@ -6,10 +6,10 @@ import asyncio
 import json
 from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Unpack
 
 import pytest
-from support.cloud import DIGEST, Cloud, running_cloud
+from support.cloud import DIGEST, Cloud, RobotOptions, running_cloud
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
@@ -32,7 +32,9 @@ def dial(cloud: Cloud, user: str, robot: str) -> connect:
 
 
 @asynccontextmanager
-async def small_cloud(**settings: Any) -> AsyncIterator[tuple[Cloud, ClientConnection, AsyncExitStack]]:
+async def small_cloud(
+    **settings: Unpack[RobotOptions],
+) -> AsyncIterator[tuple[Cloud, ClientConnection, AsyncExitStack]]:
     """A cloud with little memory, and the robot of a user who does nothing wrong."""
     async with running_cloud(PATIENT, **settings) as cloud, AsyncExitStack() as stack:
         cloud.master.users.add("flood")

@@ -7,9 +7,9 @@ import json
 import os
 import signal
 import sys
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 import psutil
 import pytest
@@ -66,8 +66,6 @@ if sys.argv[2:] == ["kill the last"]:
 sys.exit(uvloop.run(run(Plan(programs=programs, ready=("all",)), prepared)))
 """
 
-Start = Callable[..., Any]
-
 
 class Supervised:
     """A supervisor in a process of its own."""
@@ -86,6 +84,12 @@ class Supervised:
     async def forks(self) -> list[psutil.Process]:
         """Return the forks that wait to begin."""
         return [psutil.Process(int(word)) for word in (await self.until("prepared")).split()[1:]]
+
+
+class Start(Protocol):
+    """Starts a supervisor; see :func:`start`."""
+
+    async def __call__(self, programs: list[list[str]], *words: str) -> Supervised: ...
 
 
 @pytest.fixture

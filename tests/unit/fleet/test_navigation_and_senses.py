@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import cos, hypot, inf, pi, sin
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pymunk
 import pytest
 from hypothesis import given, settings
@@ -36,7 +37,9 @@ def test_directions_survive_wrapping_and_quaternions(angle: float) -> None:
 # Navigation
 
 
-def drive(navigator: Navigator, pose: Pose, seconds: float, clear: Any = lambda _pose: inf) -> list[Pose]:
+def drive(
+    navigator: Navigator, pose: Pose, seconds: float, clear: Callable[[Pose], float] = lambda _pose: inf
+) -> list[Pose]:
     """Perfect wheels, 50 steps a second."""
     dt, poses = 0.02, [pose]
     for _ in range(int(seconds / dt)):
@@ -109,7 +112,7 @@ def test_a_stopped_robot_brakes_softly() -> None:
 # Lidar
 
 
-def oracle(world: World, spec: LidarSpec, seer: str) -> np.ndarray[Any, Any]:
+def oracle(world: World, spec: LidarSpec, seer: str) -> npt.NDArray[np.float64]:
     """The same scan, beam by beam with pymunk."""
     robot = world.robots[seer]
     pose = robot.pose

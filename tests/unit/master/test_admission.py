@@ -188,8 +188,8 @@ def test_a_group_is_on_one_machine_with_addresses_of_one_network(world: World) -
     for process in ("c1", "c2"):
         world.container_set(process, networks=("none", "group"), slots=3)
 
-    def member(tag: str, address: str = "", user: str = "anna", **more: Any) -> None:
-        world.container(tag, user, network=Network.GROUP, group="g", group_ip=address, **more)
+    def member(tag: str, address: str = "", user: str = "anna") -> None:
+        world.container(tag, user, network=Network.GROUP, group="g", group_ip=address)
 
     member("a", "10.0.0.2/24")
     with pytest.raises(

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Unpack
 
 import pytest
-from support.master_world import World
+from support.master_world import StatusParts, World
 
 from rce.control.model import EndpointState, EndpointStatus, LinkAddress, NodeState, NodeStatus
 from rce.model.specs import Network, ResourceChanges
@@ -20,7 +20,11 @@ def drain(world: World, machine: str = "m1", *, undo: bool = False) -> Changes:
 
 
 def report(
-    world: World, tag: str, process: str, state: EndpointState = EndpointState.RUNNING, **fields: Any
+    world: World,
+    tag: str,
+    process: str,
+    state: EndpointState = EndpointState.RUNNING,
+    **fields: Unpack[StatusParts],
 ) -> Changes:
     fields.setdefault("address", LinkAddress(machine=process, unix=f"/{process}/{tag}"))
     return world.report(process, EndpointStatus(id=f"anna/{tag}", revision=1, state=state, **fields))

@@ -5,9 +5,10 @@ import os
 import subprocess
 import sys
 import xml
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
+from typing import Protocol
 
 import pytest
 
@@ -140,8 +141,14 @@ def test_installed_packages_have_programs_in_lib(tmp_path: Path) -> None:
     assert index.find("tools").executable("relay") == [str(programs / "relay")]
 
 
+class Distributed(Protocol):
+    """Sets entry points: group, name, value; see :func:`distributed`."""
+
+    def __call__(self, *points: tuple[str, str, str]) -> None: ...
+
+
 @pytest.fixture
-def distributed(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
+def distributed(monkeypatch: pytest.MonkeyPatch) -> Iterator[Distributed]:
     """Lets installed distributions have the entry points that a test gives."""
 
     def forget() -> None:
@@ -157,7 +164,7 @@ def distributed(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]
     forget()
 
 
-def test_distributions_add_nodes_that_are_functions(distributed: Callable[..., None]) -> None:
+def test_distributions_add_nodes_that_are_functions(distributed: Distributed) -> None:
     distributed(("rce.nodes", "Clock:now.py", "time:time_ns"))
     with pytest.raises(
         BadPackageError, match="no file of a module time"
@@ -169,7 +176,7 @@ def test_distributions_add_nodes_that_are_functions(distributed: Callable[..., N
     assert done.stdout == '{\n    "a": 1\n}\n'
 
 
-def test_distributions_add_packages_with_nodes_that_are_scripts(distributed: Callable[..., None]) -> None:
+def test_distributions_add_packages_with_nodes_that_are_scripts(distributed: Distributed) -> None:
     distributed(
         ("rce.packages", "shop", "xml"),
         ("rce.nodes", "shop:tool.py", "json.tool"),
@@ -184,7 +191,7 @@ def test_distributions_add_packages_with_nodes_that_are_scripts(distributed: Cal
 
 
 def test_packages_on_the_path_go_before_those_of_distributions(
-    distributed: Callable[..., None], tmp_path: Path
+    distributed: Distributed, tmp_path: Path
 ) -> None:
     distributed(("rce.packages", "shop", "json"))
     folder = make(tmp_path / "shop")
