@@ -90,17 +90,22 @@ class Timing:
     """Times in seconds, sizes in bytes."""
 
     locate: float = 10.0
-    """For the master's answer."""
+    """Seconds for the master's answer."""
     open: float = 25.0
-    """For the WebSocket handshake; the endpoint itself may wait some seconds for the master."""
+    """Seconds for the WebSocket handshake; the endpoint itself may wait some seconds for the master."""
     ping_interval: float | None = 10.0
+    """Seconds between two pings; None for no pings."""
     ping_timeout: float | None = 10.0
+    """Seconds for the answer to a ping, after which the connection counts as lost; None for no limit."""
     close: float = 3.0
+    """Seconds for the closing handshake."""
     flush: float = 5.0
-    """For what waits to be sent when the connection is closed by the program."""
+    """Seconds for what waits to be sent when the program closes the connection."""
     max_message: int = 64 << 20
+    """Bytes of the largest message that is taken from the engine."""
     write_buffer: tuple[int, int] = (128 << 10, 32 << 10)
-    """What waits stays in the queue, where it can be overtaken, while so much waits in the socket."""
+    """Bytes in the socket above which messages stay in their queue, where others can overtake them, and below
+    which the next one follows."""
     backoff: Backoff = Backoff(first=0.2, longest=15.0, jitter=1.0)
     """Pauses between attempts to connect."""
 
@@ -109,19 +114,19 @@ class Listener(Protocol):
     """Gets the events of an engine transport. Called in the event loop; must not block."""
 
     def on_connecting(self) -> None:
-        """An attempt to connect begins."""
+        """Learn that an attempt to connect begins."""
 
     def on_failure(self, error: ClientError) -> None:
-        """It failed; another one follows, or :meth:`EngineTransport.run` ends with this error."""
+        """Learn that it failed; another one follows, or :meth:`EngineTransport.run` ends with this error."""
 
     def on_connected(self) -> None:
-        """The connection is there; what is posted from now on is sent."""
+        """Learn that there is a connection; what is posted from now on is sent."""
 
     def on_lost(self, error: LostError) -> None:
-        """The connection ended."""
+        """Learn that the connection ended."""
 
     def on_event(self, event: Event) -> None:
-        """Something came."""
+        """Take what came from the engine."""
 
 
 class EngineTransport:
@@ -175,14 +180,20 @@ class EngineTransport:
             await asyncio.sleep(pauses.next())
 
     def post_data(self, tag: str, frames: Sequence[Frame], key: str | None = None) -> bool:
-        """Send a topic's message when its turn comes; False if there is no connection."""
+        """Send a topic's message when its turn comes; return False if there is no connection.
+
+        Args:
+            tag: The interface.
+            frames: The message's frames.
+            key: A queued message with a key is dropped only for a newer one of the same key.
+        """
         if self.connected:
             self._idle.clear()
             self._queue.put_data(tag, QueuedMessage.of(frames, key))
         return self.connected
 
     def post_control(self, frames: Sequence[Frame]) -> bool:
-        """Send a message that must not be lost; False if there is no connection or too much waits."""
+        """Send a message that must not be lost; return False without a connection or if the queue is full."""
         if not self.connected or self._queue.full:
             return False
         self.post_request(frames)
@@ -210,7 +221,7 @@ class EngineTransport:
         return queued.sent
 
     async def flush(self) -> None:
-        """Wait until nothing waits to be sent, at most :attr:`Timing.flush`."""
+        """Wait until nothing waits to be sent, at most :attr:`Timing.flush` seconds."""
         try:
             async with asyncio.timeout(self._timing.flush):
                 await self._idle.wait()

@@ -21,9 +21,11 @@ class QueueLimits:
     """How much may wait to be sent. A topic's queue always takes one message, however large."""
 
     topic_messages: int = 64
+    """Messages of one topic; then the oldest is dropped."""
     topic_bytes: int = 16 << 20
+    """Bytes of the messages of one topic; then the oldest are dropped."""
     control_messages: int = 1024
-    """Service messages and requests; sending another waits."""
+    """Service messages; then calls fail. Requests are always taken."""
 
 
 @dataclass(eq=False, slots=True)
@@ -82,7 +84,7 @@ class SendQueue:
         self._filled.set()
 
     def pop(self) -> QueuedMessage | None:
-        """Take what is to be sent next, None if nothing waits."""
+        """Remove and return what is to be sent next; None if nothing waits."""
         if self._control:
             return self._control.popleft()
         if not self._topics:
@@ -94,14 +96,14 @@ class SendQueue:
         return queued
 
     async def get(self) -> QueuedMessage:
-        """Wait for what is to be sent next."""
+        """Wait until there is something to send; remove and return it. Cancelling removes nothing."""
         while (queued := self.pop()) is None:
             self._filled.clear()
             await self._filled.wait()
         return queued
 
     def clear(self) -> None:
-        """Throw away everything, because there is no connection to send it on."""
+        """Remove everything, as there is no connection; senders that wait get a :class:`LostError`."""
         while (queued := self.pop()) is not None:
             if queued.sent is not None and not queued.sent.done():
                 queued.sent.set_exception(LostError("the connection ended before the message was sent"))

@@ -221,11 +221,11 @@ class Session:
     # What the transport tells: rce_client.engine_transport.Listener
 
     def on_connecting(self) -> None:
-        """An attempt to connect begins."""
+        """Learn that an attempt to connect begins."""
         self._happen(ConnectionEvent.DIAL, CONNECTING)
 
     def on_failure(self, error: ClientError) -> None:
-        """It failed. A program that does not listen is told in the log what only a person can repair."""
+        """Learn that it failed; without ``on_state``, log what only a person can repair."""
         repairable = isinstance(error, (InUseError, UntrustedError))
         if self._on_state is None and repairable and self._reminder.is_due(str(error)):
             _log.warning("%s: %s", self.robot, error)
@@ -287,7 +287,7 @@ class Session:
             self._backlog.append(request)
 
     def _take_fault(self, fault: Fault) -> None:
-        """Tell of what came and cannot be read; a service call that it was part of fails."""
+        """Report what came and cannot be read; fail the service call that it was part of."""
         text = f"unreadable: {fault.text}"
         if fault.call is None or not self.interfaces.fail(fault.call.i_tag, fault.call.msg_id, text):
             self._take_error(text)

@@ -164,7 +164,7 @@ async def remove(conn: Connection) -> None:
 
 
 def summary(config: ClientConfig) -> str:
-    """Print the content of a config file in words."""
+    """Return the content of a config file in words."""
     plan = make_plan(config)
     lines = [f"{config.robot} of user {config.user} at {config.url}"]
     lines += [f"  container {item.tag}" for item in config.containers]

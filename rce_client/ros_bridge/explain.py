@@ -53,7 +53,7 @@ def _end(path: str, interfaces: dict[str, InterfaceSpec]) -> tuple[str, str]:
 
 
 def long_form(config: ClientConfig) -> str:
-    """Write the file without bridges, as JSON; credentials are left out."""
+    """Return the file without bridges, as JSON; credentials are left out."""
     data: dict[str, Any] = config.model_dump(
         by_alias=True, exclude_defaults=True, exclude={"bridges", "password", "token"}
     )
@@ -61,7 +61,7 @@ def long_form(config: ClientConfig) -> str:
 
 
 def picture(config: ClientConfig) -> str:
-    """Draw the wiring: endpoints, and below each what leaves it."""
+    """Return the wiring as text: endpoints, and below each what leaves it."""
     found = list(wires(config))
     width = max((len(wire.source_name) for wire in found), default=0)
     lines = []
@@ -76,7 +76,7 @@ def picture(config: ClientConfig) -> str:
 
 
 def dot(config: ClientConfig) -> str:
-    """Draw the wiring for Graphviz: ``rce-ros FILE --explain --dot | dot -Tsvg``."""
+    """Return the wiring for Graphviz: ``rce-ros FILE --explain --dot | dot -Tsvg``."""
     found = list(wires(config))
     endpoints = dict.fromkeys((config.robot, *(one.tag for one in config.containers)))
     endpoints |= dict.fromkeys(name for wire in found for name in (wire.source, wire.target))

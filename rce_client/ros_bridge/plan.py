@@ -66,7 +66,7 @@ class Plan:
 
 
 def make_plan(config: ClientConfig) -> Plan:
-    """Plan the bridge of a robot."""
+    """Return what is to be done for a robot's config."""
     spans = tuple(
         Span(own.tag, own.kind.role, own.message_type, own.addr)
         for own in config.robot_interfaces

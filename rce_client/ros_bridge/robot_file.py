@@ -51,7 +51,11 @@ class RobotFile:
             return await self.complete(node, say)
 
     async def complete(self, node: Node, say: Callable[[str], None]) -> ClientConfig:
-        """Do the same with a node that is in the robot's graph already."""
+        """Return the complete file; ask the robot's graph for missing types, by a node that is in it.
+
+        Raises:
+            ConfigError: A type cannot be read, or does not fit.
+        """
         if not self.draft.untyped:
             return self.draft
         found = await find_types(self.draft.untyped, node, self._source, say)
