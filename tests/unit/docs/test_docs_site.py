@@ -62,6 +62,12 @@ def test_files_outside_of_the_pages_are_found(link: str, place: str) -> None:
     assert outside("reference/fleet.md", link) == place
 
 
+def test_the_menu_has_every_page() -> None:
+    menu = re.findall(r"([\w/-]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    pages = [str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md")]
+    assert sorted(menu) == sorted(pages), "put it under nav in mkdocs.yml"
+
+
 def test_the_site_asks_no_other_host() -> None:
     """Fonts, scripts and styles come with the theme; only links may lead elsewhere."""
     text = (ROOT / "mkdocs.yml").read_text()
