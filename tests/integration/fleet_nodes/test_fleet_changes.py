@@ -167,3 +167,20 @@ async def test_a_station_follows_the_planner_that_comes_after() -> None:
                 await station.until(lambda: any(change.freed for change in station.changes[before:]))
                 await station.until(lambda: station.view.blocked() == [9])
             assert any("the planner was restarted" in text for text in station.events)
+
+
+async def test_an_earlier_planner_is_followed_by_its_whole_states() -> None:
+    """A planner of the release before publishes ``/fleet/state`` and nothing else."""
+    async with (
+        Core(port=0) as core,
+        Node("planner", argv=[], master_uri=core.uri, types=TypeRegistry(PACKAGES), signals=False) as node,
+    ):
+        states = await node.advertise("/fleet/state", "fleet/FleetState", latch=True)
+        states.publish(rows=4, columns=4, cell_size=1.0, blocked=[1])
+        station = Station(core)
+        async with station.running():
+            await station.until(lambda: station.view.blocked() == [1])
+            states.publish(rows=4, columns=4, cell_size=1.0, blocked=[2])
+            await station.until(lambda: station.view.blocked() == [2])
+            assert station.changes[-1] == ViewChange(blocked=(2,), freed=(1,))
+            assert not station.client.follows_changes
