@@ -171,6 +171,14 @@ async def test_the_page_shows_engine_and_refusals() -> None:
         engine = await page.locator("#engine").inner_text()
         assert "cTag_01 running" in engine
         assert "moveClient_1 running" in engine
+        # The station hears changes in place of whole states.
+        await page.wait_for_function(
+            """() => {
+                const tags = rceFleet.fleet.engine.connections.map(connection => connection.tag_a);
+                const has = tag => tags.includes(`cTag_fleet/${tag}`);
+                return has("fleetChanges") && has("getState") && !has("fleetState");
+            }"""
+        )
         wall = await page.evaluate("[...rceFleet.fleet.walls][0]")
         async with page.expect_response(lambda reply: f"/cells/{wall}" in reply.url) as answered:
             await click_cell(page, wall)
