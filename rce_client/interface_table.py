@@ -11,7 +11,7 @@ from rce_client.services import ServiceClient
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rce.protocol.messages import DataMessage
+    from rce.protocol.messages import CallId, DataMessage, ErrorReport
     from rce_client.interfaces import ClientInterface
 
 _MOST_EARLY = 64
@@ -103,9 +103,12 @@ class InterfaceTable:
             interface.on_fault(msg_id, text)
         return isinstance(interface, ServiceClient)
 
-    def is_call(self, tag: str) -> bool:
-        """Return whether an interface is a service client."""
-        return isinstance(self._interfaces.get(tag), ServiceClient)
+    def call_of(self, report: ErrorReport) -> CallId | None:
+        """Return the service call of this program that an ``ER`` is about."""
+        if report.call is not None:
+            return report.call if isinstance(self._interfaces.get(report.call.i_tag), ServiceClient) else None
+        clients = [one for one in self._interfaces.values() if isinstance(one, ServiceClient)]
+        return next((call for one in clients if (call := one.call_of(report.text)) is not None), None)
 
     def lose(self) -> None:
         """Learn that the connection ended: as far as is known here, no interface is joined any more."""

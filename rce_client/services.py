@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 import inspect
 import logging
-import re
 import uuid
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from rce.model.names import Role
+from rce.protocol.messages import CallId
 from rce_client.exceptions import CallError, CallTimeoutError, NotConnectedError
 from rce_client.interfaces import ClientInterface, InterfaceOwner
 
@@ -22,8 +22,6 @@ _log = logging.getLogger(__name__)
 
 M = TypeVar("M")
 """What messages look like: ``dict[str, Any]`` with a converter, bytes-like with a forwarder."""
-
-_CALL_FAULT = re.compile(r"(?P<tag>\w+), msgID (?P<id>\w+): (?P<text>.*)", re.DOTALL)
 
 
 class ServiceClient(ClientInterface, Generic[M]):
@@ -85,6 +83,11 @@ class ServiceClient(ClientInterface, Generic[M]):
         answer = self._calls.get(msg_id)
         if answer is not None and not answer.done():
             answer.set_exception(CallError(f"{self.tag}: {text}"))
+
+    def call_of(self, text: str) -> CallId | None:
+        """Return the call that an ``ER`` names in its text only, as engines of the release before do."""
+        calls = (CallId(self.tag, msg_id) for msg_id in self._calls)
+        return next((call for call in calls if text.startswith(f"{call}: ")), None)
 
     def on_lost(self) -> None:
         """Fail all calls; whether they were carried out is not known."""
@@ -159,9 +162,3 @@ class ServiceProvider(ClientInterface, Generic[M]):
             frames = self._frames(f"the answer cannot be sent: {error}", msg_id)
         if not self._owner.post_control(frames):
             _log.warning("%s: no connection to send an answer on", self.tag)
-
-
-def read_call_fault(text: str) -> tuple[str, str, str] | None:
-    """Return interface tag, msgID and problem if an ``ER`` is about one message."""
-    found = _CALL_FAULT.fullmatch(text)
-    return None if found is None else (found["tag"], found["id"], found["text"])

@@ -28,7 +28,6 @@ from rce_client.interface_table import InterfaceTable
 from rce_client.life import CONNECTION_LIFE, ConnectionEvent, State
 from rce_client.reminder import Reminder
 from rce_client.sendqueue import QueueLimits
-from rce_client.services import read_call_fault
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
@@ -256,7 +255,7 @@ class Session:
             case LatchedSources():
                 self.interfaces.keep_latched(event.i_tag, event.sources)
             case ErrorReport():
-                self._take_error(event.text)
+                self._take_report(event)
             case Fault():
                 self._take_fault(event)
             case (
@@ -292,11 +291,14 @@ class Session:
         if fault.call is None or not self.interfaces.fail(fault.call.i_tag, fault.call.msg_id, text):
             self._take_error(text)
 
+    def _take_report(self, report: ErrorReport) -> None:
+        call = self.interfaces.call_of(report)
+        if call is None:
+            self._take_error(report.text)
+        else:
+            self.interfaces.fail(call.i_tag, call.msg_id, report.text.removeprefix(f"{call}: "))
+
     def _take_error(self, text: str) -> None:
-        fault = read_call_fault(text)
-        if fault is not None and self.interfaces.is_call(fault[0]):
-            self.interfaces.fail(*fault)
-            return
         self.errors.append(text)
         if self._on_error is not None:
             self._on_error(text)

@@ -12,9 +12,40 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+from rce.protocol.calls import call_at
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from rce.protocol.messages import CallId
+
 
 class RobotError(Exception):
-    """Base of all faults of :mod:`rce_robot`; the text is fit for an ``ER``."""
+    """Base of all faults of :mod:`rce_robot`; the text is fit for an ``ER``.
+
+    Attributes:
+        call: The service call that ends with it, if it is one's.
+    """
+
+    call: CallId | None = None
+
+    @classmethod
+    def at(cls, tag: str, msg_id: str, problem: str) -> Self:
+        """Make the fault of a message at an interface, which is a service call's or not."""
+        call = call_at(tag, msg_id)
+        error = cls(problem if call is not None else f"{tag}: {problem}")
+        error.call = call
+        return error
+
+    @property
+    def problem(self) -> str:
+        """The words without the call."""
+        return super().__str__()
+
+    def __str__(self) -> str:
+        return self.problem if self.call is None else f"{self.call}: {self.problem}"
 
 
 class UnreadableError(RobotError):
@@ -35,7 +66,9 @@ class ConversionError(UnreadableError, ValueError):
         self.field = field
         self.reason = reason
 
-    def __str__(self) -> str:
+    @property
+    def problem(self) -> str:
+        """The words without the call."""
         return f"{self.field}: {self.reason}"
 
 

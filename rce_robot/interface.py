@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from rce.aio.queues import OverflowPolicy
 from rce.link import Interface
-from rce.protocol.messages import NO_ID
-from rce_robot.exceptions import MisdirectedError, UnreadableError
+from rce_robot.exceptions import MisdirectedError, RobotError, UnreadableError
 from rce_robot.offload import Offload, Read
 
 if TYPE_CHECKING:
@@ -16,7 +15,7 @@ if TYPE_CHECKING:
 
     from rce.guard.holdings import Holding
     from rce.link import Port
-    from rce.protocol.messages import DataMessage
+    from rce.protocol.messages import CallId, DataMessage
     from rce.protocol.stream import LargeData
     from rce_robot.conversion import Result
     from rce_robot.conversion.jobs import Job
@@ -44,8 +43,8 @@ class RobotSide(Protocol):
     def send_urgent(self, message: Queued) -> bool:
         """Send in the control lane; False if that is full or the robot is away."""
 
-    def report(self, text: str) -> None:
-        """Send an ``ER``."""
+    def report(self, problem: str, call: CallId | None = None) -> None:
+        """Send an ``ER``; with a call: that it failed."""
 
     def show_active(self, tag: str, active: bool) -> None:
         """Send an ``ST``."""
@@ -145,9 +144,8 @@ class RobotInterface(Interface):
         Raises:
             RobotError: It is refused.
         """
-        raise MisdirectedError(
-            f"{self._name(large.address.msg_id)}: the interface takes nothing from the robot"
-        )
+        problem = "the interface takes nothing from the robot"
+        raise MisdirectedError.at(self.tag, large.address.msg_id, problem)
 
     def keep_latched(self, sources: Sequence[str]) -> None:
         """Take note that the robot's sources other than these ended."""
@@ -170,7 +168,7 @@ class RobotInterface(Interface):
 
     def not_rendered(self, msg_id: str, problem: str) -> None:
         """Deal with a message to the robot that could not be converted."""
-        self.robot.report(f"{self._name(msg_id)}: {problem}")
+        self._report(problem, msg_id)
 
     def pack(self, msg: Any, msg_id: str) -> Rendered:
         """Return the data message that carries ``msg`` to the robot."""
@@ -188,7 +186,7 @@ class RobotInterface(Interface):
         try:
             return self.form_in.read(message.msg, warn)
         except UnreadableError as error:
-            raise UnreadableError(f"{self._name(message.msg_id)}: {error}") from error
+            raise UnreadableError.at(self.tag, message.msg_id, str(error)) from error
 
     async def read_large(self, large: LargeData) -> Read:
         """Convert a message that was not parsed yet; one that needs binary values comes again with them."""
@@ -203,8 +201,10 @@ class RobotInterface(Interface):
             self._warned.add(text)
             self.robot.report(f"{self.tag}: {text}")
 
-    def _name(self, msg_id: str) -> str:
-        return self.tag if msg_id == NO_ID else f"{self.tag}, msgID {msg_id}"
+    def _report(self, problem: str, msg_id: str) -> None:
+        """Tell the robot of a fault of one message, which is a service call's or not."""
+        error = RobotError.at(self.tag, msg_id, problem)
+        self.robot.report(error.problem, error.call)
 
     async def _send_service(self, payload: Buffer, msg_id: str) -> bool:
         """Send a request or an answer to the robot; False if too much waits.

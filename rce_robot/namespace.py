@@ -18,7 +18,6 @@ from rce.control.model import EndpointState, EndpointStatus, EndpointUsage, Inte
 from rce.guard.holdings import Holdings
 from rce.link import Endpoint, InterfaceError
 from rce.model.names import EndpointId, InterfaceType
-from rce.protocol.calls import call_at
 from rce.protocol.http import LATCH
 from rce_robot.exceptions import MisdirectedError
 from rce_robot.interfaces import make_interface
@@ -32,8 +31,7 @@ if TYPE_CHECKING:
     from rce.link import Interface, LinkHub, Port
     from rce.model.requests import Request
     from rce.model.specs import InterfaceSpec
-    from rce.protocol.calls import CallId
-    from rce.protocol.messages import DataMessage
+    from rce.protocol.messages import CallId, DataMessage
     from rce.protocol.stream import LargeData
     from rce_robot.conversion import ConversionPool, Result
     from rce_robot.conversion.jobs import Job
@@ -252,13 +250,13 @@ class Namespace:
         """
         interface = self._interfaces.get(message.i_tag)
         if interface is None:
-            name = call_at(message.i_tag, message.msg_id) or message.i_tag
-            raise MisdirectedError(f"{name}: robot {self.id.tag} has no such interface")
+            problem = f"robot {self.id.tag} has no such interface"
+            raise MisdirectedError.at(message.i_tag, message.msg_id, problem)
         if message.message_type != interface.message_type:
-            name = call_at(message.i_tag, message.msg_id) or message.i_tag
-            problem = f"{name}: carries {interface.message_type}, not {message.message_type}"
-            interface.refused(message.msg_id, problem)
-            raise MisdirectedError(problem)
+            problem = f"carries {interface.message_type}, not {message.message_type}"
+            error = MisdirectedError.at(message.i_tag, message.msg_id, problem)
+            interface.refused(message.msg_id, str(error))
+            raise error
         interface.take(message)
 
     def take_large(self, large: LargeData) -> None:
@@ -268,10 +266,10 @@ class Namespace:
             RobotError: It is refused; the interface knows.
         """
         address = large.address
-        name = large.call or address.i_tag
         interface = self._interfaces.get(address.i_tag)
         if interface is None:
-            raise MisdirectedError(f"{name}: robot {self.id.tag} has no such interface")
+            problem = f"robot {self.id.tag} has no such interface"
+            raise MisdirectedError.at(address.i_tag, address.msg_id, problem)
         if address.message_type and address.message_type != interface.message_type:
             problem = f"carries {interface.message_type}, not {address.message_type}"
         elif not interface.form_in.readable:
@@ -279,8 +277,9 @@ class Namespace:
         else:
             interface.take_large(large)
             return
-        interface.refused(address.msg_id, f"{name}: {problem}")
-        raise MisdirectedError(f"{name}: {problem}")
+        error = MisdirectedError.at(address.i_tag, address.msg_id, problem)
+        interface.refused(address.msg_id, str(error))
+        raise error
 
     def keep_latched(self, i_tag: str, sources: Sequence[str]) -> None:
         """Let what the robot's other sources latched at an interface end."""
@@ -333,10 +332,10 @@ class Namespace:
         """Send in the control lane."""
         return self._live is not None and self._live.send_urgent(message)
 
-    def report(self, text: str) -> None:
+    def report(self, problem: str, call: CallId | None = None) -> None:
         """Send an ``ER``, if the robot is there."""
         if self._live is not None:
-            self._live.report(text)
+            self._live.report(problem, call)
 
     def show_active(self, tag: str, active: bool) -> None:
         """Send an ``ST``, if the robot is there."""

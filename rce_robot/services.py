@@ -46,7 +46,7 @@ class AskedByRobot(RobotInterface):
 
     def _run(self, work: Coroutine[Any, Any, None], msg_id: str) -> None:
         if not self.robot.run(work):
-            raise BusyError(f"{self._name(msg_id)}: too many calls wait for an answer")
+            raise BusyError.at(self.tag, msg_id, "too many calls wait for an answer")
 
     async def _convert_and_call(self, reading: Coroutine[Any, Any, Read], msg_id: str, size: int) -> None:
         """Call with a request that another process converts."""
@@ -59,7 +59,7 @@ class AskedByRobot(RobotInterface):
             await self._call(read.payload, msg_id)
         elif not read.ids:
             problem = read.fault or "a string is not an object of the fields of the request"
-            self.robot.report(f"{self._name(msg_id)}: {problem}")
+            self._report(problem, msg_id)
 
     @contextlib.contextmanager
     def _held(self, size: int, msg_id: str) -> Iterator[None]:
@@ -79,26 +79,26 @@ class AskedByRobot(RobotInterface):
         finally:
             holding.release()
             if given_up:
-                self.robot.report(f"{self._name(msg_id)}: memory is short; the call was given up")
+                self._report("memory is short; the call was given up", msg_id)
 
     async def _call(self, payload: Buffer, msg_id: str) -> None:
         try:
             with self._held(len(payload), msg_id):
                 answer = await self.port.call(payload)
         except CallError as error:
-            self.robot.report(f"{self._name(msg_id)}: {error}")
+            self._report(str(error), msg_id)
             return
         except Exception:  # noqa: BLE001 - logged; the caller must hear of the end of its call
             _log.exception("service call at %s", self.tag)
-            self.robot.report(f"{self._name(msg_id)}: internal error; the engine's log tells more")
+            self._report("internal error; the engine's log tells more", msg_id)
             return
         try:
             sent = await self._send_service(answer, msg_id)
         except UnreadableError as error:
-            self.robot.report(f"{self._name(msg_id)}: {error}")
+            self._report(str(error), msg_id)
             return
         if not sent:
-            self.robot.report(f"{self._name(msg_id)}: the answer was dropped, too much waits to be sent")
+            self._report("the answer was dropped, too much waits to be sent", msg_id)
 
 
 class AnsweredByRobot(RobotInterface):
@@ -139,7 +139,7 @@ class AnsweredByRobot(RobotInterface):
         """Complete a call. A string in place of ``msg`` is the robot's word for why it failed."""
         answer = self._calls.get(message.msg_id)
         if answer is None or answer.done():
-            raise MisdirectedError(f"{self._name(message.msg_id)}: no call waits for this answer")
+            raise MisdirectedError.at(self.tag, message.msg_id, "no call waits for this answer")
         if isinstance(message.msg, str):
             answer.set_exception(PeerFaultError(message.msg))
             return
@@ -156,13 +156,13 @@ class AnsweredByRobot(RobotInterface):
     def take_large(self, large: LargeData) -> None:
         """Complete a call when its answer has been converted."""
         if large.address.msg_id not in self._calls:
-            raise MisdirectedError(f"{self._name(large.address.msg_id)}: no call waits for this answer")
+            raise MisdirectedError.at(self.tag, large.address.msg_id, "no call waits for this answer")
         self._convert(self.read_large(large), large.address.msg_id, large.size)
 
     def _convert(self, reading: Coroutine[Any, Any, Read], msg_id: str, size: int) -> None:
         if not self.robot.run(self._complete(reading, msg_id, size)):
             reading.close()
-            raise BusyError(f"{self._name(msg_id)}: too much is converted already")
+            raise BusyError.at(self.tag, msg_id, "too much is converted already")
 
     async def _complete(self, reading: Coroutine[Any, Any, Read], msg_id: str, size: int) -> None:
         """Complete a call with an answer that another process converts."""
@@ -182,7 +182,7 @@ class AnsweredByRobot(RobotInterface):
             answer.set_exception(PeerFaultError(read.text))
         else:
             answer.set_exception(PeerFaultError(f"the robot's answer cannot be read: {read.fault}"))
-            self.robot.report(f"{self._name(msg_id)}: {read.fault}")
+            self._report(read.fault, msg_id)
 
     def refused(self, msg_id: str, problem: str) -> None:
         """Fail the call: its answer is lost."""

@@ -23,7 +23,6 @@ from rce.model.requests import (
     DestroyContainer,
     ResizeContainer,
 )
-from rce.protocol.calls import call_at
 from rce.protocol.codec import encode
 from rce.protocol.http import LATCH, SINGLE_FRAME
 from rce.protocol.limits import Limits
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
     from collections.abc import Coroutine, Iterator, Sequence
 
     from rce.model.requests import Request
-    from rce.protocol.calls import CallId
+    from rce.protocol.messages import CallId
     from rce.protocol.stream import Event
     from rce_robot.outbox import Queued
     from rce_robot.settings import SessionSettings
@@ -245,10 +244,13 @@ class Session:
         self._owner.grew()
         return taken
 
-    def report(self, text: str) -> None:
+    def report(self, problem: str, call: CallId | None = None) -> None:
         """Send an ``ER``; one that finds the lane full is dropped, the log has it."""
-        if not self.send_urgent(_outgoing(ErrorReport(text=text))):
-            _log.info("not sent: %s", text)
+        self._send_report(ErrorReport(problem=problem, call=call))
+
+    def _send_report(self, report: ErrorReport) -> None:
+        if not self.send_urgent(_outgoing(report)):
+            _log.info("not sent: %s", report.text)
 
     def show_active(self, tag: str, active: bool) -> None:
         """Send an ``ST``."""
@@ -367,17 +369,18 @@ class Session:
                 try:
                     self._owner.take(event)
                 except RobotError as error:
-                    self.report(str(error))
+                    self.report(error.problem, error.call)
                 except Exception:  # noqa: BLE001 - logged; it must not end anything else
                     _log.exception("data message at %s", event.i_tag)
-                    name = call_at(event.i_tag, event.msg_id) or event.i_tag
-                    self.report(f"{name}: internal error; the engine's log tells more")
+                    problem = "internal error; the engine's log tells more"
+                    fault = RobotError.at(event.i_tag, event.msg_id, problem)
+                    self.report(fault.problem, fault.call)
             case LargeData():
                 self._handle_large(event)
             case LatchedSources():
                 self._owner.keep_latched(event.i_tag, event.sources)
             case Fault():
-                self.report(event.text)
+                self._send_report(event.report)
                 if event.call is not None:
                     self._owner.refused(event.call, event.text)
             case ErrorReport() | InterfaceStatus():
@@ -397,12 +400,12 @@ class Session:
         try:
             self._owner.take_large(large)
         except RobotError as error:
-            self.report(str(error))
+            self.report(error.problem, error.call)
 
     def _request(self, request: Request, size: int) -> None:
         if isinstance(request, (ConfigureComponents, ConfigureConnections)):
             for fault in request.faults:
-                self.report(str(fault))
+                self._send_report(ErrorReport(problem=str(fault), path=fault.path, code=fault.code))
             request = msgspec.structs.replace(request, faults=())
         waiting = self._waiting_bytes + size
         if (

@@ -52,7 +52,7 @@ class FromRobot(RobotInterface):
         try:
             packed = pack_value(message.msg)
         except UnreadableError as error:
-            raise UnreadableError(f"{self._name(message.msg_id)}: {error}") from error
+            raise UnreadableError.at(self.tag, message.msg_id, str(error)) from error
         self._put(len(packed), partial(self._convert_value, packed, message.msg_id, message.latch))
 
     def take_large(self, large: LargeData) -> None:
@@ -95,7 +95,7 @@ class FromRobot(RobotInterface):
         read = converted.read
         if read.fault or read.text is not None:
             problem = read.fault or "a string is not an object of the fields of the message"
-            self.robot.report(f"{self._name(converted.msg_id)}: {problem}")
+            self._report(problem, converted.msg_id)
         for warning in read.warnings:
             self._warn(warning)
         if read.payload is not None:
@@ -133,7 +133,7 @@ class ToRobot(RobotInterface):
 
     def take(self, message: DataMessage) -> None:
         """Refuse it."""
-        raise MisdirectedError(f"{self._name(message.msg_id)}: the interface takes nothing from the robot")
+        raise MisdirectedError.at(self.tag, message.msg_id, "the interface takes nothing from the robot")
 
     def receive(self, payload: bytes, *, latched: bool) -> None:
         """Send a peer's message to the robot."""

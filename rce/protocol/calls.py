@@ -6,21 +6,11 @@ that it names, as far as these can be read.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 from rce.model.names import is_name
 from rce.protocol.limits import MAX_MESSAGE_ID_LENGTH
-from rce.protocol.messages import NO_ID
-
-
-class CallId(NamedTuple):
-    """A service call at an interface of a robot."""
-
-    i_tag: str
-    msg_id: str
-
-    def __str__(self) -> str:
-        return f"{self.i_tag}, msgID {self.msg_id}"
+from rce.protocol.messages import NO_ID, CallId
 
 
 def call_of(value: Any) -> CallId | None:

@@ -24,6 +24,7 @@ from rce.protocol.messages import (
     LatchedSources,
     type_of,
 )
+from rce.protocol.reports import write_report
 from rce.protocol.requests import write_request
 from rce.protocol.single import MAX_PAYLOAD, encode_single
 
@@ -60,7 +61,7 @@ def encode(message: ClientMessage) -> list[Frame]:
     if isinstance(message, DataMessage):
         return encode_data(message.i_tag, message.message_type, message.msg, message.msg_id, message.latch)
     if isinstance(message, ErrorReport):
-        return encode_message("ER", message.text)
+        return [_encode(write_report(message)).decode()]
     if isinstance(message, LatchedSources | InterfaceStatus):
         return encode_message(type_of(message), msgspec.to_builtins(message))
     return encode_message(type_of(message), write_request(message))

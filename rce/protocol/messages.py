@@ -7,10 +7,11 @@ Wire source: ``docs/protocol.md``.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 from msgspec import Meta, Struct, field
 
+from rce.model.faults import FaultCode, Path
 from rce.model.requests import (
     ConfigureComponents,
     ConfigureConnections,
@@ -61,10 +62,32 @@ class InterfaceStatus(Struct, frozen=True, kw_only=True, omit_defaults=True, ren
     topic: str = field(default_factory=lambda: UPDATE_TOPIC)
 
 
+class CallId(NamedTuple):
+    """A service call at an interface of a robot."""
+
+    i_tag: str
+    msg_id: str
+
+    def __str__(self) -> str:
+        return f"{self.i_tag}, msgID {self.msg_id}"
+
+
 class ErrorReport(Struct, frozen=True, kw_only=True):
     """``ER``: something that the client asked for failed."""
 
-    text: str
+    problem: str
+    """What, without the call."""
+    call: CallId | None = None
+    """The service call that failed."""
+    path: Path = ()
+    """Where in a message the fault is."""
+    code: FaultCode | None = None
+    """Which kind of fault it is; None: not said."""
+
+    @property
+    def text(self) -> str:
+        """The words for people."""
+        return self.problem if self.call is None else f"{self.call}: {self.problem}"
 
 
 ClientMessage: TypeAlias = Request | DataMessage | LatchedSources | InterfaceStatus | ErrorReport

@@ -24,10 +24,10 @@ from rce.protocol.messages import (
     TYPES,
     ClientMessage,
     DataMessage,
-    ErrorReport,
     MessageId,
     SourceName,
 )
+from rce.protocol.reports import read_report
 from rce.protocol.requests import kind_of, read_request
 
 if TYPE_CHECKING:
@@ -216,7 +216,7 @@ def message_from_json(value: Any, accept: Collection[str] = TYPES) -> ClientMess
     if kind in REQUEST_TYPES:
         return read_request(kind, data)
     if kind == "ER":
-        return ErrorReport(text=_convert(data, str, "data"))
+        return read_report(_convert(data, str, "data"), value.get("fault"))
     if kind == "DM" and isinstance(data, dict) and "msgID" in data:
         data = {**data, "msgID": text_id(data["msgID"])}
     return _convert(data, TYPES[kind], "data")

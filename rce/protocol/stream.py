@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from msgspec import Struct
 
+from rce.model.faults import FieldFault
 from rce.protocol.assembler import Assembler, Binary
-from rce.protocol.calls import CallId, call_at, call_of
-from rce.protocol.exceptions import ProtocolError
+from rce.protocol.calls import call_at, call_of
+from rce.protocol.exceptions import MessageError, ProtocolError
 from rce.protocol.limits import DEFAULT_LIMITS, Limits
-from rce.protocol.messages import DOWNWARD, UPWARD, ClientMessage, DataMessage
+from rce.protocol.messages import DOWNWARD, UPWARD, CallId, ClientMessage, DataMessage, ErrorReport
 from rce.protocol.reading import (
     SerializedData,
     check_depth,
@@ -39,15 +40,31 @@ if TYPE_CHECKING:
 class Fault(Struct, frozen=True):
     """Something from the peer was refused or dropped; the stream continues."""
 
-    text: str
-    """Fit to be sent to the peer as ``ER``; it starts with the call, if there is one."""
+    problem: str
+    """What, without the call."""
     call: CallId | None = None
     """The service call that ends with this, because its request or its answer is lost."""
+    fields: tuple[FieldFault, ...] = ()
+    """What is wrong in a request."""
 
     @classmethod
-    def of(cls, problem: str, call: CallId | None) -> Self:
+    def of(cls, error: ProtocolError, call: CallId | None) -> Self:
         """Make the fault of a message, which is a service call's or not."""
-        return cls(problem if call is None else f"{call}: {problem}", call)
+        fields = error.faults if isinstance(error, MessageError) else ()
+        return cls(str(error), call, tuple(field for field in fields if field.path))
+
+    @property
+    def report(self) -> ErrorReport:
+        """What the peer is told."""
+        if not self.fields:
+            return ErrorReport(problem=self.problem, call=self.call)
+        first = self.fields[0]
+        return ErrorReport(problem=self.problem, call=self.call, path=first.path, code=first.code)
+
+    @property
+    def text(self) -> str:
+        """The words for people."""
+        return self.report.text
 
 
 class LargeData(Struct, frozen=True):
@@ -214,7 +231,7 @@ class ProtocolStream:
                 return [message_from_json(value, self._accept)]
             complete, dropped = self._assembler.add_message(value, len(text), now)
         except ProtocolError as error:
-            return [Fault.of(str(error), call_of(value))]
+            return [Fault.of(error, call_of(value))]
         return self._events(value if complete else None, dropped)
 
     def await_binaries(self, large: LargeData, ids: Collection[str], now: float) -> list[Event]:
@@ -231,7 +248,7 @@ class ProtocolStream:
                 waiting, ids, waiting.binaries, len(large.text), now
             )
         except ProtocolError as error:
-            return [Fault.of(str(error), waiting.call)]
+            return [Fault.of(error, waiting.call)]
         return self._events(waiting if complete else None, dropped)
 
     def feed_binary(self, frame: Binary, now: float) -> list[Event]:
@@ -261,7 +278,7 @@ class ProtocolStream:
             value = {"type": "DM", "data": message}
             return message_from_json(value, self._accept)
         except ProtocolError as error:
-            return Fault.of(str(error), call_of(value))
+            return Fault.of(error, call_of(value))
 
     def expire(self, now: float) -> list[Event]:
         """Drop what has been incomplete for too long."""
@@ -281,7 +298,7 @@ class ProtocolStream:
     def _too_long(self, text: str | bytes) -> Fault:
         limit = self._limits.max_text
         address = find_address(text) if isinstance(text, bytes) else None
-        return Fault.of(
+        return Fault(
             f"a text frame of {len(text)} is longer than the limit of {limit}",
             None if address is None else call_at(address.i_tag, address.msg_id),
         )
@@ -302,13 +319,13 @@ class ProtocolStream:
         try:
             return message_from_json(value, self._accept)
         except ProtocolError as error:
-            return Fault.of(str(error), call_of(value))
+            return Fault.of(error, call_of(value))
 
 
 def _fault(dropped: Dropped) -> Fault:
     """Tell of what will not become a message."""
     value = dropped.value
-    return Fault.of(
+    return Fault(
         dropped.text, value.call if isinstance(value, (_Serialized, _WaitingLarge)) else call_of(value)
     )
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rce.link import PeerFaultError
+from rce.protocol import codec
 from rce_client.connection import Connection, State
 from rce_client.exceptions import (
     CallError,
@@ -116,6 +117,24 @@ async def test_service_client(engine: Engine) -> None:
             await client({"data": "fail"})
         with pytest.raises(CallTimeoutError, match=r"0\.05"):
             await client({"data": "hang"}, timeout=0.05)
+        assert not conn.errors
+
+
+async def test_failed_call_is_known_from_the_text_of_an_older_engine(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An engine of the release before says in words only which call failed."""
+    monkeypatch.setattr(codec, "write_report", lambda report: {"type": "ER", "data": report.text})
+
+    async def answer(payload: bytes) -> bytes:
+        raise ValueError("no such thing")
+
+    async with engine.connection() as conn:
+        client = await conn.service_client("ask", ECHO)
+        await client.wait_active(10)
+        engine.end("ask").answer = answer
+        with pytest.raises(CallError, match="no such thing"):
+            await client({"data": "fail"})
         assert not conn.errors
 
 

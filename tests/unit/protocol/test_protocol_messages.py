@@ -71,7 +71,7 @@ def text(kind: str, data: Any) -> str:
         ),
         ("DM", {"iTag": "i", "type": "a/B", "msg": {}}, m.DataMessage("i", "a/B", {}, "nil")),
         ("ST", {"topic": "iu", "iTag": "i", "status": True}, m.InterfaceStatus(i_tag="i", status=True)),
-        ("ER", "no", m.ErrorReport(text="no")),
+        ("ER", "no", m.ErrorReport(problem="no")),
     ],
 )
 def test_message_is_read(kind: str, data: Any, expected: m.ClientMessage) -> None:

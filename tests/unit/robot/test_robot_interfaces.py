@@ -22,7 +22,7 @@ from rce.link import (
 )
 from rce.model.names import InterfaceType
 from rce.model.specs import InterfaceSpec
-from rce.protocol.messages import DataMessage
+from rce.protocol.messages import CallId, DataMessage, ErrorReport
 from rce.protocol.stream import LargeData
 from rce.protocol.weight import Address
 from rce.ros.types import TypeRegistry
@@ -95,8 +95,8 @@ class FakeRobot:
             self.urgent.append(rendered)
         return self.room
 
-    def report(self, text: str) -> None:
-        self.reports.append(text)
+    def report(self, problem: str, call: CallId | None = None) -> None:
+        self.reports.append(ErrorReport(problem=problem, call=call).text)
 
     def show_active(self, tag: str, active: bool) -> None:
         self.states.append(active)
