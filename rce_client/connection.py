@@ -25,8 +25,9 @@ __all__ = ["Connection", "State"]
 class Connection(Requests, OwnInterfaces):
     """A connection that stays: it dials again when it breaks, and restores what the program had made.
 
-    An async context manager: it is connected when its block begins, and closed when it ends. What was made in
-    the engine stays there; :meth:`remove_all` removes it.
+    An async context manager. Entering waits for the engine without limit (put ``asyncio.timeout`` around it
+    for one); cancelling ends the attempt. Leaving sends what waits, for at most ``timing.flush`` seconds, and
+    closes; cancelled, it closes at once. What was made in the engine stays there; :meth:`remove_all` removes it.
 
     Requests such as :meth:`create_container` return when they were handed to the network, or were noted for
     the reconnect while there is no connection. The protocol has no answer for success; what fails comes as
@@ -55,6 +56,9 @@ class Connection(Requests, OwnInterfaces):
                 await robot.add_node("brain", "echo", "Test", "stringEcho.py")
                 await robot.remove_all()
         ```
+
+    Raises:
+        RefusedError: On entering: the engine does not take this client.
     """
 
     def __init__(

@@ -30,7 +30,7 @@ For developers, and for operators who want to know how a state comes about. This
 made from the tables in the code (`make reference`).
 
 In the pictures, what leads to a state below leaves on the right side, what leads to one above on the left.
-Lines that meet at a dot lead to the same state. Each state of a box can follow each other one of it. A grey
+Lines that meet at a dot lead to the same state. Any state of a box may follow any other one in it. A grey
 box is an end. An event that changes nothing is only in the table; one that is not in a state's row cannot
 happen there."""
 
