@@ -27,7 +27,7 @@ class Connection(Requests, OwnInterfaces):
 
     An async context manager. Entering waits for the engine without limit (put ``asyncio.timeout`` around it
     for one); cancelling ends the attempt. Leaving sends what waits, for at most ``timing.flush`` seconds, and
-    closes; cancelled, it closes at once. What was made in the engine stays there; :meth:`remove_all` removes it.
+    closes; cancelled, it closes at once. What was made stays in the engine; :meth:`remove_all` removes it.
 
     Requests such as :meth:`create_container` return when they were handed to the network, or were noted for
     the reconnect while there is no connection. The protocol has no answer for success; what fails comes as
