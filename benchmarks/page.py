@@ -96,7 +96,7 @@ def _judged(target: Target, figure: float | None) -> str:
     return f"{figure:g} {target.incarnation} | {wanted} | {verdict}"
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 

@@ -33,7 +33,7 @@ class Target:
         return figure >= self.limit if self.at_least else figure <= self.limit
 
 
-def _column(column: str, **where: Any) -> Callable[[Rows], float | None]:
+def _column(column: str, **where: object) -> Callable[[Rows], float | None]:
     """Read a column of the last row in which other columns have these values."""
 
     def read(rows: Rows) -> float | None:
@@ -43,7 +43,7 @@ def _column(column: str, **where: Any) -> Callable[[Rows], float | None]:
     return read
 
 
-def _number(value: Any) -> float | None:
+def _number(value: object) -> float | None:
     """Read a figure; texts such as ``7.6 s`` by their number."""
     return None if value is None else float(str(value).split()[0])
 

@@ -39,7 +39,7 @@ class Robot:
         self.name = name
         self.status: dict[str, bool] = {}
 
-    async def send(self, kind: str, data: Any) -> None:
+    async def send(self, kind: str, data: object) -> None:
         """Send a message without binary values."""
         await self.socket.send(_write({"type": kind, "data": data}), text=True)
 

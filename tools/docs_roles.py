@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import griffe
 
@@ -25,7 +25,7 @@ _LITERAL = re.compile(r"^(.*?) *::$(?=\n\n )", re.MULTILINE)
 class Roles(griffe.Extension):
     """Rewrites all docstrings of a package once it is loaded."""
 
-    def on_package(self, *, pkg: griffe.Module, **_: Any) -> None:
+    def on_package(self, *, pkg: griffe.Module, **_: object) -> None:
         """Rewrite the docstrings of a package."""
         places = _places(pkg)
         for item in _objects(pkg):

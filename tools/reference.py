@@ -221,7 +221,7 @@ def _commands(name: str, command: Any) -> Iterator[str]:
         yield from _commands(f"{name} {each.name}", each)
 
 
-def _option(option: Any) -> str:
+def _option(option: object) -> str:
     return "| " + " | ".join(_cells(option)) + " |"
 
 
@@ -244,7 +244,7 @@ def _cells(option: Any) -> tuple[str, str, str]:
     return names.replace("|", r"\|"), kind.replace("|", r"\|").replace("[", r"\["), text.replace("|", r"\|")
 
 
-def _kind(annotation: Any) -> str:
+def _kind(annotation: object) -> str:
     if isinstance(annotation, type) and issubclass(annotation, Enum):
         return "|".join(str(each.value) for each in annotation)
     names = {"int": "NUMBER", "float": "NUMBER", "Path": "PATH", "str": "TEXT"}

@@ -82,7 +82,7 @@ class Peer:
         uri = f"http://{self.address}:{self.rpc_port}"
         return ("%.9f" % self.stamp, self.master_uri, "fkie", ME, uri)
 
-    def info(self, _filter: Any = None) -> tuple[Any, ...]:
+    def info(self, _filter: object = None) -> tuple[Any, ...]:
         """Answer ``masterInfo``."""
         with self.lock:
             assert self.state is not None

@@ -104,7 +104,7 @@ class Graph:
             await finish(process)
         return printed
 
-    async def ask(self, method: str, *arguments: Any) -> Any:
+    async def ask(self, method: str, *arguments: object) -> Any:
         """Call the master; None if it does not answer or refuses."""
         async with RpcClient() as rpc:
             try:

@@ -43,7 +43,7 @@ class Stranger:
         async with self._changed:
             self._changed.notify_all()
 
-    def _fill(self, value: Any) -> bool:
+    def _fill(self, value: object) -> bool:
         if not isinstance(value, dict):
             return True
         if not all(self._fill(inner) for inner in value.values()):
@@ -72,13 +72,13 @@ class Stranger:
     def queue(self, tag: str) -> asyncio.Queue[dict[str, Any]]:
         return self.data.setdefault(tag, asyncio.Queue())
 
-    async def send(self, kind: str, data: Any) -> None:
+    async def send(self, kind: str, data: object) -> None:
         await self.socket.send_str(json.dumps({"type": kind, "data": data}))
 
-    async def publish(self, tag: str, cls: str, message: Any) -> None:
+    async def publish(self, tag: str, cls: str, message: object) -> None:
         await self.send("DM", {"iTag": tag, "type": cls, "msgID": "nil", "msg": message})
 
-    async def call(self, tag: str, cls: str, message: Any, *, timeout: float = TIMEOUT_S) -> Any:
+    async def call(self, tag: str, cls: str, message: object, *, timeout: float = TIMEOUT_S) -> Any:
         number = f"call{next(self._numbers)}"
         await self.send("DM", {"iTag": tag, "type": cls, "msgID": number, "msg": message})
         async with asyncio.timeout(timeout):
@@ -147,7 +147,7 @@ async def wire_echo(client: Stranger, *, container: str = "cTag_01", robot: str 
 
 
 async def ask_for_echo(
-    client: Stranger, container: str, robot: str, requested: dict[str, Any] | None = None, **node: Any
+    client: Stranger, container: str, robot: str, requested: dict[str, Any] | None = None, **node: object
 ) -> None:
     """Ask for what :func:`wire_echo` makes, with resources for its container and more keys for its node.
 

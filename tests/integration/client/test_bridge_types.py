@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
 
 import pytest
 
@@ -14,7 +13,7 @@ from rce.ros.node import Node
 from rce_client.ros_bridge.type_lookup import find_types
 
 
-def bridge(**keys: Any) -> Bridge:
+def bridge(**keys: object) -> Bridge:
     return Bridge.model_validate(keys)
 
 

@@ -97,7 +97,7 @@ async def program(*arguments: str, master: str = "http://127.0.0.1:1/") -> Async
         await finish(process)
 
 
-def write(folder: Path, data: Any) -> str:
+def write(folder: Path, data: object) -> str:
     path = folder / "robot.config"
     path.write_text(json.dumps(data))
     return str(path)

@@ -95,7 +95,7 @@ class Fleet:
                 self._changed.clear()
                 await self._changed.wait()
 
-    async def ask(self, service: str, kind: str, **fields: Any) -> Any:
+    async def ask(self, service: str, kind: str, **fields: object) -> Any:
         await self._node.wait_for_service(service, timeout=10)
         reply = await self._node.service_client(service, kind)(**fields)
         assert reply.ok, reply.message

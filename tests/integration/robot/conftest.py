@@ -25,10 +25,10 @@ class Robot:
         self.socket = socket
         self._kept: list[dict[str, Any]] = []
 
-    async def send(self, type_: str, data: Any) -> None:
+    async def send(self, type_: str, data: object) -> None:
         await self.socket.send(json.dumps({"type": type_, "data": data}))
 
-    async def say(self, tag: str, cls: str, msg: Any, msg_id: str = "nil", key: str = "msg") -> None:
+    async def say(self, tag: str, cls: str, msg: object, msg_id: str = "nil", key: str = "msg") -> None:
         await self.send("DM", {"iTag": tag, "type": cls, "msgID": msg_id, key: msg})
 
     async def get(self, type_: str) -> Any:

@@ -8,7 +8,6 @@ import signal
 import socket
 import sys
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 from support.ros_nodes import MakeNode
@@ -234,7 +233,7 @@ async def test_a_large_graph(core: Core) -> None:
     nodes, parameters = 200, 5000
     async with RpcClient() as rpc:
 
-        async def call(method: str, *arguments: Any) -> None:
+        async def call(method: str, *arguments: object) -> None:
             await rpc.call(core.uri, method, arguments, timeout=120)
 
         async def join(number: int) -> None:

@@ -150,7 +150,7 @@ METHODS: dict[str, tuple[st.SearchStrategy[Any] | None, ...]] = {
 }
 
 
-def below(prefix: str, value: Any) -> Any:
+def below(prefix: str, value: object) -> Any:
     """Move a value into an example's own namespace."""
     return prefix + value[2:] if isinstance(value, str) and value.startswith("/P") else value
 
@@ -280,7 +280,7 @@ def parameter_server() -> Iterator[Popen[str]]:
         process.stdin.close()
 
 
-def perform(graph: Graph, node: str, method: str, key: str, *value: Any) -> list[Any]:
+def perform(graph: Graph, node: str, method: str, key: str, *value: object) -> list[Any]:
     """Do a step to a graph of ours; return whom it tells what."""
     if method == "subscribe":
         graph.subscribe_parameter(key, node, f"http://{node}")

@@ -52,7 +52,7 @@ async def running(graph: Graph, program: str, part: str) -> AsyncIterator[Progra
         await interrupt(process)
 
 
-async def until_set(node: Node, name: str, value: Any) -> None:
+async def until_set(node: Node, name: str, value: object) -> None:
     """Wait until the program has set a parameter."""
     async with asyncio.timeout(TIMEOUT_S):
         while await node.get_param(name, None) != value:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from typing import Any
 
 import pytest
 from aiohttp.test_utils import TestServer
@@ -46,7 +45,7 @@ async def test_the_page_follows_changes_and_repairs_gaps() -> None:
             page.set_default_timeout(WAIT_MS)
             await page.goto(str(server.make_url("/")))
 
-            async def shows(**wanted: Any) -> None:
+            async def shows(**wanted: object) -> None:
                 await page.wait_for_function(
                     f"wanted => {{ const shown = ({SHOWN})(); return Object.entries(wanted).every("
                     "([key, value]) => JSON.stringify(shown[key]) === JSON.stringify(value)); }",

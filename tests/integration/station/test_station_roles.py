@@ -52,7 +52,7 @@ class Site:
         self.tokens: dict[str, str] = {}
 
     async def master(
-        self, method: str, path: str, body: Any = None, *, token: str = "", status: int = 200
+        self, method: str, path: str, body: object = None, *, token: str = "", status: int = 200
     ) -> Any:
         headers = {"Authorization": f"Bearer {token or self.tokens['testUser']}"} if self.tokens else {}
         async with self.session.request(

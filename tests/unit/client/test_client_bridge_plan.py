@@ -21,7 +21,7 @@ def own(tag: str, type_: str, addr: str = "", cls: str = STRING) -> dict[str, An
     return {"eTag": "robot", "iTag": tag, "iType": type_, "iCls": cls} | ({"addr": addr} if addr else {})
 
 
-def config(*interfaces: dict[str, Any], **parts: Any) -> ClientConfig:
+def config(*interfaces: dict[str, Any], **parts: object) -> ClientConfig:
     base = {"url": "http://m/", "userID": "u", "password": "p", "robotID": "robot"}
     return loads(json.dumps({**base, "interfaces": list(interfaces), **parts}))
 

@@ -22,7 +22,7 @@ HEAD: dict[str, Any] = {
 }
 
 
-def read(*bridges: dict[str, Any], types: dict[int, str] | None = None, **more: Any) -> ClientConfig:
+def read(*bridges: dict[str, Any], types: dict[int, str] | None = None, **more: object) -> ClientConfig:
     return loads(json.dumps({**HEAD, "bridges": bridges, **more}), types=types)
 
 

@@ -67,7 +67,7 @@ def good() -> dict[str, Any]:
     }
 
 
-def faults(data: Any) -> list[str]:
+def faults(data: object) -> list[str]:
     with pytest.raises(ConfigError) as caught:
         loads(json.dumps(data))
     return [str(fault) for fault in caught.value.faults]

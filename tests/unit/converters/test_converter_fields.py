@@ -75,7 +75,7 @@ OBJECTS = json_objects(EVERYTHING)  # made once: there are many strategies in it
 
 
 @given(OBJECTS)
-def test_every_field_type_comes_back_as_it_went(value: Any) -> None:
+def test_every_field_type_comes_back_as_it_went(value: object) -> None:
     codec = CONVERTERS.of(EVERYTHING)
     payload, unknown = codec.decode(value)
     assert unknown == ()
@@ -85,7 +85,7 @@ def test_every_field_type_comes_back_as_it_went(value: Any) -> None:
 
 
 @given(OBJECTS)
-def test_values_survive_json_with_base64_binaries(value: Any) -> None:
+def test_values_survive_json_with_base64_binaries(value: object) -> None:
     """Values survive json text with base64 in place of binary values."""
     codec = CONVERTERS.of(EVERYTHING)
     payload, _ = codec.decode(value)
@@ -111,7 +111,7 @@ JSON_VALUES = st.recursive(
 
 
 @given(st.data(), JSON_VALUES)
-def test_strange_value_is_taken_or_refused_by_name(data: st.DataObject, strange: Any) -> None:
+def test_strange_value_is_taken_or_refused_by_name(data: st.DataObject, strange: object) -> None:
     """A strange value in any field is taken or refused by name."""
     field = data.draw(st.sampled_from(EVERYTHING.fields))
     codec = CONVERTERS.of(EVERYTHING)
@@ -196,7 +196,7 @@ def test_garbage_bytes_are_read_or_refused(data: bytes) -> None:
         ),
     ],
 )
-def test_what_does_not_fit_is_refused_by_the_name_of_its_field(name: str, value: Any, text: str) -> None:
+def test_what_does_not_fit_is_refused_by_the_name_of_its_field(name: str, value: object, text: str) -> None:
     with pytest.raises(ConversionError, match=text):
         converter(name).decode(value)
 
@@ -269,7 +269,7 @@ def test_nan_and_infinity_become_null_in_json_text() -> None:
         ({}, 0, 0),
     ],
 )
-def test_times_are_taken_as_text_and_as_parts(value: Any, secs: int, nsecs: int) -> None:
+def test_times_are_taken_as_text_and_as_parts(value: object, secs: int, nsecs: int) -> None:
     assert converter("std_msgs/Time").decode({"data": value})[0] == struct.pack("<II", secs, nsecs)
 
 
@@ -296,7 +296,7 @@ def test_times_leave_as_text_with_microseconds(secs: int, nsecs: int, text: str)
         ({"secs": -1, "nsecs": 5}, -1, 5),
     ],
 )
-def test_durations_are_seconds(value: Any, secs: int, nsecs: int) -> None:
+def test_durations_are_seconds(value: object, secs: int, nsecs: int) -> None:
     payload = converter("std_msgs/Duration").decode({"data": value})[0]
     assert payload == struct.pack("<ii", secs, nsecs)
     assert math.isclose(converter("std_msgs/Duration").encode(payload)["data"], secs + nsecs / 1e9)
@@ -327,7 +327,7 @@ class _Reversed:
     def encode(self, fields: Any) -> Any:
         return fields["data"][::-1].encode()
 
-    def decode(self, value: Any) -> Any:
+    def decode(self, value: object) -> Any:
         if not isinstance(value, bytes):
             raise ValueError("must be a binary value")  # noqa: TRY004
         return {"data": bytes(value).decode()[::-1]}
@@ -371,7 +371,7 @@ def test_base64_is_what_the_wire_has() -> None:
         ("geometry_msgs/PoseStamped", {"header": {"seq": 9.0}}, {"header": {"seq": 9}}),
     ],
 )
-def test_numbers_without_fraction_are_integers(name: str, value: Any, same: Any) -> None:
+def test_numbers_without_fraction_are_integers(name: str, value: object, same: object) -> None:
     assert converter(name).decode(value) == converter(name).decode(same)
 
 
@@ -388,6 +388,6 @@ def test_numbers_without_fraction_are_integers(name: str, value: Any, same: Any)
         ("std_msgs/Time", {"data": {"secs": 1.5}}, "data: secs of a time is 1.5"),
     ],
 )
-def test_numbers_with_fraction_are_refused_as_integers(name: str, value: Any, text: str) -> None:
+def test_numbers_with_fraction_are_refused_as_integers(name: str, value: object, text: str) -> None:
     with pytest.raises(ConversionError, match=text):
         converter(name).decode(value)

@@ -274,7 +274,7 @@ class SimulatedClients:
 
     # Mail
 
-    def _post(self, topic: str, robot: str, action: Callable[..., object], *values: Any) -> None:
+    def _post(self, topic: str, robot: str, action: Callable[..., object], *values: object) -> None:
         """Topics are in order each, as over TCP, but not with one another."""
         if self.rng.random() < self.loss:
             return

@@ -131,7 +131,7 @@ class FakePeer:
         assert reply.request == self.requests
         return reply
 
-    async def ask(self, kind: str, data: Any, robot: str = "rob") -> tuple[str, ...]:
+    async def ask(self, kind: str, data: object, robot: str = "rob") -> tuple[str, ...]:
         self.requests += 1
         await self.say(ClientRequest(request=self.requests, id=f"anna/{robot}", type=kind, data=data))
         reply = await self.get(ClientReply)

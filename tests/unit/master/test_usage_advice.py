@@ -27,7 +27,7 @@ class Watched:
         self.book = UsageBook(lambda: self.now)
         self.counters: dict[str, float] = {}
 
-    def run(self, seconds: float, *, cores: float = 0.0, throttled: float = 0.0, **fields: Any) -> History:
+    def run(self, seconds: float, *, cores: float = 0.0, throttled: float = 0.0, **fields: object) -> History:
         """Let it run; returns its history."""
         for _ in range(int(seconds / 2)):
             self.now += 2

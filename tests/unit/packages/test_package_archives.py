@@ -30,7 +30,7 @@ HUGE = (1 << 33) - 1
 """All that the header of a file can say."""
 
 
-def header(name: str, size: int = 0, **fields: Any) -> bytes:
+def header(name: str, size: int = 0, **fields: object) -> bytes:
     info = tarfile.TarInfo(name)
     info.size = size
     for key, value in fields.items():
@@ -38,7 +38,7 @@ def header(name: str, size: int = 0, **fields: Any) -> bytes:
     return info.tobuf(tarfile.USTAR_FORMAT, "utf-8", "strict")
 
 
-def file(name: str, data: bytes = b"", **fields: Any) -> bytes:
+def file(name: str, data: bytes = b"", **fields: object) -> bytes:
     return header(name, len(data), **fields) + data + bytes(-len(data) % 512)
 
 

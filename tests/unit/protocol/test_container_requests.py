@@ -16,7 +16,7 @@ from rce.protocol.exceptions import MessageError
 from rce.protocol.requests import read_request
 
 
-def create(**data: Any) -> Resources:
+def create(**data: object) -> Resources:
     request = read_request("CC", {"containerTag": "c", "containerData": data})
     assert isinstance(request, CreateContainer)
     return request.resources

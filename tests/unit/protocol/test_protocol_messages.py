@@ -21,7 +21,7 @@ from rce.protocol.reading import decode
 from rce.protocol.requests import read_request
 
 
-def text(kind: str, data: Any) -> str:
+def text(kind: str, data: object) -> str:
     return json.dumps({"type": kind, "data": data})
 
 
@@ -74,7 +74,7 @@ def text(kind: str, data: Any) -> str:
         ("ER", "no", m.ErrorReport(problem="no")),
     ],
 )
-def test_message_is_read(kind: str, data: Any, expected: m.ClientMessage) -> None:
+def test_message_is_read(kind: str, data: object, expected: m.ClientMessage) -> None:
     assert decode(text(kind, data)) == expected
     assert decode(text(kind, data).encode()) == expected
 
@@ -265,14 +265,14 @@ JSON = st.recursive(
 
 
 @given(NAMES, NAMES, JSON, st.text(st.characters(codec="utf-8"), max_size=255))
-def test_data_message_survives_the_round_trip(tag: str, cls: str, msg: Any, msg_id: str) -> None:
+def test_data_message_survives_the_round_trip(tag: str, cls: str, msg: object, msg_id: str) -> None:
     message = m.DataMessage(tag, f"pkg/{cls}", msg, msg_id)
     (frame,) = encode(message)
     assert decode(str(frame)) == message
 
 
 @given(st.sampled_from(["CC", "DC", "CN", "CX", "DM", "ST", "ER", "XX"]), JSON)
-def test_any_data_is_a_message_or_an_error_with_words(kind: str, data: Any) -> None:
+def test_any_data_is_a_message_or_an_error_with_words(kind: str, data: object) -> None:
     (frame,) = encode_message(kind, data)
     with contextlib.suppress(MessageError):
         assert m.type_of(decode(str(frame))) == kind

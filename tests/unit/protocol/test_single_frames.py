@@ -6,7 +6,6 @@ import json
 import re
 import struct
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given
@@ -33,7 +32,7 @@ def feed(frame: bytes, limits: Limits = DEFAULT_LIMITS) -> Event:
     return event
 
 
-def frame_of(header: Any, payload: bytes = b"payload") -> bytes:
+def frame_of(header: object, payload: bytes = b"payload") -> bytes:
     text = header if isinstance(header, bytes) else json.dumps(header).encode()
     return struct.pack("!BH", 1, len(text)) + text + payload
 
@@ -68,7 +67,7 @@ def test_any_bytes_are_a_message_or_one_fault(data: bytes) -> None:
 
 
 @given(st.recursive(st.none() | st.integers() | st.text(), lambda inner: st.dictionaries(st.text(), inner)))
-def test_any_json_as_header_is_one_fault(header: Any) -> None:
+def test_any_json_as_header_is_one_fault(header: object) -> None:
     assert isinstance(feed(frame_of(header)), Fault)
 
 

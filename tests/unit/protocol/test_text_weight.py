@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from typing import Any
 
 import pytest
 from hypothesis import given
@@ -18,7 +17,7 @@ from rce.protocol.weight import Address, check_elements, find_address, is_light,
 STRING = "std_msgs/String"
 
 
-def data_message(msg: Any, *, msg_first: bool = False, **more: Any) -> bytes:
+def data_message(msg: object, *, msg_first: bool = False, **more: object) -> bytes:
     rest = {"iTag": "tag", "type": STRING, "msgID": "7", **more}
     data = {"msg": msg, **rest} if msg_first else {**rest, "msg": msg}
     return json.dumps({"data": data, "type": "DM"} if msg_first else {"type": "DM", "data": data}).encode()

@@ -147,7 +147,7 @@ class Setup:
         forms = FormFactory(TypeRegistry()).pair(self.port.spec, kind)
         self.interface = make_interface(kind.role, self.port, self.robot, *forms, call_timeout=call_timeout)
 
-    def take(self, msg: Any, msg_id: str = "nil") -> None:
+    def take(self, msg: object, msg_id: str = "nil") -> None:
         self.interface.take(
             DataMessage(i_tag="tag", message_type=self.port.spec.message_type, msg=msg, msg_id=msg_id)
         )
@@ -201,7 +201,7 @@ def test_from_the_robot() -> None:
         ("SubscriberForwarder", {"data": "x"}),
     ],
 )
-def test_what_does_not_fit_is_refused_and_named(type_: str, msg: Any) -> None:
+def test_what_does_not_fit_is_refused_and_named(type_: str, msg: object) -> None:
     setup = Setup(type_)
     with pytest.raises(UnreadableError, match="tag, msgID 7: "):
         setup.take(msg, "7")

@@ -111,7 +111,7 @@ def test_the_last_topic_takes_parameter_subscriptions_along() -> None:
     ],
 )
 def test_parameter_subscribers_are_told(
-    subscribed: str, changed: str, value: Any, told: tuple[str, Any] | None
+    subscribed: str, changed: str, value: object, told: tuple[str, Any] | None
 ) -> None:
     graph = Graph()
     graph.subscribe_parameter(subscribed, "/n", uri("/n"))

@@ -39,7 +39,7 @@ class GraphMaster(MasterClient):
         return 0
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """A tree without the empty namespaces that deleting may leave: they count as not set."""
     if not isinstance(value, dict):
         return value

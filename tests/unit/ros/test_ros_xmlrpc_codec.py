@@ -30,7 +30,7 @@ VALUE = st.recursive(
 
 
 @given(VALUE)
-def test_values_survive(value: Any) -> None:
+def test_values_survive(value: object) -> None:
     assert decode_response(encode_response(value)) == value
     assert decode_call(encode_call("method", (value, 1))) == ("method", (value, 1))
 
@@ -48,7 +48,7 @@ def test_garbage_is_refused_not_crashed_on(document: bytes) -> None:
 
 
 @pytest.mark.parametrize("value", [None, 2**31, object(), "bell \x07", {1: 2}])
-def test_refuses_to_write_what_has_no_form(value: Any) -> None:
+def test_refuses_to_write_what_has_no_form(value: object) -> None:
     with pytest.raises(MalformedDocumentError):
         encode_response(value)
 
@@ -82,7 +82,7 @@ def test_binary_is_base64() -> None:
 
 class TestDispatcher:
     @staticmethod
-    def ask(method: str, *arguments: Any) -> Any:
+    def ask(method: str, *arguments: object) -> Any:
         def add(caller: str, a: Any, b: Any = 1) -> Any:
             if not isinstance(a, int):
                 raise BadArgumentError("a must be a number")

@@ -17,7 +17,7 @@ def snapshot(sequence: int, started: str = A) -> dict[str, Any]:
     return {"sequence": sequence, "state": {"started": started}}
 
 
-def change(sequence: int, started: str = A, **parts: Any) -> dict[str, Any]:
+def change(sequence: int, started: str = A, **parts: object) -> dict[str, Any]:
     empty: dict[str, Any] = {"robots": [], "removed": [], "blocked": [], "pending": [], "freed": []}
     return {**empty, "started": started, "sequence": sequence, "freed": [sequence], **parts}
 

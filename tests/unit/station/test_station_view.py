@@ -11,7 +11,7 @@ from rce_fleet.station.live import MAX_CHANGES, MAX_EVENTS, Broadcast
 from rce_fleet.station.view import FleetView, ViewChange
 
 
-def robot(name: str, **changes: Any) -> dict[str, Any]:
+def robot(name: str, **changes: object) -> dict[str, Any]:
     known = {
         "id": name,
         "state": "idle",
@@ -25,7 +25,7 @@ def robot(name: str, **changes: Any) -> dict[str, Any]:
     return known | changes
 
 
-def state(*robots: dict[str, Any], **changes: Any) -> dict[str, Any]:
+def state(*robots: dict[str, Any], **changes: object) -> dict[str, Any]:
     grid = {"rows": 8, "columns": 8, "cell_size": 1.0, "origin_x": 0.0, "origin_y": 0.0}
     return {**grid, "blocked": [], "walls": [], "pending": [], "robots": list(robots), **changes}
 
@@ -66,7 +66,7 @@ def test_a_state_tells_what_it_changed() -> None:
     assert not view.on_state(state(robot("Robot1", goal=9), blocked=[1, 3]))
 
 
-def changes(*robots: dict[str, Any], **parts: Any) -> dict[str, Any]:
+def changes(*robots: dict[str, Any], **parts: object) -> dict[str, Any]:
     return {"robots": list(robots), "removed": [], "blocked": [], "pending": [], "freed": [], **parts}
 
 
