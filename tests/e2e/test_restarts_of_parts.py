@@ -20,7 +20,7 @@ from rce.config.resources import examples_dir
 from rce.ros.errors import ServiceError
 from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
-from rce.ros.types import Time, TypeRegistry
+from rce.ros.types import Message, Time, TypeRegistry
 
 pytestmark = [pytest.mark.e2e, pytest.mark.timeout(600), pytest.mark.needs("rospy", "roslaunch")]
 
@@ -93,7 +93,7 @@ class Driver:
             clock.publish(clock=Time(self._now, 0))
             await asyncio.sleep(0.1)
 
-    def _hear(self, message: Any) -> None:
+    def _hear(self, message: Message) -> None:
         pid, secs = map(int, message.data.split())
         self._heard.put_nowait((pid, secs))
 

@@ -37,12 +37,11 @@ from rce.control.model import (
     LinkSpec,
     NodeState,
     NodeStatus,
-    PackageSpec,
 )
 from rce.link import Buffer, Endpoint, Interface, LinkHub, Port
 from rce.link.handover import LinkAcceptor
 from rce.model.names import EndpointId
-from rce.model.specs import InterfaceSpec, NodeSpec, ParameterSpec, Resources
+from rce.model.specs import InterfaceSpec, NodeSpec
 from rce_container.environment import proc
 from rce_container.folder import Record, StateFolder
 from rce_container.limits import choose_limiter
@@ -55,6 +54,7 @@ from rce_container.runtimes.namespace import HOME_BYTES, NamespaceRuntime
 from rce_container.runtimes.podman import PodmanRuntime
 from rce_container.runtimes.process import ProcessRuntime
 from rce_container.settings import ContainerSettings
+from support.parts import SpecParts
 
 MACHINE = "testmachine"
 RUNTIMES = ["process", pytest.param("namespace", marks=pytest.mark.needs("bwrap"))]
@@ -142,18 +142,6 @@ class ManagerOptions(TypedDict, total=False):
     starts_at_once: int
     slot_memory: int
     slot_processes: int
-
-
-class SpecParts(TypedDict, total=False):
-    """What a container's spec says beside its name."""
-
-    nodes: tuple[NodeSpec, ...]
-    interfaces: tuple[InterfaceSpec, ...]
-    links: tuple[LinkSpec, ...]
-    connections: tuple[ConnectionSpec, ...]
-    resources: Resources
-    parameters: tuple[ParameterSpec, ...]
-    packages: tuple[PackageSpec, ...]
 
 
 class ContainerParts(SpecParts, total=False):

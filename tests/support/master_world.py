@@ -2,51 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TypedDict, Unpack
+from typing import Unpack
 
 from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, TaskSetKind
-from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress, NodeStatus
-from rce.model.specs import InterfaceSpec, Network, NodeSpec, Resources
+from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress
+from rce.model.specs import InterfaceSpec, NodeSpec, Resources
 from rce_master.state import commands
 from rce_master.state.changes import Changes
 from rce_master.state.core import State
 from rce_master.state.records import User, UserRole
 from rce_master.state.settings import StateSettings
-
-
-class MachineParts(TypedDict, total=False):
-    """Fields of :class:`rce.control.messages.MachineInfo` beside its name."""
-
-    slots: int
-    cores: int
-    memory: int
-    labels: tuple[str, ...]
-    runtimes: tuple[str, ...]
-    networks: tuple[str, ...]
-    draining: bool
-
-
-class ResourceParts(TypedDict, total=False):
-    """Fields of :class:`rce.model.specs.Resources`."""
-
-    group: str
-    group_ip: str
-    network: Network
-    image: str
-    size: int
-    cpu: float
-    memory: int
-    bandwidth: int
-    special_features: tuple[str, ...]
-
-
-class StatusParts(TypedDict, total=False):
-    """Fields of :class:`rce.control.model.EndpointStatus` that tests give."""
-
-    incarnation: str
-    address: LinkAddress
-    nodes: tuple[NodeStatus, ...]
-    detail: str
+from support.parts import MachineParts, ResourceParts, StatusParts
 
 
 class World:
@@ -88,6 +54,8 @@ class World:
         process: str = "c1",
         endpoints: tuple[EndpointStatus, ...] = (),
         name: str = "m",
+        *,
+        draining: bool = False,
         **machine: Unpack[MachineParts],
     ) -> Changes:
         return self.do(
@@ -96,7 +64,7 @@ class World:
                     version=CONTROL_VERSION,
                     kind=TaskSetKind.CONTAINER,
                     process=process,
-                    machine=MachineInfo(name=name, **machine),
+                    machine=MachineInfo(name=name, draining=draining, **machine),
                     endpoints=endpoints,
                 )
             )

@@ -9,6 +9,7 @@ from typing import TypedDict, Unpack
 
 import pytest
 from support.containers import Machine, joined, until
+from support.parts import NodeLife
 
 from rce.control.logs import LogLevel, LogQuery, LogStream
 from rce.control.messages import LogChunk, ReadLog, Status
@@ -76,22 +77,14 @@ def _nodes(machine: Machine) -> None:
         (machine.packages / "own" / "nodes" / name).write_text(text)
 
 
-class NodeOptions(TypedDict, total=False):
-    after: tuple[str, ...]
-    heartbeat: str
-    heartbeat_timeout: float
-    restart: RestartPolicy
-    max_restarts: int
-
-
 class QueryParts(TypedDict, total=False):
     level: LogLevel
     incarnation: str
     previous: bool
 
 
-def own(exe: str, args: str = "", tag: str = "node", **options: Unpack[NodeOptions]) -> NodeSpec:
-    return NodeSpec(tag=tag, pkg="own", exe=exe, args=args, **options)
+def own(exe: str, args: str = "", tag: str = "node", **life: Unpack[NodeLife]) -> NodeSpec:
+    return NodeSpec(tag=tag, pkg="own", exe=exe, args=args, **life)
 
 
 async def read(

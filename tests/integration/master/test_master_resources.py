@@ -247,19 +247,19 @@ async def using(site: Site, there: TaskSet) -> dict[str, Any]:
     there.report(running("testUser/c", NodeStatus(tag="n", state=NodeState.RUNNING, restarts=2)))
     there.channel.send(Usage(cpu_s=1.0, memory=1, endpoints={"testUser/c": told(1.0)}))
 
-    async def first() -> Any:
-        usage = await site.api("GET", "/usage")
-        return usage["containers"][0]["memory"] and usage
+    async def first() -> dict[str, Any] | None:
+        usage: dict[str, Any] = await site.api("GET", "/usage")
+        return usage if usage["containers"][0]["memory"] else None
 
     await until(first)
     await asyncio.sleep(0.2)  # a rate needs two looks, some time apart
     there.channel.send(Usage(cpu_s=1.0, memory=1, endpoints={"testUser/c": told(1.1, oom_kills=1)}))
 
-    async def second() -> Any:
-        usage = await site.api("GET", "/usage")
-        return usage["containers"][0]["oom_kills"] and usage
+    async def second() -> dict[str, Any] | None:
+        usage: dict[str, Any] = await site.api("GET", "/usage")
+        return usage if usage["containers"][0]["oom_kills"] else None
 
-    return dict(await until(second))
+    return await until(second)
 
 
 async def test_usage_is_told_with_rates_and_advice(site: Site) -> None:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import asyncio
 from functools import partial
-from typing import Any
 
 import pytest
 from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
 from rce.ros.node import Node
-from rce.ros.types import TypeRegistry
+from rce.ros.types import Message, TypeRegistry
 from rce.ros.xmlrpc import RpcClient
 
 STRING = "std_msgs/String"
@@ -25,7 +24,7 @@ def near(core: Core) -> MakeNode:
 async def test_the_object_itself_is_delivered(near: MakeNode) -> None:
     types = TypeRegistry()
     async with near("a", types=types) as a, near("b", types=types) as b:
-        got: asyncio.Queue[Any] = asyncio.Queue()
+        got: asyncio.Queue[Message] = asyncio.Queue()
         raw: asyncio.Queue[tuple[bytes, bool]] = asyncio.Queue()
         await b.subscribe("t", STRING, got.put_nowait)
         publisher = await a.advertise("t", STRING)

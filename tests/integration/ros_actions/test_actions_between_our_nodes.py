@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import asynccontextmanager
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import pytest
 from support.ros_nodes import MakeNode
@@ -22,6 +22,7 @@ from rce.ros.actions import (
     SimpleActionServer,
 )
 from rce.ros.actions.ledger import Arrival
+from rce.ros.actions.work import Handler
 from rce.ros.core import Core
 from rce.ros.types import Message, SerializationError, Time
 
@@ -42,9 +43,18 @@ async def until_cancelled(goal: ServerGoal) -> None:
     await goal.wait_for_cancel()
 
 
+class ServerOptions(TypedDict, total=False):
+    max_goals: int
+    auto_accept: bool
+
+
 @asynccontextmanager
 async def pair(
-    make_node: MakeNode, handler: Any, *, server: type[ActionServer] = ActionServer, **options: Any
+    make_node: MakeNode,
+    handler: Handler,
+    *,
+    server: type[ActionServer] = ActionServer,
+    **options: Unpack[ServerOptions],
 ) -> AsyncIterator[tuple[ActionServer, ActionClient]]:
     async with (
         make_node("server") as a,

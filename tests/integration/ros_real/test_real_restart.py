@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 from support.ports import free_port
@@ -30,7 +29,7 @@ async def test_a_core_is_killed_and_started_again(
     port = free_port()
     graph = Graph(f"http://127.0.0.1:{port}/", tmp_path, kind)
 
-    async def up() -> Any:
+    async def up() -> object:
         return await graph.ask("getPid")
 
     async def restored() -> bool:

@@ -107,7 +107,7 @@ async def test_rosservice(graph: Graph, make_node: MakeGraphNode) -> None:
 
 async def test_rosparam(graph: Graph, make_node: MakeGraphNode) -> None:
     async with make_node(graph, "ours") as ours:
-        told: asyncio.Queue[tuple[str, Any]] = asyncio.Queue()
+        told: asyncio.Queue[tuple[str, object]] = asyncio.Queue()
         await ours.watch_param("/tree", lambda *change: told.put_nowait(change))
         assert await ours.get_param_cached("/tree/a", "not yet") == "not yet"
         await graph.tool("rosparam", "set", "/tree", "{a: 1, b: [1, 2.5, x], c: {d: true}}")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, Unpack
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.parts import NodeLife
 
 from rce.control.model import NodeState, NodeStatus
 from rce.lifecycle import InvalidTransitionError
@@ -21,8 +22,8 @@ from rce_container.environment.nodes.record import LAST_CHANCE_S, WELL_S
 FAILED = "exit code 3"
 
 
-def spec(tag: str = "a", **options: Any) -> NodeSpec:
-    return NodeSpec(tag=tag, pkg="own", exe="x.py", **options)
+def spec(tag: str = "a", args: str = "", **life: Unpack[NodeLife]) -> NodeSpec:
+    return NodeSpec(tag=tag, pkg="own", exe="x.py", args=args, **life)
 
 
 class World:
@@ -392,8 +393,9 @@ def test_what_is_not_at_fault_can_start_and_everything_can_end(specs: list[NodeS
 # Health
 
 
-def beating(**options: Any) -> World:
-    world = World(spec(heartbeat="/beat", heartbeat_timeout=2.0, **options))
+def beating(**life: Unpack[NodeLife]) -> World:
+    life["heartbeat"], life["heartbeat_timeout"] = "/beat", 2.0
+    world = World(spec(**life))
     world.register()
     world.do(e.Beat("a"))
     return world

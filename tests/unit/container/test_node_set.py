@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
-from typing import Any
+from typing import NoReturn
 
 import pytest
 
@@ -18,7 +18,7 @@ from rce_container.environment.nodes.reaper import Reaper
 
 
 def context(folder: Path, faults: list[str]) -> NodeContext:
-    def launch_environment(_: NodeSpec) -> Any:
+    def launch_environment(_: NodeSpec) -> NoReturn:
         raise NodeError("no package 'x'")
 
     async def why_killed() -> str:

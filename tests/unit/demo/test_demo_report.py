@@ -18,11 +18,13 @@ SCENARIO = choose_scenario(2, 0)
 ROBOTS = dict(zip(SCENARIO.robots, SCENARIO.goals, strict=True))
 
 
-def make_report(reached: set[str], problem: str = "", **world: Any) -> RunReport:
+def make_report(reached: set[str], problem: str = "", collisions: int = 0) -> RunReport:
     unused: Any = None
     run = ScenarioRun(unused, SCENARIO, lambda: None, lambda _: None)
     run.reached = reached
-    return RunReport(SCENARIO, 0, run, truth(ROBOTS, apart=0.5, **world), MessageTotals(10, 1), problem)
+    return RunReport(
+        SCENARIO, 0, run, truth(ROBOTS, apart=0.5, collisions=collisions), MessageTotals(10, 1), problem
+    )
 
 
 def test_report_of_a_good_run() -> None:

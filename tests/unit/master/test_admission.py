@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 from support.master_world import World
 
@@ -17,7 +15,9 @@ from rce_master.exceptions import (
     NoRoomError,
 )
 from rce_master.state import commands, placing
-from rce_master.state.records import UserRole
+from rce_master.state.changes import Transaction
+from rce_master.state.placement import Room
+from rce_master.state.records import Container, UserRole
 from rce_master.state.settings import StateSettings
 
 MB = 1 << 20
@@ -297,7 +297,7 @@ def test_many_that_wait_cost_little(monkeypatch: pytest.MonkeyPatch) -> None:
     world.container("first")
     looked: list[str] = []
 
-    def choose(tx: Any, container: Any, rooms: Any) -> Any:
+    def choose(tx: Transaction, container: Container, rooms: dict[str, Room]) -> Room | None:
         looked.append(container.tag)
         return best(tx, container, rooms)
 

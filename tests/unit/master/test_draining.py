@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Unpack
 
 import pytest
-from support.master_world import StatusParts, World
+from support.master_world import World
+from support.parts import StatusParts
 
 from rce.control.model import EndpointState, EndpointStatus, LinkAddress, NodeState, NodeStatus
 from rce.model.specs import Network, ResourceChanges

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from random import Random
-from typing import Any
+from typing import Any, Unpack
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.parts import MachineParts
 
 from rce.control.messages import MachineInfo
 from rce.model.specs import Network, Resources
@@ -17,17 +18,22 @@ MB = 1 << 20
 SHORT_OF_MEMORY = "m1 has 40 of 100 MB memory free, 50 MB needed"
 
 
-def room(process: str = "m1", **fields: Any) -> Room:
-    promised = {
-        key: fields.pop(key) for key in ("slots_used", "cpu_used", "memory_used", "draining") if key in fields
-    }
+def room(
+    process: str = "m1",
+    *,
+    slots_used: int = 0,
+    cpu_used: float = 0.0,
+    memory_used: int = 0,
+    draining: bool = False,
+    **machine: Unpack[MachineParts],
+) -> Room:
     return Room(
         process=process,
-        machine=MachineInfo(name=process, **fields),
-        slots=promised.get("slots_used", 0),
-        cpu=promised.get("cpu_used", 0.0),
-        memory=promised.get("memory_used", 0),
-        draining=promised.get("draining", False),
+        machine=MachineInfo(name=process, **machine),
+        slots=slots_used,
+        cpu=cpu_used,
+        memory=memory_used,
+        draining=draining,
     )
 
 

@@ -366,8 +366,17 @@ async def test_status_patches_are_added_up_and_a_gap_asks_once(cloud: Cloud) -> 
     await containers.hello()
     tables = cloud.state_service.tables
 
-    def status(number: int, **fields: Any) -> EndpointStatus:
-        return EndpointStatus(id="anna/c", revision=1, state=EndpointState.RUNNING, number=number, **fields)
+    def status(
+        number: int, interfaces: dict[str, bool] | None = None, connections: tuple[int, ...] = ()
+    ) -> EndpointStatus:
+        return EndpointStatus(
+            id="anna/c",
+            revision=1,
+            state=EndpointState.RUNNING,
+            number=number,
+            interfaces=interfaces or {},
+            connections=connections,
+        )
 
     await containers.say(Status(status=status(4, interfaces={"in": False})))
     await containers.say(

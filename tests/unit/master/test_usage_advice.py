@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypedDict, Unpack
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.parts import ResourceParts
 
 from rce.control.messages import MachineInfo, Usage
 from rce.control.model import EndpointUsage, NodeUsage
@@ -19,21 +20,35 @@ MB = 1 << 20
 ID = "anna/c"
 
 
+class CpuCounters(TypedDict):
+    cpu_s: float
+    throttled_s: float
+
+
+class UsageParts(TypedDict, total=False):
+    memory: int
+    memory_limit: int
+    oom_kills: int
+    cpu_limit: float
+
+
 class Watched:
     """A container that reports every two seconds."""
 
     def __init__(self) -> None:
         self.now = 0.0
         self.book = UsageBook(lambda: self.now)
-        self.counters: dict[str, float] = {}
+        self.counters = CpuCounters(cpu_s=0.0, throttled_s=0.0)
 
-    def run(self, seconds: float, *, cores: float = 0.0, throttled: float = 0.0, **fields: object) -> History:
+    def run(
+        self, seconds: float, *, cores: float = 0.0, throttled: float = 0.0, **fields: Unpack[UsageParts]
+    ) -> History:
         """Let it run; returns its history."""
         for _ in range(int(seconds / 2)):
             self.now += 2
-            for key, rate in (("cpu_s", cores), ("throttled_s", throttled)):
-                self.counters[key] = self.counters.get(key, 0.0) + 2 * rate
-            told = EndpointUsage(**self.counters, **fields)  # type: ignore[arg-type]
+            self.counters["cpu_s"] += 2 * cores
+            self.counters["throttled_s"] += 2 * throttled
+            told = EndpointUsage(**self.counters, **fields)
             self.book.note("c1", Usage(cpu_s=1.0, memory=1, endpoints={ID: told}), {ID})
         found = self.book.history("c1", ID)
         assert found is not None
@@ -49,7 +64,7 @@ def texts(found: list[Advice]) -> list[tuple[str, str]]:
     return [(one.about, one.command) for one in found]
 
 
-def advise(history: History, room: Room | None = None, **requested: Any) -> list[Advice]:
+def advise(history: History, room: Room | None = None, **requested: Unpack[ResourceParts]) -> list[Advice]:
     return for_container("c", Resources(**requested), history, room)
 
 
@@ -72,7 +87,7 @@ def test_nodes_have_rates_of_their_own() -> None:
 
 def test_a_container_that_was_made_anew_begins_anew(watched: Watched) -> None:
     watched.run(600, cores=1.0)
-    watched.counters.clear()
+    watched.counters = CpuCounters(cpu_s=0.0, throttled_s=0.0)
     history = watched.run(4, cores=0.5)
     assert history.rates.cpu == 0.5
     assert len(history.samples) == 2
@@ -133,7 +148,7 @@ def test_advice_to_grow_says_when_the_machine_has_no_room(watched: Watched) -> N
 
 
 def test_what_is_hardly_used_is_too_large_but_not_at_once(watched: Watched) -> None:
-    requested: dict[str, Any] = {"cpu": 2.0, "memory": 1000 * MB}
+    requested: ResourceParts = {"cpu": 2.0, "memory": 1000 * MB}
     assert advise(watched.run(200, cores=0.1, memory=50 * MB), **requested) == []
     history = watched.run(200, cores=0.1, memory=50 * MB)
     assert texts(advise(history, **requested)) == [

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from enum import Enum
 from typing import Any, get_origin
 
@@ -148,7 +149,7 @@ def test_older_names_stay_on_the_control_channel() -> None:
 
 
 @pytest.mark.parametrize("write", [json.dumps, yaml.safe_dump])
-def test_fields_return_from_a_config_file(write: Any) -> None:
+def test_fields_return_from_a_config_file(write: Callable[[object], str]) -> None:
     keys: dict[str, type[Request | Item]] = {
         "containers": CreateContainer,
         "nodes": AddNode,

@@ -42,12 +42,12 @@ def file(name: str, data: bytes = b"", **fields: object) -> bytes:
     return header(name, len(data), **fields) + data + bytes(-len(data) % 512)
 
 
-def folder(name: str, **fields: Any) -> bytes:
-    return header(name, **{"type": tarfile.DIRTYPE, "mode": 0o755, **fields})
+def folder(name: str, size: int = 0, mode: int = 0o755) -> bytes:
+    return header(name, size, type=tarfile.DIRTYPE, mode=mode)
 
 
-def link(name: str, target: str, **fields: Any) -> bytes:
-    return header(name, **{"type": tarfile.SYMTYPE, "mode": 0o777, "linkname": target, **fields})
+def link(name: str, target: str) -> bytes:
+    return header(name, type=tarfile.SYMTYPE, mode=0o777, linkname=target)
 
 
 START = folder("nav") + file("nav/package.yaml", MANIFEST)
