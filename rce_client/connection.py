@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NoReturn, Self
 
+from rce.masters import Masters
 from rce_client.engine_transport import Target, Timing
 from rce_client.life import State
 from rce_client.own_interfaces import OwnInterfaces
@@ -14,7 +15,7 @@ from rce_client.session import Session
 if TYPE_CHECKING:
     import ssl
     from collections import deque
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
     from types import TracebackType
 
     from rce.model.requests import Request
@@ -34,7 +35,8 @@ class Connection(Requests, OwnInterfaces):
     an error text to ``on_error``. Cancelling a request does not take it back: it is sent, and remembered.
 
     Args:
-        url: The master, ``http://HOST:9000/`` or ``https://``.
+        url: The master, ``http://HOST:9000/`` or ``https://``; several, in a list or separated by commas, are
+            asked in turn.
         user_id: User ID.
         password: The user's password; only its SHA-256 is sent. Empty if there is a token.
         robot_id: Names this robot; one connection at a time.
@@ -63,7 +65,7 @@ class Connection(Requests, OwnInterfaces):
 
     def __init__(
         self,
-        url: str,
+        url: str | Sequence[str],
         user_id: str,
         password: str,
         robot_id: str,
@@ -77,7 +79,9 @@ class Connection(Requests, OwnInterfaces):
     ) -> None:
         self.robot_id = robot_id
         """Names this robot."""
-        target = Target(url=url, user=user_id, password=password, token=token, robot=robot_id, tls=tls)
+        target = Target(
+            url=str(Masters(url)), user=user_id, password=password, token=token, robot=robot_id, tls=tls
+        )
         self._session = Session(target, on_error=on_error, on_state=on_state, timing=timing, limits=limits)
 
     async def __aenter__(self) -> Self:

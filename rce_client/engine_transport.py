@@ -15,11 +15,12 @@ from websockets.exceptions import ConnectionClosed
 
 from rce.aio.backoff import Backoff
 from rce.dialing import open_url_socket
+from rce.masters import Masters
 from rce.protocol.http import FEATURES, FEATURES_HEADER, FEATURES_KEY, SINGLE_FRAME
 from rce.protocol.limits import Limits
 from rce.protocol.stream import ProtocolStream
 from rce_client.discovery import VERSION, locate
-from rce_client.exceptions import InUseError, LostError, RefusedError, UntrustedError
+from rce_client.exceptions import ClientError, InUseError, LostError, RefusedError, UntrustedError
 from rce_client.failures import judge
 from rce_client.sendqueue import QueuedMessage, QueueLimits, SendQueue
 from rce_client.socket import EngineSocket
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 
     from rce.protocol.codec import Frame
     from rce.protocol.stream import Event
-    from rce_client.exceptions import ClientError
 
 _log = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ class Target:
     """The client's account and the engine's address."""
 
     url: str
-    """The master, ``http://HOST:9000/`` or ``https://``."""
+    """The master, ``http://HOST:9000/`` or ``https://``; several, separated by commas, are used in turn."""
     user: str
     robot: str
     password: str = field(default="", repr=False)
@@ -140,6 +140,7 @@ class EngineTransport:
         limits: QueueLimits | None = None,
     ) -> None:
         self._target = target
+        self._masters = Masters(target.url)
         self._listener = listener
         self._timing = timing or Timing()
         self._queue = SendQueue(limits or QueueLimits())
@@ -231,7 +232,12 @@ class EngineTransport:
     async def _dial(self) -> EngineSocket:
         target, timing = self._target, self._timing
         tls = target.context()
-        found = await locate(target.url, target.user, version=target.version, tls=tls, timeout=timing.locate)
+        url = self._masters.current
+        try:
+            found = await locate(url, target.user, version=target.version, tls=tls, timeout=timing.locate)
+        except ClientError:
+            self._masters.failed(url)
+            raise
         parts = urlsplit(found.url)
         query, headers = target.handshake(header=found.takes_header)
         async with asyncio.timeout(timing.open):

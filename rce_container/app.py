@@ -24,6 +24,7 @@ from rce.control.messages import MachineInfo
 from rce.link.address import in_url, is_any, own_address
 from rce.link.handover import LinkAcceptor
 from rce.link.listening import listen_on
+from rce.masters import Masters, split_addresses
 from rce.ros.packages import PackageIndex, installed_shares
 from rce.supervision.signals import end_signals
 from rce.tls.choice import TlsChoice
@@ -57,7 +58,7 @@ class App:
     """A container task set that is to be run."""
 
     master: str
-    """Host of the master."""
+    """Host of the master; several are separated by commas."""
     control_port: int
     secret: Secret
     settings: ContainerSettings
@@ -126,6 +127,7 @@ class App:
         offers = await asyncio.to_thread(find_offers, runtime, runtimes.values())
         await asyncio.to_thread(_compile_engine)
         keep = self.settings.log_days, self.settings.log_space
+        masters = self._masters(tls)
         with StateFolder(self._state_dir, run_dir(), log_days=keep[0], log_space=keep[1]) as state:
             name = state.name(self.name)
             acceptor = LinkAcceptor(tls=self.settings.tls)
@@ -136,10 +138,12 @@ class App:
                 stack.callback(limiter.close)
                 for one in runtimes.values():
                     stack.callback(one.close)
-                library = await asyncio.to_thread(self._library, state, tls)
+                library = await asyncio.to_thread(self._library, state, masters, tls)
                 reach = self.host
                 if is_any(reach):
-                    reach = await own_address(self.master, self.control_port, quitting.told)
+                    reach = await own_address(
+                        split_addresses(self.master)[0], self.control_port, quitting.told
+                    )
                 manager = Manager(
                     name=name,
                     info=_machine(self.settings, offers, limiter, detail),
@@ -151,16 +155,19 @@ class App:
                     links=(reach, port),
                     limiter=limiter,
                     library=library,
-                    dialer=RunDialer(self._control_url(tls), self.secret, tls=tls),
+                    dialer=RunDialer(masters, self.secret, tls=tls),
                 )
-                await self._manage(manager, tls, quitting.of(manager), lambda: ready(name, runtime.name))
+                channel = TaskSetChannel(masters, self.secret, manager.hello, manager.handle, tls=tls)
+                await _manage(manager, channel, quitting.of(manager), lambda: ready(name, runtime.name))
 
-    def _control_url(self, tls: Context | None) -> str:
-        return f"{'ws' if tls is None else 'wss'}://{in_url(self.master)}:{self.control_port}"
+    def _masters(self, tls: Context | None) -> Masters:
+        scheme = "ws" if tls is None else "wss"
+        hosts = split_addresses(self.master)
+        return Masters(f"{scheme}://{in_url(host)}:{self.control_port}" for host in hosts)
 
-    def _library(self, state: StateFolder, tls: Context | None) -> Library:
+    def _library(self, state: StateFolder, masters: Masters, tls: Context | None) -> Library:
         """Where packages that users bring come from. Blocks."""
-        client = ContentClient(self.master, self.control_port, self.secret, tls=tls)
+        client = ContentClient(masters, self.secret, tls=tls)
         cache = PackageCache(state.library, client.piece, space=self.settings.bundle_space)
         requested = self.settings.requirements
         library = Library(
@@ -169,21 +176,21 @@ class App:
         library.open()
         return library
 
-    async def _manage(
-        self, manager: Manager, tls: Context | None, quit_: asyncio.Event, ready: Callable[[], None]
-    ) -> None:
-        channel = TaskSetChannel(self._control_url(tls), self.secret, manager.hello, manager.handle, tls=tls)
-        manager.send = channel.send
-        async with asyncio.TaskGroup() as tasks:
-            dialing: list[asyncio.Task[None]] = []
 
-            def go() -> None:
-                dialing.append(tasks.create_task(channel.run(), name="control channel"))
-                ready()
+async def _manage(
+    manager: Manager, channel: TaskSetChannel, quit_: asyncio.Event, ready: Callable[[], None]
+) -> None:
+    manager.send = channel.send
+    async with asyncio.TaskGroup() as tasks:
+        dialing: list[asyncio.Task[None]] = []
 
-            await manager.run(go, quit_)
-            for task in dialing:
-                task.cancel()
+        def go() -> None:
+            dialing.append(tasks.create_task(channel.run(), name="control channel"))
+            ready()
+
+        await manager.run(go, quit_)
+        for task in dialing:
+            task.cancel()
 
 
 def choose_runtime(requested: str, runtimes: dict[str, Runtime]) -> tuple[Runtime, str]:

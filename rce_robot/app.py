@@ -26,6 +26,7 @@ from rce.link.address import in_url, is_any, own_address
 from rce.link.listening import listen_on
 from rce.link.unix import remove_stale_sockets, socket_name
 from rce.lookups import LOOKUPS
+from rce.masters import Masters, split_addresses
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce.supervision.signals import end_signals
@@ -52,7 +53,7 @@ class App:
     """A robot task set that is to be run."""
 
     master: str
-    """Host of the master."""
+    """Host of the master; several are separated by commas."""
     control_port: int
     secret: Secret
     packages: Sequence[Path]
@@ -94,7 +95,7 @@ class App:
         machine = settings.machine or socket.gethostname()
         reach = settings.public_host or settings.host
         if is_any(reach):
-            reach = await own_address(self.master, self.control_port, stop)
+            reach = await own_address(split_addresses(self.master)[0], self.control_port, stop)
         name = f"robot_{secrets.token_hex(4)}"
         packages = _package_index(self.packages)
         types = TypeRegistry(packages)
@@ -123,9 +124,10 @@ class App:
                 lobby=lobby,
                 pool=pool,
             )
-            control = f"{'wss' if for_task_sets else 'ws'}://{in_url(self.master)}:{self.control_port}"
+            scheme = "wss" if for_task_sets else "ws"
+            hosts = split_addresses(self.master)
             channel = TaskSetChannel(
-                control,
+                Masters(f"{scheme}://{in_url(host)}:{self.control_port}" for host in hosts),
                 self.secret,
                 task_set.hello,
                 task_set.handle,

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import urlsplit
 
-from pydantic import AfterValidator, Field, SecretStr, ValidationError
+from pydantic import AfterValidator, BeforeValidator, Field, SecretStr, ValidationError
 
 from rce.config import client_checks
 from rce.config.bridges import Bridge, expand
@@ -17,6 +17,7 @@ from rce.config.documents import parse, read_file
 from rce.config.exceptions import ConfigError, Fault
 from rce.config.items import Container, Interface, ItemOf, Link, Name, Node, Parameter
 from rce.config.validation import Strict, faults_of
+from rce.masters import split_addresses
 from rce.model.requests import (
     AddInterface,
     AddNode,
@@ -35,6 +36,15 @@ from rce.model.specs import InterfaceSpec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+
+def _check_urls(given: Any) -> Any:
+    """Take one address or a list of them; return them as one text, separated by commas."""
+    urls = given if isinstance(given, list | tuple) and given else [given]
+    if not all(isinstance(url, str) for url in urls):
+        raise ValueError("must be the master's address such as http://master:9000/, or a list of addresses")
+    parts = [part for url in urls for part in split_addresses(url) or ("",)]
+    return ",".join(map(_check_url, parts))
 
 
 def _check_url(url: str) -> str:
@@ -57,8 +67,9 @@ def _check_authority(text: str) -> str:
 class ClientConfig(Strict):
     """All that one robot's file says."""
 
-    url: Annotated[str, AfterValidator(_check_url)]
-    """The master's address."""
+    url: Annotated[str, BeforeValidator(_check_urls)]
+    """The master's address; several, which are separated by commas here and may be a list in the file, are
+    tried in turn."""
     user: Name = Field(alias="userID")
     password: SecretStr = SecretStr("")
     """The user's password; empty if there is a token."""

@@ -27,6 +27,7 @@ from msgspec.structs import fields as struct_fields
 
 from rce.config.documents import join
 from rce.config.exceptions import Fault
+from rce.masters import split_addresses
 from rce.model.quantities import read_cores, read_memory, write_memory
 
 _WORDS = {
@@ -274,6 +275,12 @@ def _read_host(value: Any) -> Any:
     return value
 
 
+def _read_hosts(value: Any) -> Any:
+    for host in split_addresses(value) if isinstance(value, str) else [value]:
+        _read_host(host)
+    return value
+
+
 def _read_network(value: Any) -> Any:
     try:
         ipaddress.ip_network(value, strict=False)
@@ -312,6 +319,8 @@ def _same(value: Any) -> Any:
 
 Host = Annotated[str, Reader(_read_host, _same, "HOST")]
 """A host name or an IP address; empty for none."""
+Hosts = Annotated[str, Reader(_read_hosts, _same, "HOST")]
+"""As :data:`Host`, or several, separated by commas."""
 Networks = Annotated[tuple[str, ...], Reader(_read_network, _same, "ADDRESS")]
 """IP addresses or networks."""
 Port = Annotated[int, Meta(ge=0, le=65535)]

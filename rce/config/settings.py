@@ -15,10 +15,11 @@ from typing import Annotated
 
 from msgspec import Meta, field
 
-from rce.config.fields import Host, Memory, Section, Setting, choice
+from rce.config.fields import Hosts, Memory, Section, Setting, choice
 from rce.config.folders import default_state_dir
 from rce.config.master_settings import ANYWHERE, MasterSettings
 from rce.config.task_set_settings import ContainerSettings, RobotSettings, Runtime
+from rce.masters import split_addresses
 
 __all__ = [
     "ANYWHERE",
@@ -113,9 +114,9 @@ class EngineSettings(Section, frozen=True, kw_only=True):
         ),
     ] = None
     master_host: Annotated[
-        Host,
+        Hosts,
         Setting(
-            "Where robot and container task sets find the master.",
+            "Where robot and container task sets find the master; several by commas, used in turn.",
             option="",
             unset="the argument MASTER_IP; 127.0.0.1 with `rce up`",
             example="10.0.0.1",
@@ -162,8 +163,8 @@ class EngineSettings(Section, frozen=True, kw_only=True):
 
     @property
     def control_url(self) -> str:
-        """Where task sets dial the master."""
-        host = self.master_host or LOOPBACK
+        """Where task sets dial the master, the first of several."""
+        host = (*split_addresses(self.master_host), LOOPBACK)[0]
         scheme = "wss" if self.tls.enabled else "ws"
         return f"{scheme}://{f'[{host}]' if ':' in host else host}:{self.master.control_port}"
 

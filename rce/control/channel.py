@@ -40,6 +40,7 @@ from rce.control.messages import (
 from rce.control.tags import Unknown
 from rce.control.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, MAX_QUEUED, MAX_TEXT, ControlTimeouts
 from rce.dialing import open_url_socket
+from rce.masters import Masters
 from rce.tls.exceptions import CertificateError
 from rce.tls.faults import explain_to_client
 from rce.tls.websocket import TlsClientConnection
@@ -78,7 +79,7 @@ class TaskSetChannel:
     """The way to the master.
 
     Args:
-        url: Where the master is, ``ws://host:8080`` (or ``wss://``).
+        url: Where the master is, ``ws://host:8080`` (or ``wss://``); several are dialed in turn.
         secret: Proves that this is a task set of the same engine.
         hello: Makes the first message of every connection: all that is there now.
         handler: Called with each message of the master but the answers to requests; one after the other, in
@@ -90,7 +91,7 @@ class TaskSetChannel:
 
     def __init__(
         self,
-        url: str,
+        url: str | Masters,
         secret: Secret,
         hello: Callable[[], Hello],
         handler: Callable[[ToTaskSet], Awaitable[None]],
@@ -98,7 +99,8 @@ class TaskSetChannel:
         timeouts: ControlTimeouts = DEFAULT_TIMEOUTS,
         tls: Context | None = None,
     ) -> None:
-        self._url = url
+        self._masters = url if isinstance(url, Masters) else Masters(url)
+        self._url = self._masters.current
         self._tls = tls
         self._secret = secret
         self._hello = hello
@@ -215,6 +217,13 @@ class TaskSetChannel:
         return reply
 
     async def _connect_once(self) -> float:
+        """Run one connection to its end, and turn to the next master; return how long to wait, in seconds."""
+        self._url = self._masters.current
+        delay = await self._connect()
+        self._masters.failed(self._url)
+        return delay
+
+    async def _connect(self) -> float:
         """Run one connection to its end; return how long to wait before the next, in seconds."""
         shown = self._secret.reveal()
         try:

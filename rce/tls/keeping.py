@@ -7,6 +7,7 @@ import contextlib
 from typing import TYPE_CHECKING
 
 from rce.lookups import LOOKUPS
+from rce.masters import split_addresses
 from rce.tls.exceptions import CertificateError
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def ensure(settings: EngineSettings, full_name: str) -> str:
     from rce.tls.hosts import own_hosts
 
     binds = (settings.master.bind, settings.robot.bind, settings.container.bind)
-    named = (settings.master_host, settings.robot.public_host or "", *binds)
+    named = (*split_addresses(settings.master_host), settings.robot.public_host or "", *binds)
     folder = CertificateFolder(settings.certificates.absolute())
     return folder.ensure(settings.tls.name, own_hosts((full_name, *named)))
 

@@ -17,7 +17,7 @@ DEFAULT_URL = "http://127.0.0.1:9000/"
 
 
 def login(
-    url: Annotated[str, typer.Argument(help="The master's address.")] = DEFAULT_URL,
+    url: Annotated[str, typer.Argument(help="The master's address; several by commas.")] = DEFAULT_URL,
     *,
     user: Annotated[str, typer.Option("--user", "-u", prompt=True, help="User name.")],
     password_stdin: Annotated[bool, typer.Option(help="Read the password from standard input.")] = False,

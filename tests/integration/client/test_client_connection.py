@@ -7,6 +7,7 @@ import struct
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from support.cloud import PASSWORD
 
 from rce.link import PeerFaultError
 from rce.protocol import codec
@@ -420,3 +421,12 @@ async def test_leaving_can_be_cancelled_while_messages_wait(engine: Engine) -> N
     assert conn.state is State.CLOSED
     with pytest.raises(NotConnectedError):
         await conn.create_container("c1")
+
+
+async def test_of_several_masters_the_first_that_answers_is_used(engine: Engine) -> None:
+    nowhere = "http://127.0.0.1:1/"
+    for masters in ([nowhere, engine.door.url], f"{nowhere},{engine.door.url}"):
+        connection = Connection(masters, "testUser", PASSWORD, "testRobot")
+        async with asyncio.timeout(30), connection:
+            assert connection.connected
+        await engine.cloud.master.changed.until(lambda: not engine.cloud.master.inside)

@@ -47,6 +47,7 @@ from rce.control.messages import (
 from rce.control.peer import Peer
 from rce.control.server import ControlServer
 from rce.control.timeouts import MAX_TEXT, ControlTimeouts
+from rce.masters import Masters
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -356,6 +357,20 @@ async def test_orders_of_a_later_master_are_passed_over() -> None:
         finally:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_of_several_masters_the_next_is_dialed_when_one_is_away() -> None:
+    first, second = Master(), Master()
+    async with second.server, contextlib.AsyncExitStack() as stack:
+        await stack.enter_async_context(first.server)
+        urls = [f"ws://127.0.0.1:{master.server.port}" for master in (first, second)]
+        robots = TaskSet(first.server.port)
+        robots.channel = TaskSetChannel(Masters(urls), SECRET, hello, robots.handle, timeouts=QUICK)
+        async with robots.running(), asyncio.timeout(30):
+            await first.hellos.get()
+            assert second.hellos.empty()
+            await stack.aclose()
+            await second.hellos.get()
 
 
 async def test_refusal_is_logged_and_tried_again(caplog: pytest.LogCaptureFixture) -> None:

@@ -18,6 +18,7 @@ from rce.control.contents import ContentClient
 from rce.control.exceptions import ContentError
 from rce.control.messages import Put
 from rce.control.model import EndpointSpec
+from rce.masters import Masters
 from rce.packages.folder import look_into
 from rce.packages.signing import SigningKey, key_id, statement
 from rce_master.cli import packages, signing_key
@@ -246,7 +247,7 @@ async def test_task_sets_fetch_contents_by_their_secret(shop: Site, tmp_path: Pa
     (sha256,) = stored(tmp_path)
     port = shop.master.control_port
     secret = Secret("a secret for the tests")
-    client = ContentClient("127.0.0.1", port, secret)
+    client = ContentClient(Masters(f"ws://127.0.0.1:{port}"), secret)
     piece = await client.piece(sha256, 0)
     assert piece.data == (tmp_path / "master" / "bundles" / sha256).read_bytes()
     assert piece.size == len(piece.data)
@@ -257,9 +258,9 @@ async def test_task_sets_fetch_contents_by_their_secret(shop: Site, tmp_path: Pa
     with pytest.raises(ContentError, match="bytes only"):
         await client.piece(sha256, piece.size)
     with pytest.raises(ContentError, match="secret"):
-        await ContentClient("127.0.0.1", port, Secret("not the secret")).piece(sha256, 0)
+        await ContentClient(Masters(f"ws://127.0.0.1:{port}"), Secret("not the secret")).piece(sha256, 0)
     with pytest.raises(ContentError, match="does not hand it out"):
-        await ContentClient("127.0.0.1", 1, secret).piece(sha256, 0)
+        await ContentClient(Masters("ws://127.0.0.1:1"), secret).piece(sha256, 0)
 
 
 async def test_an_account_with_keys_takes_no_other_one_by_itself(shop: Site, tmp_path: Path) -> None:
