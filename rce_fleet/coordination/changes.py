@@ -1,6 +1,6 @@
-"""What the outside has to be told: the fleet's state as a whole, or what changed of it.
+"""Changes of the fleet's state, for publishing.
 
-Poses are not part of it: they are published robot by robot as they come.
+Poses are not included: they are published for each robot as they arrive.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class FleetChanges:
-    """What became different. It can be applied again without harm: everything in it is the new state.
+    """A change of the state. Applying it twice is harmless: it has the new state of its robots and cells.
 
     Attributes:
         sequence: Number of the change, counted from 1.
         robots: Robots that are new or changed, by name.
-        removed: Robots that are gone, ascending.
+        removed: Removed robots, ascending.
         blocked: Cells that became blocked, ascending; walls never change.
-        pending: Cells that will be blocked as soon as the robots in them have left, ascending.
-        freed: Cells that are neither any more, ascending.
+        pending: Cells that will be blocked once the robots in them have left, ascending.
+        freed: Cells that are not blocked or pending any more, ascending.
     """
 
     sequence: int
@@ -37,7 +37,7 @@ class FleetChanges:
 
 
 class ChangeLog:
-    """Collects what may have changed, and tells what did.
+    """Collects possible changes, and returns the actual ones.
 
     Attributes:
         sequence: Number of the last change; 0 before the first.
@@ -64,8 +64,8 @@ class ChangeLog:
         """Return what changed since the last call; None if nothing did.
 
         Args:
-            describe: Gives a robot as it is now; None if it is gone.
-            is_blocked: Tells of a cell whether it is blocked (true), pending (false) or neither (None).
+            describe: Returns the state of a robot; None if it was removed.
+            is_blocked: Returns whether a cell is blocked (True), pending (False) or neither (None).
         """
         noted, self._robots = sorted(self._robots), set()
         cells, self._cells = sorted(self._cells), set()
@@ -95,7 +95,7 @@ class ChangeLog:
         )
 
     def _tell(self, robot: str, now: RobotSnapshot | None) -> RobotSnapshot | None:
-        """Return a robot's state if it is another one than the outside was told."""
+        """Return a robot's state if it differs from the last published one."""
         if now is None:
             return None
         known = replace(now, x=nan, y=nan, yaw=nan)
@@ -106,7 +106,7 @@ class ChangeLog:
 
 
 def _told(robot: RobotSnapshot | None) -> tuple[object, ...] | None:
-    """What is told of a robot, without its pose."""
+    """Return the published state of a robot, without its pose."""
     if robot is None:
         return None
     return (

@@ -1,4 +1,4 @@
-"""When each robot has to be looked at next, so that a tick of the clock touches only those that are due."""
+"""The time of each robot's next check, so that a timer event handles only the robots that are due."""
 
 from __future__ import annotations
 
@@ -6,34 +6,34 @@ from heapq import heappop, heappush
 from math import inf
 
 ROUNDING = 1e-6
-"""Seconds that a robot is looked at too early at most: sums of times are rounded."""
+"""Seconds by which a check may be early: sums of times are rounded."""
 
 
 class Deadlines:
-    """One time for each robot, by the planner's clock in seconds."""
+    """One time per robot, in seconds of the planner's clock."""
 
     def __init__(self) -> None:
         self._due: dict[str, float] = {}
         self._heap: list[tuple[float, str]] = []
 
     def set(self, robot: str, due: float) -> None:
-        """Have a robot looked at when ``due`` has come, and not for what was set before."""
+        """Set the time of a robot's next check."""
         if self._due.get(robot) != due:
             self._due[robot] = due
             if due < inf:
                 heappush(self._heap, (due, robot))
 
     def hasten(self, robot: str, due: float) -> None:
-        """Have a robot looked at when ``due`` has come, unless it is looked at earlier anyway."""
+        """Set the time of a robot's next check, unless an earlier one is set."""
         if due < self._due.get(robot, inf):
             self.set(robot, due)
 
     def forget(self, robot: str) -> None:
-        """Do not look at a robot any more."""
+        """Remove a robot."""
         self._due.pop(robot, None)
 
     def take_due(self, now: float) -> list[str]:
-        """Return the robots whose time has come, the earliest first; they have none until one is set."""
+        """Return the robots that are due, the earliest first, and remove their times."""
         due = []
         while self._heap and self._heap[0][0] <= now + ROUNDING:
             time, robot = heappop(self._heap)
@@ -43,5 +43,5 @@ class Deadlines:
         return due
 
     def __getitem__(self, robot: str) -> float:
-        """When a robot is looked at next; ``inf`` if never."""
+        """Return the time of a robot's next check; ``inf`` if none is set."""
         return self._due.get(robot, inf)

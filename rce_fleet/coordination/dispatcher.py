@@ -1,8 +1,8 @@
-"""Carries out what the fleet's state asks for: stops robots, gives them places, grants cells, asks for plans.
+"""Carries out what the fleet's state requires: stops and places robots, grants cells, requests plans.
 
-The planner takes events and notes what they change; :meth:`Dispatcher.advance` then does everything that
-has become possible by that. What may have become possible is found by the indexes of the state and by the
-ledger's notes, so the cost of an event does not depend on the number of robots.
+The planner handles events and records their changes; :meth:`Dispatcher.advance` then does everything that has
+become possible. It finds that by the indexes of the state and of the ledger, so the cost of an event does not
+depend on the number of robots.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 
 
 class Dispatcher:
-    """Sends the robots of a fleet on.
+    """Moves the robots of a fleet on.
 
     Attributes:
-        now: Time of the present event, seconds.
-        out: The instructions to which it led so far.
-        outdated: Whether something changed that the newest plan, or the one asked for, does not know.
+        now: Time of the current event, seconds.
+        out: Its instructions so far.
+        outdated: Whether the state changed since the newest plan or plan request.
         to_settle: Robots that may stand still now.
-        left: Cells that may have to be blocked now.
+        left: Pending cells that may be free of robots now.
 
     Args:
         state: The fleet.
@@ -63,7 +63,7 @@ class Dispatcher:
                 self._ask_for_plan()
 
     def hold(self, record: RobotRecord, reason: str) -> None:
-        """Tell a robot to stop, to take its cells back once it has."""
+        """Stop a robot, to take its cells back once it stands still."""
         if record.phase is Phase.SILENT:
             return
         record.held_at = self.now
@@ -74,7 +74,7 @@ class Dispatcher:
         self.send(record, ())
 
     def _settle_standing(self) -> None:
-        """Give robots that stand still their places, and then those that waited for one of these."""
+        """Place robots that stand still, and then those that waited for one of their cells."""
         while True:
             freed = self.state.ledger.take_freed()
             self.left |= freed
@@ -92,7 +92,7 @@ class Dispatcher:
                     self.state.index.set_hindered(robot, ())
 
     def _settle(self, record: RobotRecord) -> None:
-        """Give a robot that stands still the cell that it stands in."""
+        """Place a robot that stands still in its cell."""
         state = self.state
         touched = self.touched(record)
         own = {cell for cell in touched if state.ledger.owner(cell) in (None, record.id)}
@@ -107,7 +107,7 @@ class Dispatcher:
             return
         state.change(record, Cause.SETTLED, "")
         record.centred = False
-        # No robot claims what is blocked already: it only touches the margin around the box.
+        # A blocked cell is not claimed: the robot only touches the margin around the box.
         state.ledger.place(record.id, cell, {other for other in own if not state.is_blocked(other)})
         self.outdated = True
         self.send(record, (cell,))
@@ -122,7 +122,7 @@ class Dispatcher:
             self.out.append(BlockedChanged(tuple(sorted(self.state.blocked))))
 
     def _grant(self) -> None:
-        """Grant cells to the robots that may have got their turn."""
+        """Grant cells to robots whose turn it may be."""
         ledger = self.state.ledger
         for robot in sorted(ledger.take_ripe()):
             record = self.state.robots.get(robot)
@@ -134,7 +134,7 @@ class Dispatcher:
     # Plans
 
     def _awaited(self) -> bool:
-        """Whether a plan has to wait for a robot that is being stopped."""
+        """Return whether a plan has to wait for a robot that is stopping."""
         told_at = self.state.index.last_stop()
         return told_at is not None and self.now - told_at < self.settings.hold_timeout
 
@@ -145,14 +145,14 @@ class Dispatcher:
         self.out.append(MakePlan(self._asked))
 
     def take_plan(self, result: PlanResult) -> None:
-        """Take the plan that was asked for; another one is ignored."""
+        """Adopt the requested plan; ignore any other."""
         request = self._asked
         if request is None or request.number != result.number:
             return
         self._asked = None
         if not self.outdated:
             adopt_plan(self.state, request, result)
-            # A plan that gets nearer is followed by another; one that gets nowhere waits for a change.
+            # After a plan that makes progress, request another; otherwise wait for a change.
             self._partial = not result.complete and bool(result.cells)
         elif not self._awaited():
             adopt_plan(self.state, request, result)
@@ -161,7 +161,7 @@ class Dispatcher:
     # One robot
 
     def arrive(self, record: RobotRecord) -> bool:
-        """Leave behind the cells that a robot has left; tell whether it is on its path."""
+        """Release the cells that a robot has left; return whether it is on its path."""
         granted = self.state.ledger.granted(record.id)
         index = arrived_index(self.state.grid, granted, record.x, record.y, self.settings)
         if index is None:
@@ -173,28 +173,28 @@ class Dispatcher:
         return True
 
     def send(self, record: RobotRecord, cells: tuple[int, ...]) -> None:
-        """Send a robot its cells; one that is to stand still is stopped first."""
+        """Send a robot its cells; stop it first if it must stand still."""
         record.sent_at = self.now
         if record.phase is Phase.HOLDING:
             self.out.append(SendCancel(record.id))
         self.out.append(SendCells(record.id, record.next_revision(), cells))
 
     def touched(self, record: RobotRecord) -> set[int]:
-        """The cells that a robot overlaps where it was seen last."""
+        """Return the cells that a robot overlaps at its last pose."""
         reach = self.settings.robot_radius + self.settings.clearance
         return self.state.grid.cells_touched(record.x, record.y, reach)
 
     def validate(self) -> None:
-        """Check that nothing is left undone that has become possible.
+        """Check that everything that is possible was done.
 
         Raises:
-            InvariantError: Something is.
+            InvariantError: Something was not done.
         """
         state, quiet = self.state, not self.outdated and self._asked is None
         for record in state.robots.values():
             stands = record.phase is Phase.HOLDING and record.stands(self.settings)
             if stands and record.id not in state.index.hindered and self.touched(record):
-                raise InvariantError(f"{record.id} stands and was not given its place")
+                raise InvariantError(f"{record.id} stands still and was not placed in its cell")
             is_granted_cells = quiet and record.phase is Phase.ACTIVE
             if is_granted_cells and state.ledger.may_grant(record.id, self.settings.ahead):
                 raise InvariantError(f"{record.id} was not granted a cell that is free for it")

@@ -1,4 +1,4 @@
-"""All that the planner remembers."""
+"""The planner's state: records of the robots, blocked cells, the ledger and the indexes."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
 class FleetState:
     """The fleet's state.
 
-    Records are changed where they are; who changes one calls :meth:`touch`, and before indexes are read
-    :meth:`refresh`. The ledger notes by itself whose part of it changed.
+    Records are changed in place: call :meth:`touch` after a change, and :meth:`refresh` before reading
+    indexes. The ledger records its own changes.
 
     Attributes:
         grid: The map; its blocked cells are walls.
-        robots: Every robot ever heard and not removed.
+        robots: All robots that sent a message and were not removed.
         ledger: Which robot claims which cell.
         blocked: Cells that were blocked; no robot claims one.
-        pending: Cells that will be blocked when those who claim them have left; no robot may enter one.
-        index: Robots by what the planner asks for.
-        log: What the outside has not been told yet.
+        pending: Cells that will be blocked once no robot claims them; no robot may enter one.
+        index: Indexes of the robots.
+        log: Changes that are not published yet.
     """
 
     grid: GridMap
@@ -48,11 +48,11 @@ class FleetState:
         return self.grid.blocked.union(self.blocked, self.pending)
 
     def is_shut(self, cell: int) -> bool:
-        """Whether no robot may enter a cell."""
+        """Return whether robots may not enter a cell."""
         return cell in self.grid.blocked or cell in self.blocked or cell in self.pending
 
     def is_blocked(self, cell: int) -> bool:
-        """Whether a cell is a wall or blocked already."""
+        """Return whether a cell is a wall or blocked already."""
         return cell in self.grid.blocked or cell in self.blocked
 
     # Changes
@@ -62,23 +62,23 @@ class FleetState:
         self._touched.add(record.id)
 
     def change(self, record: RobotRecord, cause: Cause, reason: str) -> None:
-        """Take a robot to the next phase of its life.
+        """Change a robot's phase.
 
         Raises:
-            TransitionError: The cause does not belong to the phase.
+            TransitionError: The phase does not allow the cause.
         """
         record.change(cause)
         record.reason = reason
         self._touched.add(record.id)
 
     def remove(self, robot: str) -> None:
-        """Forget a robot; its cells are free."""
+        """Remove a robot; its cells are free."""
         del self.robots[robot]
         self.ledger.remove(robot)
         self._touched.add(robot)
 
     def want_blocked(self, cell: int) -> None:
-        """Let no robot enter a cell from now on."""
+        """Make a cell pending: no robot may enter it from now on."""
         self.pending.add(cell)
         self.log.note_cell(cell)
 
@@ -95,7 +95,7 @@ class FleetState:
         self.log.note_cell(cell)
 
     def refresh(self) -> None:
-        """Enter into the indexes what changed since the last call."""
+        """Update the indexes with the changes since the last call."""
         touched = self.ledger.take_changed() | self._touched
         self._touched = set()
         for robot in sorted(touched, key=self._held_at):
@@ -110,14 +110,14 @@ class FleetState:
         record = self.robots.get(robot)
         return record.held_at if record else 0.0
 
-    # The outside
+    # Publishing
 
     def take_changes(self) -> FleetChanges | None:
-        """Return what the outside has not been told yet; None if it knows everything."""
+        """Return the changes that are not published yet; None if there are none."""
         return self.log.take(self.describe, self._cell_state)
 
     def snapshot(self) -> FleetSnapshot:
-        """The state as the outside sees it."""
+        """Return the state for publishing."""
         return FleetSnapshot(
             robots=tuple(self._describe(self.robots[robot]) for robot in sorted(self.robots)),
             blocked=tuple(sorted(self.blocked)),
@@ -125,7 +125,7 @@ class FleetState:
         )
 
     def describe(self, robot: str) -> RobotSnapshot | None:
-        """One robot as the outside sees it; None if there is none of this name."""
+        """Return a robot's state for publishing; None if the robot is unknown."""
         record = self.robots.get(robot)
         return None if record is None else self._describe(record)
 
@@ -133,7 +133,7 @@ class FleetState:
         """Check the invariants.
 
         Raises:
-            InvariantError: One does not hold.
+            InvariantError: An invariant does not hold.
         """
         self.ledger.validate()
         self.index.validate(self.robots.values(), self.ledger)
@@ -142,7 +142,7 @@ class FleetState:
         for record in self.robots.values():
             route, claims = self.ledger.route(record.id), self.ledger.claims(record.id)
             if not self.grid.is_path(route):
-                raise InvariantError(f"the route of {record.id} is no path: {route}")
+                raise InvariantError(f"the route of {record.id} is not a path: {route}")
             if route and claims & self.blocked:
                 raise InvariantError(f"{record.id} claims blocked cells: {claims & self.blocked}")
             if record.phase is not Phase.ACTIVE:
@@ -153,7 +153,7 @@ class FleetState:
                 raise InvariantError(f"the route of {record.id} leads through blocked cells: {route}")
 
     def _cell_state(self, cell: int) -> bool | None:
-        """Whether a cell is blocked (true), pending (false) or neither (None)."""
+        """Return whether a cell is blocked (True), pending (False) or neither (None)."""
         return True if cell in self.blocked else False if cell in self.pending else None
 
     def _describe(self, record: RobotRecord) -> RobotSnapshot:
@@ -191,4 +191,4 @@ _AT_REST = {
     (True, False): RobotState.WAITING,
     (True, True): RobotState.ARRIVED,
 }
-"""State of a robot that stands in its cell, by whether it has a goal and is there."""
+"""State of a robot at rest in its cell, by whether it has a goal and is there."""

@@ -1,7 +1,7 @@
-"""Indexes over the robots, so that an event touches the records that it concerns and no others.
+"""Indexes of the robots, so that an event handles only the records that it concerns.
 
-Each index can be made from scratch from the records and the ledger; :meth:`FleetIndex.validate` compares. An
-index is kept by entering a robot anew whenever its record or its part of the ledger changed.
+Each index can be rebuilt from the records and the ledger; :meth:`FleetIndex.validate` compares. A robot is
+entered again whenever its record or its part of the ledger changed.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 
 class FleetIndex:
-    """Robots by what the planner asks for.
+    """Indexes of robots for the planner's queries.
 
     Attributes:
         goals: The robot that was sent to a cell, by that cell.
-        stopping: Robots with a place that were told to stand still, and when; the newest last.
+        stopping: Robots with a cell that were told to stand still, and when; the newest last.
         under_way: Active robots that are not at rest in the last cell of their route.
-        hindered: Robots that stand and cannot take their place, and the cells that they overlap.
+        hindered: Robots that stand still and cannot be placed, and the cells that they overlap.
     """
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class FleetIndex:
         self._goal_of: dict[str, int] = {}
 
     def enter(self, record: RobotRecord, ledger: CellLedger) -> None:
-        """Enter a robot as it is now."""
+        """Enter a robot with its current state."""
         robot = record.id
         if self._goal_of.get(robot) != record.goal:
             self._drop_goal(robot)
@@ -56,18 +56,18 @@ class FleetIndex:
             self.set_hindered(robot, ())
 
     def leave(self, robot: str) -> None:
-        """Forget a robot."""
+        """Remove a robot."""
         self._drop_goal(robot)
         self.stopping.pop(robot, None)
         self.under_way.discard(robot)
         self.set_hindered(robot, ())
 
     def last_stop(self) -> float | None:
-        """When a robot that is still stopping was told to last; None if none is."""
+        """Return when the last robot that is still stopping was told to; None without one."""
         return next(reversed(self.stopping.values()), None)
 
     def set_hindered(self, robot: str, cells: Iterable[int]) -> None:
-        """Note the cells whose change may let a robot take its place; none if it is not hindered."""
+        """Store the cells whose change may allow placing a robot; none if it is not hindered."""
         wanted = frozenset(cells)
         before = self.hindered.pop(robot, frozenset())
         for cell in before - wanted:
@@ -85,7 +85,7 @@ class FleetIndex:
         return {robot for cell in cells for robot in self._hindered_at.get(cell, ())}
 
     def validate(self, records: Iterable[RobotRecord], ledger: CellLedger) -> None:
-        """Compare with indexes made from scratch.
+        """Compare with rebuilt indexes.
 
         Raises:
             InvariantError: They differ.
@@ -114,10 +114,10 @@ class FleetIndex:
 
 
 def is_stopping(record: RobotRecord, ledger: CellLedger) -> bool:
-    """Whether a robot that has a place was told to stand still and was not given a new place yet."""
+    """Return whether a robot with a cell was told to stand still and is not placed again yet."""
     return record.phase is Phase.HOLDING and ledger.length(record.id) > 0
 
 
 def is_under_way(record: RobotRecord, ledger: CellLedger) -> bool:
-    """Whether a robot takes part in plans and is not at rest in the last cell of its route."""
+    """Return whether a robot takes part in plans and is not at rest in the last cell of its route."""
     return record.phase is Phase.ACTIVE and not (record.centred and ledger.length(record.id) == 1)

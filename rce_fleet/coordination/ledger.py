@@ -1,11 +1,12 @@
 """Which robot claims which cell, and which robot enters it next.
 
-A joint plan says at which step robots enter cells. Real robots keep no steps, so the plan is carried out
-by order: a robot is granted a cell only once every robot that uses the cell before it has left it. Robots
-never follow each other in a circle, so one of them can always drive, however slow the others are.
+A joint plan says at which step robots enter cells. Real robots do not keep these steps, so the plan is
+carried out in order: a robot is granted a cell only once every robot that uses the cell before it has left
+it. Robots never follow each other in a circle, so one of them can always drive, however slow the others are.
 
-An operation costs what it changes, not what the ledger holds: cells know their owner and their queue, and the
-ledger notes what became possible (:meth:`CellLedger.take_freed`, :meth:`CellLedger.take_ripe`).
+The cost of an operation depends on what it changes, not on the ledger's size: cells have an owner and a
+queue, and the ledger records what became possible (:meth:`CellLedger.take_freed`,
+:meth:`CellLedger.take_ripe`).
 """
 
 from __future__ import annotations
@@ -25,10 +26,10 @@ class _Account:
     """One robot's part of the ledger.
 
     Attributes:
-        route: The cell that it is in, then those it will enter. Empty for a robot without a place.
+        route: The cell that it is in, then those it will enter. Empty for a robot without a cell.
         granted: How many cells of the route it may use; the first always.
         extra: Further cells that it overlaps.
-        passed: How many cells of its life it has left; numbers its visits.
+        passed: Number of cells that it has left so far; numbers its visits.
         owned: The cells whose owner it is.
     """
 
@@ -84,21 +85,21 @@ class CellLedger:
         return account.route[: account.granted] if account else []
 
     def visitors(self, cell: int) -> set[str]:
-        """The robots whose routes lead through a cell or begin there."""
+        """Return the robots whose routes lead through a cell or begin there."""
         return {robot for robot, _ in self._queues.get(cell, ())}
 
     def length(self, robot: str) -> int:
-        """How many cells the robot's route has; 0 for a robot without a place."""
+        """Return the number of cells of the robot's route; 0 for a robot without a cell."""
         account = self._accounts.get(robot)
         return len(account.route) if account else 0
 
     def end_of_grant(self, robot: str) -> int | None:
-        """The last cell that the robot may enter; None without a place."""
+        """Return the last cell that the robot may enter; None for a robot without a cell."""
         account = self._accounts.get(robot)
         return account.route[account.granted - 1] if account and account.granted else None
 
     def extra(self, robot: str) -> frozenset[int]:
-        """Cells that the robot overlaps without being on its way through them."""
+        """Return cells that the robot overlaps outside its route."""
         account = self._accounts.get(robot)
         return account.extra if account else frozenset()
 
@@ -110,12 +111,12 @@ class CellLedger:
         return changed
 
     def take_freed(self) -> set[int]:
-        """Return the cells that lost their owner since the last call; they may have another one by now."""
+        """Return the cells that lost their owner since the last call; they may have a new one by now."""
         freed, self._freed = self._freed, set()
         return freed
 
     def take_ripe(self) -> set[str]:
-        """Return the robots that :meth:`grant` may give further cells now; it would give no other any."""
+        """Return the robots to which :meth:`grant` may grant further cells now; all others get none."""
         ripe, self._ripe = self._ripe, set()
         return ripe
 
@@ -143,7 +144,7 @@ class CellLedger:
         """Claim cells for a robot without a cell; skip those that other robots claim."""
         account = self._account(robot)
         if account.route:
-            raise InvariantError(f"{robot} has a place")
+            raise InvariantError(f"{robot} has a cell already")
         account.extra = frozenset(cell for cell in cells if self._owners.get(cell, robot) == robot)
         self._settle_owners(robot, account)
 
@@ -183,7 +184,7 @@ class CellLedger:
                 raise InvariantError(f"the plan of {robot} does not begin where its granted cells end")
         for robot in self._accounts:
             self.truncate(robot)
-        # A plan has tens of thousands of visits: this is the longest thing that the planner does at once.
+        # A plan has tens of thousands of visits: this is the planner's longest operation.
         accounts, queues = self._accounts, self._queues
         for robot, cell in visits:
             account = accounts[robot]
@@ -215,11 +216,11 @@ class CellLedger:
         return account.granted > before
 
     def may_grant(self, robot: str, ahead: int) -> bool:
-        """Tell whether :meth:`grant` would give a robot a further cell."""
+        """Return whether :meth:`grant` would grant a robot a further cell."""
         return self._may_enter_next(robot, self._account(robot), ahead)
 
     def arrive(self, robot: str, index: int) -> None:
-        """The robot has fully arrived in granted cell number ``index`` and overlaps no other."""
+        """Record that a robot has fully arrived in granted cell number ``index`` and overlaps no other."""
         account = self._account(robot)
         if not 0 <= index < account.granted:
             raise InvariantError(f"{robot} arrived in a cell that it was not granted")
@@ -240,13 +241,13 @@ class CellLedger:
             self._ripe.add(robot)
         self._settle_owners(robot, account)
 
-    # Books
+    # Consistency
 
     def validate(self) -> None:
         """Check the invariants.
 
         Raises:
-            InvariantError: One does not hold.
+            InvariantError: An invariant does not hold.
         """
         owners: dict[int, str] = {}
         for robot, account in self._accounts.items():
@@ -284,7 +285,7 @@ class CellLedger:
         return is_first and self._owners.get(cell, robot) == robot
 
     def _withdraw(self, robot: str, account: _Account) -> None:
-        """Take all visits of a robot out of the queues."""
+        """Remove all visits of a robot from the queues."""
         for index, cell in enumerate(account.route):
             self._drop_visit(cell, (robot, account.passed + index))
 
@@ -298,7 +299,7 @@ class CellLedger:
             self._ripe.add(queue[0][0])
 
     def _settle_owners(self, robot: str, account: _Account) -> None:
-        """Make a robot the owner of what it claims, and of nothing else."""
+        """Make a robot the owner of exactly the cells that it claims."""
         claims = account.claims
         for cell in account.owned - claims:
             del self._owners[cell]

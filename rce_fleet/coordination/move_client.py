@@ -350,7 +350,7 @@ class MoveClient:
         self._advance(ClientEvent.STOPPED)
         return [*self._proceed(now), self._report]
 
-    # Books
+    # State
 
     def _advance(self, event: ClientEvent) -> None:
         state = CLIENT_LIFE.advance(self._report.state, event, self.name, self._recent)

@@ -82,7 +82,7 @@ class FleetPlanner:
             Tick: self._take_tick,
         }
 
-    # The outside
+    # Publishing
 
     def handle(self, event: Event, now: float) -> list[Instruction]:
         """Handle an event at time ``now`` (seconds, monotonic); return the instructions."""

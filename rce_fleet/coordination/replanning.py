@@ -1,8 +1,8 @@
 """One plan for all active robots, from the cells that they are committed to.
 
-A plan is made in three steps, so that the long one can be done elsewhere: :func:`request_plan` takes what
-it depends on from the fleet's state, :func:`compute_plan` works on nothing else, and :func:`adopt_plan`
-enters the result into the ledger, as far as the robots are still where the plan has them begin.
+A plan is made in three steps, so that the long one can run in another process: :func:`request_plan` copies
+its input from the fleet's state, :func:`compute_plan` uses only this copy, and :func:`adopt_plan` enters the
+result into the ledger, as far as the robots are still where the plan begins.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ if TYPE_CHECKING:
     from rce_fleet.coordination.settings import FleetSettings
 
 NO_CELL = -1
-"""In a request: a robot has none."""
+"""In a request: the robot has no such cell."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlanRequest:
-    """All that a plan depends on.
+    """The input of a plan.
 
     Attributes:
-        number: Names the request.
+        number: Number of the request.
         rows, columns: Size of the map.
-        blocked: Cells that no robot may enter, those of robots that take no part among them.
+        blocked: Cells that no robot may enter, with those of robots that take no part.
         robots: Robots that take part.
-        starts: For each the last cell that it was granted.
-        goals: For each where it was sent, or -1.
-        rests: For each where it returns to without a goal, or -1.
+        starts: Last granted cell of each robot.
+        goals: Goal of each robot, or -1.
+        rests: Cell that each robot returns to without a goal, or -1.
         seed: Breaks ties.
         effort: Work spent at most, see :func:`rce_fleet.planning.lacam.plan`.
     """
@@ -58,10 +58,10 @@ class PlanResult:
     """A plan: which robot enters which cell, in order.
 
     Attributes:
-        number: The request's.
-        visitors: For each visit of a cell the robot, as its place in the request's ``robots``.
-        cells: For each visit the cell.
-        unreachable: Robots, as places in ``robots``, whose goal cannot be reached.
+        number: Number of the request.
+        visitors: Robot of each visit of a cell, as an index of the request's ``robots``.
+        cells: Cell of each visit.
+        unreachable: Robots, as indexes of ``robots``, whose goal cannot be reached.
         complete: Whether the plan ends with all robots at their targets.
     """
 
@@ -73,15 +73,15 @@ class PlanResult:
 
 
 def request_plan(state: FleetState, settings: FleetSettings, number: int) -> PlanRequest:
-    """Take from the fleet's state what a plan depends on.
+    """Return the input of a plan from the fleet's state.
 
     Cells claimed by robots that are not active are obstacles. Cells granted already are driven through in any
     case, so the plan begins where they end.
 
     Args:
-        state: The fleet; ``rest`` of robots that have nowhere to go is set.
+        state: The fleet; ``rest`` of robots without a target is set.
         settings: Seed and effort.
-        number: Of the plan; breaks ties in another way each time.
+        number: Number of the plan; changes how ties are broken.
     """
     robots, starts, goals, rests = [], [], [], []
     blocked = set(state.shut)
@@ -111,7 +111,7 @@ def request_plan(state: FleetState, settings: FleetSettings, number: int) -> Pla
 
 
 def compute_plan(request: PlanRequest) -> PlanResult:
-    """Make the plan. The same request always gives the same one."""
+    """Return the plan. The same request always gives the same plan."""
     grid = GridMap(request.rows, request.columns, blocked=frozenset(request.blocked))
     starts = dict(zip(request.robots, request.starts, strict=True))
     targets = assign_targets(
@@ -147,13 +147,13 @@ def adopt_plan(state: FleetState, request: PlanRequest, result: PlanResult) -> N
     """Enter a plan's routes into the ledger.
 
     The state may have changed since the request. A robot that is not active any more, was granted other cells
-    or was sent elsewhere gets no route, and a route ends before a cell that no robot may enter any more. That
-    is safe, as only grants let robots drive, and each of them is checked by the ledger; but robots may not
-    get to their goals by it, so another plan has to follow.
+    or has another goal gets no route, and a route ends before a cell that no robot may enter any more. That
+    is safe, because robots drive only on granted cells, and the ledger checks each grant; but robots may not
+    reach their goals, so another plan has to follow.
 
     Args:
         state: The fleet; its ledger and the robots' ``unreachable`` are changed.
-        request: What the plan was asked for with.
+        request: The plan's request.
         result: The plan.
     """
     unreachable = frozenset(result.unreachable)
@@ -178,7 +178,7 @@ def adopt_plan(state: FleetState, request: PlanRequest, result: PlanResult) -> N
 
 
 def _visits(state: FleetState, present: list[str | None], result: PlanResult) -> Iterator[tuple[str, int]]:
-    """Tell who enters which cell, in order, as far as it is still possible."""
+    """Yield the visits in order, as far as they are still possible."""
     shut = state.shut
     for index, cell in zip(result.visitors, result.cells, strict=True):
         robot = present[index]

@@ -1,7 +1,7 @@
-"""Steers a fleet: gives every robot cells of the map to drive on, so that no two ever claim the same one.
+"""Plans for a fleet: grants each robot cells of the map, so that no two robots ever claim the same one.
 
-A robot is whatever publishes ``/NAME/amcl_pose`` and has a move client. The work is done by
-:mod:`rce_fleet.coordination`; this node carries messages to it and from it. ``share/README.md`` lists
+A robot is found by its topic ``/NAME/amcl_pose`` and needs a move client. The work is done by
+:mod:`rce_fleet.coordination`; this node passes messages to it and from it. ``share/README.md`` lists
 topics and parameters.
 """
 
@@ -53,9 +53,9 @@ if TYPE_CHECKING:
     from rce_fleet.coordination.replanning import PlanRequest
 
 TICK = 0.1
-"""Seconds between two looks at the clock; changes of the state are published at most as often."""
+"""Seconds between two timer events; changes of the state are published at most this often."""
 LOOK_AROUND = 0.5
-"""Seconds between two looks for new robots."""
+"""Seconds between two searches for new robots."""
 POSE = "geometry_msgs/PoseWithCovarianceStamped"
 ROBOT_TOPIC = re.compile(r"/([A-Za-z][A-Za-z0-9_]*)/amcl_pose")
 MAP_FRAME = "map"
@@ -67,7 +67,7 @@ class PlannerNode:
     Args:
         node: Running node.
         planner: The planner.
-        takes_answers: Move clients answer on ``goalNodesList`` instead of topics of their own.
+        takes_answers: Move clients answer on ``goalNodesList`` instead of their own topics.
     """
 
     def __init__(self, node: Node, planner: FleetPlanner, *, takes_answers: bool = False) -> None:
@@ -82,10 +82,10 @@ class PlannerNode:
         self._map: Publisher
 
     async def run(self, blocked: list[int]) -> None:
-        """Steer until the node is told to stop.
+        """Run until the node is stopped.
 
         Args:
-            blocked: Cells that are blocked from the beginning, and can be freed.
+            blocked: Cells that are blocked at the start, and can be freed.
         """
         node = self._node
         self._blocked = await node.advertise("/fleet/blockedCells", "std_msgs/Int32MultiArray", latch=True)
@@ -106,7 +106,7 @@ class PlannerNode:
     # What comes in
 
     async def _look_around(self) -> None:
-        """Take in every robot whose pose is published."""
+        """Add every robot whose pose is published."""
         async with RpcClient() as rpc:
             master = MasterClient(self._node.master_uri, self._node.name, self._node.uri, rpc)
             while True:
@@ -116,7 +116,7 @@ class PlannerNode:
                         if found is not None and found[1] not in self._cells:
                             await self._join(found[1])
                 except MasterError as error:
-                    self._node.log.warning("cannot look for robots: %s", error)
+                    self._node.log.warning("cannot search for robots: %s", error)
                 if not await self._node.sleep(LOOK_AROUND):
                     return
 
@@ -132,7 +132,7 @@ class PlannerNode:
             )
         else:
             await self._hear_apart(robot)
-        # Who watches the planner cannot hear what other interfaces of its container publish.
+        # Clients of the planner's container do not receive what its other interfaces publish.
         seen = await node.advertise(f"/fleet/poses/{robot}", POSE, latch=True)
 
         def take(message: Message) -> None:
@@ -140,10 +140,10 @@ class PlannerNode:
             seen.publish(message)
 
         await node.subscribe(f"/{robot}/amcl_pose", POSE, take)
-        node.log.info("%s is here", robot)
+        node.log.info("found robot %s", robot)
 
     async def _hear_apart(self, robot: str) -> None:
-        """Hear a move client and its robot on a topic for each."""
+        """Subscribe to the topics of a move client and its robot."""
         await self._node.subscribe(
             f"/{robot}/moveClient/status",
             "fleet/MoveStatus",
@@ -156,7 +156,7 @@ class PlannerNode:
         )
 
     def _take_answer(self, robot: str, message: Message) -> None:
-        """Take what a move client says; the planner's own lists come back here too."""
+        """Handle a move client's answer; the planner's own lists arrive here too."""
         dimensions = message.layout.dim
         labels = [dimension.label for dimension in dimensions]
         if not is_answer(labels):
@@ -191,17 +191,17 @@ class PlannerNode:
     # What goes out
 
     def _ask(self, event: Event) -> dict[str, Any]:
-        """Give a request to the planner; the fields of the response."""
+        """Pass a request to the planner; return the fields of the response."""
         reply = next(done for done in self._handle(event) if isinstance(done, Reply))
         self._node.log.info("%s", reply.message)
         return {"ok": reply.ok, "message": reply.message}
 
     def _take(self, event: Event) -> None:
-        """Give an event to the planner."""
+        """Pass an event to the planner."""
         self._handle(event)
 
     def _handle(self, event: Event) -> list[Instruction]:
-        """Give an event to the planner and do what it says."""
+        """Pass an event to the planner and carry out its instructions."""
         instructions = self._planner.handle(event, time.monotonic())
         for instruction in instructions:
             match instruction:
@@ -254,7 +254,7 @@ def _report(message: Message) -> ClientReport:
 
 
 async def read_parameters(node: Node) -> dict[str, Any]:
-    """The parameters of the namespace ``/fleet``, and over them the node's private ones."""
+    """Return the parameters of the namespace ``/fleet``, overridden by the node's private ones."""
     values: dict[str, Any] = {}
     for namespace in ("/fleet", "~"):
         found = await node.get_param(namespace, {})
@@ -264,7 +264,7 @@ async def read_parameters(node: Node) -> dict[str, Any]:
 
 
 async def main() -> None:
-    """Steer a fleet until the node is told to stop."""
+    """Run the planner until the node is stopped."""
     async with Node("fleet_planner") as node:
         values = await read_parameters(node)
         settings = FleetSettings(

@@ -1,9 +1,9 @@
-"""A process that makes plans, so that the planner's event loop takes poses and requests meanwhile.
+"""A process that makes plans, so that the planner's event loop can handle poses and requests meanwhile.
 
-A process and not a thread: planning is Python code that would hold the interpreter's lock for milliseconds
-at a time, its garbage would be collected in the middle of the event loop's work, and it would share one core
-with the thousands of poses a second that a large fleet sends. What crosses is small and plain: a request with
-a few numbers for each robot, and a result with two numbers for each step of a robot.
+It is a process and not a thread: planning is Python code that holds the interpreter lock for milliseconds,
+triggers garbage collection in the event loop, and would share one core with the thousands of poses per second
+of a large fleet. The messages are small: a request with a few numbers per robot, and a result with two
+numbers for each step of a robot.
 
 The process reads requests from its standard input and ends with it.
 """
@@ -27,15 +27,15 @@ if TYPE_CHECKING:
     from types import TracebackType
 
 _LENGTH = 4
-"""Bytes of a message's length, which goes before the message."""
+"""Bytes of the length in front of each message."""
 
 
 class PlanWorker:
-    """The process, as the planner's node sees it; ``async with`` starts and ends it.
+    """The planner node's handle of the process; ``async with`` starts and ends it.
 
     Args:
-        log: Told when the process has to be started again.
-        command: Starts the process.
+        log: Logs restarts of the process.
+        command: Command of the process.
     """
 
     def __init__(self, log: logging.Logger, *, command: tuple[str, ...] = ()) -> None:
@@ -53,9 +53,9 @@ class PlanWorker:
         await self._end()
 
     async def compute(self, request: PlanRequest) -> PlanResult:
-        """Make a plan. A process that ended is started again once.
+        """Return a plan. If the process ends, it is restarted once.
 
-        A call that is cancelled leaves the process in the middle of its work: end it then.
+        Cancelling leaves the process in the middle of its work: end it afterwards.
 
         Raises:
             PlanWorkerError: The process ended twice over this request.
@@ -63,7 +63,7 @@ class PlanWorker:
         try:
             return await self._ask(request)
         except (asyncio.IncompleteReadError, ConnectionError):
-            self._log.warning("the process that makes plans ended (%s); starting it again", await self._end())
+            self._log.warning("the plan worker ended (%s); restarting it", await self._end())
         await self._start()
         try:
             return await self._ask(request)
@@ -75,7 +75,7 @@ class PlanWorker:
         self._process = await asyncio.create_subprocess_exec(*self._command, stdin=PIPE, stdout=PIPE)
 
     async def _end(self) -> str:
-        """End the process; return how it ended."""
+        """End the process; return how it ended, in words."""
         process, self._process = self._process, None
         if process is None:
             return "it was ended"
@@ -97,7 +97,7 @@ class PlanWorker:
 
 
 def serve(requests: BinaryIO, results: BinaryIO) -> None:
-    """Make plans until there are no more requests."""
+    """Make plans until the input ends."""
     while len(head := requests.read(_LENGTH)) == _LENGTH:
         payload = requests.read(int.from_bytes(head))
         result = compute_plan(msgspec.msgpack.decode(payload, type=PlanRequest))

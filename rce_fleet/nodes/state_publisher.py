@@ -1,8 +1,8 @@
-"""Publishes the fleet's state: what changed, as it changes, and the whole of it, seldom or when asked.
+"""Publishes the fleet's state: changes at once, the complete state on request and at a low rate.
 
-``/fleet/changes`` carries changes, numbered; ``/fleet/get_state`` answers with the whole state and the number
-of the last change in it. ``/fleet/state`` carries the whole state, latched, for those who read nothing else.
-The larger the fleet, the less often it is published: up to 20 robots with each change, 800 robots every 4 s.
+``/fleet/changes`` has numbered changes; ``/fleet/get_state`` answers with the complete state and the number
+of the last change in it. ``/fleet/state`` has the complete state, latched, for programs that read only one
+topic. Its rate falls with the size of the fleet: up to 20 robots after each change, 800 robots every 4 s.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ CHANGES_TOPIC = "/fleet/changes"
 GET_STATE = "fleet/GetState"
 GET_STATE_SERVICE = "/fleet/get_state"
 WHOLE_ROBOTS_PER_S = 200.0
-"""How many robots whole states tell of in a second at most."""
+"""Maximum number of robots per second in complete states."""
 REPEAT_S = 1.0
 """Seconds without a change after which the number of the last one is published again."""
 
 
 class StatePublisher:
-    """Tells the outside how the fleet stands.
+    """Publishes the fleet's state.
 
     Args:
         node: Running node.
-        planner: Knows the state.
+        planner: The planner, with the state.
     """
 
     def __init__(self, node: Node, planner: FleetPlanner) -> None:
@@ -50,7 +50,7 @@ class StatePublisher:
         self._changes: Publisher
 
     async def start(self) -> None:
-        """Offer topics and service, and publish the state as it is."""
+        """Advertise topics and service, and publish the current state."""
         node = self._node
         self._state = await node.advertise(STATE_TOPIC, STATE, latch=True)
         self._changes = await node.advertise(CHANGES_TOPIC, CHANGES)
@@ -58,7 +58,7 @@ class StatePublisher:
         self._publish_whole()
 
     def update(self, now: float) -> None:
-        """Publish what is due at ``now``, in seconds; to be called a few times a second."""
+        """Publish what is due at ``now``, in seconds; call it a few times per second."""
         changes = self._planner.take_changes()
         if changes is not None or now - self._changes_at >= REPEAT_S:
             self._changes_at = now
@@ -78,7 +78,7 @@ class StatePublisher:
 
 
 def state_fields(started: Time, planner: FleetPlanner) -> dict[str, Any]:
-    """The fields of a ``fleet/FleetState``."""
+    """Return the fields of a ``fleet/FleetState``."""
     grid, snapshot = planner.state.grid, planner.snapshot()
     walls = sorted(grid.blocked)
     return {
@@ -92,7 +92,7 @@ def state_fields(started: Time, planner: FleetPlanner) -> dict[str, Any]:
 
 
 def changes_fields(started: Time, changes: FleetChanges | None, sequence: int) -> dict[str, Any]:
-    """The fields of a ``fleet/FleetChanges``; without changes those of a repeated number."""
+    """Return the fields of a ``fleet/FleetChanges``; without changes, those of a repeated number."""
     if changes is None:
         return {"started": started, "sequence": sequence}
     return {
@@ -107,7 +107,7 @@ def changes_fields(started: Time, changes: FleetChanges | None, sequence: int) -
 
 
 def robot_fields(robot: RobotSnapshot) -> dict[str, Any]:
-    """The fields of a ``fleet/RobotState``."""
+    """Return the fields of a ``fleet/RobotState``."""
     return {
         "id": robot.id,
         "state": robot.state.value,
@@ -131,5 +131,5 @@ def _map_fields(grid: GridMap) -> dict[str, Any]:
 
 
 def _or_none(cell: int | None) -> int:
-    """A cell as messages say it: -1 for none."""
+    """Return a cell as in messages: -1 for none."""
     return -1 if cell is None else cell

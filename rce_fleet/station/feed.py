@@ -1,7 +1,7 @@
-"""Turns what changes in the view into messages for the pages.
+"""Sends the view and its changes to the pages.
 
-A page gets ``map``, ``state`` and ``poses``, which tell everything, and then ``changes``, numbered from the
-``state`` on, and ``poses`` of robots that moved. A page that finds a number left out connects anew.
+A page first gets ``map``, ``state`` and ``poses``, which are complete; then ``changes``, numbered from the
+``state`` on, and ``poses`` of robots that moved. A page that misses a number reconnects.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rce_fleet.station.view import FleetView, ViewChange
 POSES_EVERY_S = 0.1
 """Seconds between two messages with poses."""
 REPEAT_POSE_S = 1.0
-"""A pose that stays the same is sent again after this time, to tell that the robot is heard."""
+"""Seconds after which an unchanged pose is sent again, to show that the robot is connected."""
 
 _Pose = tuple[float, float, float]
 
@@ -29,7 +29,7 @@ class Feed:
         pages: The open pages.
 
     Args:
-        view: What is known of the fleet.
+        view: The state of the fleet.
     """
 
     def __init__(self, view: FleetView) -> None:
@@ -42,7 +42,7 @@ class Feed:
         self._all: list[str] = []
 
     async def run(self) -> None:
-        """Send poses, some at a time, until cancelled."""
+        """Send poses in batches until cancelled."""
         while True:
             await self._any_heard.wait()
             self._any_heard.clear()
@@ -50,7 +50,7 @@ class Feed:
             await asyncio.sleep(POSES_EVERY_S)
 
     def on_change(self, change: ViewChange) -> None:
-        """Send what changed in the view."""
+        """Send a change of the view."""
         if not change:
             return
         self._number += 1
@@ -77,12 +77,12 @@ class Feed:
         )
 
     def on_pose(self, robot: str) -> None:
-        """Send a robot's pose with the next ones."""
+        """Add a robot's pose to the next batch."""
         self._heard.add(robot)
         self._any_heard.set()
 
     def send_poses(self, now: float) -> None:
-        """Send the poses of robots that moved, or were not told of for a while, at ``now`` in seconds."""
+        """Send the poses of robots that moved, or were not sent for a while; ``now`` is in seconds."""
         moved: dict[str, _Pose] = {}
         for robot in sorted(self._heard):
             if not self._view.knows(robot) or robot not in self._view.poses:
@@ -106,7 +106,7 @@ class Feed:
         self.pages.send_event(_text("event", {"text": text, "tone": tone}))
 
     def _tell_all(self) -> list[str]:
-        """Return the messages that tell everything; made once for all pages that need them now."""
+        """Return the complete messages; made once for all pages that need them now."""
         grid = self._view.map()
         if grid is not None and not self._all:
             names = self._view.robot_ids()

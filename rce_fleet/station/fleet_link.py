@@ -22,7 +22,7 @@ RESEND_FOR_S = 20.0
 """How long goals and blocked cells are sent again to a restarted planner."""
 RESEND_EVERY_S = 0.5
 ASK_AGAIN_S = 1.0
-"""Seconds until the whole state is requested again after no answer came."""
+"""Seconds after which the complete state is requested again without an answer."""
 
 
 class PlannerService(NamedTuple):
@@ -60,7 +60,7 @@ class PlannerListener(Protocol):
         """Handle a ``fleet/FleetChanges``."""
 
     def may_have_missed(self) -> None:
-        """Handle that changes may have been missed: they are received from now on, or again."""
+        """Handle a new or restored subscription to changes: some may have been missed."""
 
     def take_pose(self, robot: str, message: dict[str, Any]) -> None:
         """Handle a robot's pose message."""
@@ -95,7 +95,7 @@ class PlannerClient(ABC):
         self._new_robots.put_nowait(robot)
 
     def stop_states(self) -> None:
-        """Receive no more whole states, only changes."""
+        """Stop receiving complete states; changes are enough."""
         self._changes_followed.set()
 
     async def call(self, service: PlannerService, request: dict[str, Any]) -> dict[str, Any]:
@@ -116,8 +116,8 @@ class FleetLink:
     Args:
         client: The client of the planner.
         view: Updated with state and poses.
-        on_change: Called with what changed after the view took a state or changes.
-        on_pose: Called with a robot's id after the view took its pose.
+        on_change: Called with the change after the view was updated with a state or changes.
+        on_pose: Called with a robot's id after its pose was updated.
         on_event: Called with a text and a tone (``good``, ``warn``, ``bad`` or empty) for each event.
     """
 
@@ -188,7 +188,7 @@ class FleetLink:
                         await asyncio.sleep(RESEND_EVERY_S)
 
     async def _keep_up(self) -> None:
-        """Request the whole state whenever changes are missing."""
+        """Request the complete state whenever changes are missing."""
         while True:
             await self._state_needed.wait()
             try:
@@ -222,7 +222,7 @@ class FleetLink:
     # What comes in
 
     def take_state(self, message: dict[str, Any]) -> None:
-        """Handle a ``fleet/FleetState``; of a planner that publishes changes, those are followed instead."""
+        """Handle a ``fleet/FleetState``; ignore it if the planner publishes changes."""
         if not self._follower.follows:
             self._take(message["started"], self._view.on_state(message))
 
@@ -233,12 +233,12 @@ class FleetLink:
         self._request_if_behind()
 
     def may_have_missed(self) -> None:
-        """Request the whole state."""
+        """Request the complete state."""
         self._follower.lose()
         self._request_if_behind()
 
     def _take(self, planner_started: str, change: ViewChange) -> None:
-        """Do what a change of the view calls for."""
+        """Subscribe to new robots, and report the change."""
         if self._planner_started not in (None, planner_started):
             self._planner_restarted.set()
         self._planner_started = planner_started

@@ -1,9 +1,9 @@
-"""Sends what changes to every open page, each at its own pace.
+"""Sends changes to every open page, each at its own pace.
 
-A page first gets everything, then what changes. Changes that a page has not taken yet wait in a queue; if the
-page is too slow, its queue is emptied, and it gets everything anew. Of other messages, each of a *topic*, a
-page gets the newest; events wait in a short queue. A page that stops reading costs some memory and slows no
-other page.
+A page first gets the complete state, then changes. Changes that are not sent yet wait in a queue; if the page
+is too slow, its queue is emptied, and it gets the complete state again. Other messages have a *topic*, and a
+page gets the newest of each; events wait in a short queue. A page that stops reading costs some memory and
+slows no other page.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 
 MAX_CHANGES = 50
-"""Changes that wait for one page at most."""
+"""Maximum number of changes that wait for one page."""
 MAX_EVENTS = 100
 
 
@@ -21,8 +21,8 @@ class Page:
     """The messages that an open page still has to get.
 
     Args:
-        whole: Gives the messages that tell everything.
-        takes_changes: Whether it understands changes; else it gets everything whenever something changes.
+        whole: Returns the messages with the complete state.
+        takes_changes: Whether the page handles changes; otherwise it gets the complete state after each.
     """
 
     def __init__(self, whole: Callable[[], list[str]], *, takes_changes: bool) -> None:
@@ -36,7 +36,7 @@ class Page:
         self._wake.set()
 
     def put_change(self, text: str) -> None:
-        """Queue a change; a page that takes none, or is too slow, gets everything instead."""
+        """Queue a change; a page that handles none, or is too slow, gets the complete state instead."""
         if not self._takes_changes or len(self._changes) >= MAX_CHANGES:
             self._is_behind = True
             self._changes.clear()
@@ -77,7 +77,7 @@ class Broadcast:
     """The open pages, and the newest message of each topic for a page that opens.
 
     Args:
-        whole: Gives the messages that tell everything that changes are about; none if nothing is known yet.
+        whole: Returns the messages with the complete state; none before the first state.
     """
 
     def __init__(self, whole: Callable[[], list[str]] = list) -> None:
@@ -89,7 +89,7 @@ class Broadcast:
         return iter(self._pages)
 
     def open(self, *, takes_changes: bool = True) -> Page:
-        """Add a page; it gets everything first, and the newest message of every topic."""
+        """Add a page; it gets the complete state first, and the newest message of every topic."""
         page = Page(self._whole, takes_changes=takes_changes)
         for topic, text in self._newest.items():
             page.put(topic, text)
@@ -101,7 +101,7 @@ class Broadcast:
         self._pages.discard(page)
 
     def send_change(self, text: str) -> None:
-        """Send a change to the pages that are open now; later ones find it in everything that they get."""
+        """Send a change to the pages that are open now."""
         for page in self._pages:
             page.put_change(text)
 

@@ -35,15 +35,15 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class ViewChange:
-    """What a message changed in the view.
+    """A change of the view by a message.
 
     Attributes:
-        is_new_map: Whether the map is another one.
+        is_new_map: Whether the map changed.
         robots: Ids of robots that are new or changed.
-        removed: Ids of robots that are gone.
+        removed: Ids of removed robots.
         blocked: Cells that became blocked, ascending.
-        pending: Cells that will be blocked as soon as a robot has left them, ascending.
-        freed: Cells that are neither any more, ascending.
+        pending: Cells that will be blocked once a robot has left them, ascending.
+        freed: Cells that are not blocked or pending any more, ascending.
     """
 
     is_new_map: bool = False
@@ -83,7 +83,7 @@ class FleetView:
         }
 
     def on_state(self, message: dict[str, Any]) -> ViewChange:
-        """Set the whole state; what it does not name is gone."""
+        """Set the complete state; remove what is not in it."""
         grid = {key: message[key] for key in _MAP}
         robots = {robot["id"]: robot for robot in message["robots"]}
         blocked, pending = set(message["blocked"]), set(message["pending"])
@@ -147,7 +147,7 @@ class FleetView:
         """Return robots, with their poses if known.
 
         Args:
-            names: Which; all, ascending, if None. Those that are not known are left out.
+            names: Ids of the robots; all, ascending, if None. Unknown ones are left out.
         """
         wanted = self.robot_ids() if names is None else names
         return [self._robot(self._robots[robot]) for robot in wanted if robot in self._robots]

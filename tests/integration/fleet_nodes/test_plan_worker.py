@@ -58,7 +58,7 @@ async def test_a_process_that_ended_is_started_again(caplog: pytest.LogCaptureFi
         assert await worker.compute(request) == compute_plan(request)
         (second,) = workers()
         assert second.pid != first.pid
-    assert "starting it again" in caplog.text
+    assert "restarting it" in caplog.text
 
 
 async def test_a_request_that_ends_the_process_twice_is_an_error() -> None:
