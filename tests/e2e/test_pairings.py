@@ -174,9 +174,9 @@ async def test_who_has_a_robot_id_is_told_to_its_user(processes: int) -> None:
             program = str(Path(sys.executable).parent / "rce-ros")
             bridge = Program("rce-ros", [program, str(file)], engine.env, engine.folder)
             bridge.env = {**engine.env, "ROS_MASTER_URI": core.uri}
-            await bridge.start(ready="waiting until the robotID is free")
+            await bridge.start(ready="waiting until it is free")
             assert re.search(holder, bridge.output())
-            await until(lambda: bridge.output().count("robotID is free") > 1, what="it is said again")
+            await until(lambda: bridge.output().count("until it is free") > 1, what="it is said again")
             await bridge.stop()
 
 

@@ -255,7 +255,7 @@ async def test_a_robot_id_in_use_is_told_at_once_and_again(
     monkeypatch.setattr(Reminder.__init__, "__defaults__", (0.1, *defaults[1:]))
 
     def told() -> list[str]:
-        return [record.message for record in caplog.records if "robotID is free" in record.message]
+        return [record.message for record in caplog.records if "until it is free" in record.message]
 
     async with asyncio.timeout(30):
         async with engine.connection():
