@@ -34,10 +34,10 @@ async def robot(url: str, name: str = "a0") -> AsyncIterator[ClientConnection]:
         yield socket
 
 
-async def loop_back(socket: ClientConnection, cls: str, name: str = "a0") -> None:
+async def loop_back(socket: ClientConnection, message_type: str, name: str = "a0") -> None:
     """Join two of the robot's interfaces, so that what it sends comes back to it."""
     ends = [
-        {"endpointTag": name, "interfaceTag": tag, "interfaceType": kind, "className": cls}
+        {"endpointTag": name, "interfaceTag": tag, "interfaceType": kind, "className": message_type}
         for tag, kind in (("out", "SubscriberConverter"), ("in", "PublisherConverter"))
     ]
     await send(socket, "CN", {"addInterfaces": ends})
@@ -53,9 +53,9 @@ async def send(socket: ClientConnection, kind: str, data: object) -> None:
     await socket.send(json.dumps({"type": kind, "data": data}))
 
 
-def data_message(msg: str, cls: str = STRING) -> str:
+def data_message(msg: str, message_type: str = STRING) -> str:
     """The text of a data message of the looped interface."""
-    return f'{{"type":"DM","data":{{"iTag":"out","type":"{cls}","msgID":"nil","msg":{msg}}}}}'
+    return f'{{"type":"DM","data":{{"iTag":"out","type":"{message_type}","msgID":"nil","msg":{msg}}}}}'
 
 
 async def drain(socket: ClientConnection) -> None:

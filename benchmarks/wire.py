@@ -86,16 +86,18 @@ class Robot:
                     self._note(_read(frame))
 
     async def send_forwarded(
-        self, tag: str, payload: bytes, *, number: str = "nil", cls: str = STRING
+        self, tag: str, payload: bytes, *, number: str = "nil", message_type: str = STRING
     ) -> None:
         """Send a serialized message: its text frame and its binary frame."""
-        data = {"iTag": tag, "type": cls, "msgID": number, "msg*": _ID.decode()}
+        data = {"iTag": tag, "type": message_type, "msgID": number, "msg*": _ID.decode()}
         await self.socket.send(_write({"type": "DM", "data": data}), text=True)
         await self.socket.send(_ID + payload)
 
-    async def send_single(self, tag: str, payload: bytes, *, number: str = "nil", cls: str = STRING) -> None:
+    async def send_single(
+        self, tag: str, payload: bytes, *, number: str = "nil", message_type: str = STRING
+    ) -> None:
         """Send a serialized message in one frame; for robots that asked for it."""
-        header = _write({"iTag": tag, "type": cls, "msgID": number})
+        header = _write({"iTag": tag, "type": message_type, "msgID": number})
         await self.socket.send(_SINGLE.pack(1, len(header)) + header + payload)
 
 
@@ -134,13 +136,13 @@ async def wire_echo(client: Robot, form: str, container: str = "bench") -> None:
         ("service", "ServiceClient", "ServiceProvider", ECHO, "/stringEchoService"),
     ]
     interfaces = []
-    for tag, inside, outside, cls, address in ends:
+    for tag, inside, outside, message_type, address in ends:
         interfaces.append(
             {
                 "endpointTag": container,
                 "interfaceTag": tag,
                 "interfaceType": f"{inside}Interface",
-                "className": cls,
+                "className": message_type,
             }
             | {"addr": address}
         )
@@ -149,7 +151,7 @@ async def wire_echo(client: Robot, form: str, container: str = "bench") -> None:
                 "endpointTag": client.name,
                 "interfaceTag": tag,
                 "interfaceType": f"{outside}{form}",
-                "className": cls,
+                "className": message_type,
             }
         )
     node = {"containerTag": container, "nodeTag": "echo", "pkg": "Test", "exe": "stringEcho.py"}

@@ -93,14 +93,14 @@ class World:
         self,
         path: str,
         type_: str,
-        cls: str = "std_msgs/String",
+        message_type: str = "std_msgs/String",
         addr: str | None = None,
         user: str = "anna",
     ) -> Changes:
         endpoint, tag = path.split("/")
         if addr is None:
             addr = f"/{tag}" if type_.endswith("Interface") else ""
-        spec = InterfaceSpec(tag=tag, type=type_, message_type=cls, addr=addr)
+        spec = InterfaceSpec(tag=tag, type=type_, message_type=message_type, addr=addr)
         return self.do(commands.AddInterface(user=user, endpoint=endpoint, interface=spec))
 
     def node(self, container: str, tag: str, exe: str = "run.py") -> Changes:

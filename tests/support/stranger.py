@@ -75,12 +75,12 @@ class Stranger:
     async def send(self, kind: str, data: object) -> None:
         await self.socket.send_str(json.dumps({"type": kind, "data": data}))
 
-    async def publish(self, tag: str, cls: str, message: object) -> None:
-        await self.send("DM", {"iTag": tag, "type": cls, "msgID": "nil", "msg": message})
+    async def publish(self, tag: str, message_type: str, message: object) -> None:
+        await self.send("DM", {"iTag": tag, "type": message_type, "msgID": "nil", "msg": message})
 
-    async def call(self, tag: str, cls: str, message: object, *, timeout: float = TIMEOUT_S) -> Any:
+    async def call(self, tag: str, message_type: str, message: object, *, timeout: float = TIMEOUT_S) -> Any:
         number = f"call{next(self._numbers)}"
-        await self.send("DM", {"iTag": tag, "type": cls, "msgID": number, "msg": message})
+        await self.send("DM", {"iTag": tag, "type": message_type, "msgID": number, "msg": message})
         async with asyncio.timeout(timeout):
             answer = await self.queue(tag).get()
         assert answer["msgID"] == number
@@ -165,10 +165,10 @@ async def ask_for_echo(
                     "endpointTag": {"cTag_01": container, "testRobot": robot}[endpoint],
                     "interfaceTag": tag,
                     "interfaceType": kind,
-                    "className": cls,
+                    "className": message_type,
                     **({"addr": addr} if addr else {}),
                 }
-                for endpoint, tag, kind, cls, addr in ECHO_INTERFACES
+                for endpoint, tag, kind, message_type, addr in ECHO_INTERFACES
             ],
         },
     )

@@ -45,13 +45,13 @@ def find_neighbour(uri: str) -> Topics | None:
 class LocalMessage:
     """A published message, as an object, as bytes, or both; each is made of the other when asked for."""
 
-    __slots__ = ("_kind", "_message", "_payload")
+    __slots__ = ("_message", "_message_type", "_payload")
 
     def __init__(
-        self, kind: MessageType | None, message: Message | None = None, payload: bytes | None = None
+        self, message_type: MessageType | None, message: Message | None = None, payload: bytes | None = None
     ) -> None:
-        assert payload is not None or (kind is not None and message is not None)
-        self._kind = kind
+        assert payload is not None or (message_type is not None and message is not None)
+        self._message_type = message_type
         self._message = message
         self._payload = payload
 
@@ -62,15 +62,15 @@ class LocalMessage:
     def payload(self) -> bytes:
         """Return the serialized message."""
         if self._payload is None:
-            assert self._kind is not None
+            assert self._message_type is not None
             assert self._message is not None
-            self._payload = bytes(self._kind.serialize(self._message))
+            self._payload = bytes(self._message_type.serialize(self._message))
         return self._payload
 
-    def message(self, kind: MessageType) -> Message:
+    def message(self, message_type: MessageType) -> Message:
         """Return the message as an object of a type with the same checksum."""
-        if self._message is None or self._message.__class__ is not kind.cls:
-            return kind.deserialize(self.payload())
+        if self._message is None or self._message.__class__ is not message_type.cls:
+            return message_type.deserialize(self.payload())
         return self._message
 
 

@@ -38,9 +38,9 @@ class Loggers:
     def handlers(self, types: Types) -> list[tuple[str, str, SerializedHandler]]:
         """Return name, type and handler of each service; the types are loaded at the first call."""
 
-        def lazily(kind: str, handler: Any) -> SerializedHandler:
+        def lazily(service_type: str, handler: Any) -> SerializedHandler:
             def answer(payload: bytes) -> Any:
-                return coding(types.service(kind), handler)(payload)
+                return coding(types.service(service_type), handler)(payload)
 
             return answer
 

@@ -44,17 +44,17 @@ class MasterClient:
             raise MasterRefusedError(method, status, text)
         return value
 
-    async def register_publisher(self, topic: str, kind: str) -> None:
+    async def register_publisher(self, topic: str, message_type: str) -> None:
         """Say that the node publishes ``topic``."""
-        await self.call("registerPublisher", topic, kind, self.slave_uri)
+        await self.call("registerPublisher", topic, message_type, self.slave_uri)
 
     async def unregister_publisher(self, topic: str) -> None:
         """Say that the node publishes ``topic`` no longer."""
         await self.call("unregisterPublisher", topic, self.slave_uri)
 
-    async def register_subscriber(self, topic: str, kind: str) -> list[str]:
+    async def register_subscriber(self, topic: str, message_type: str) -> list[str]:
         """Say that the node subscribes to ``topic``; return the slave APIs of its publishers."""
-        publishers: list[str] = await self.call("registerSubscriber", topic, kind, self.slave_uri)
+        publishers: list[str] = await self.call("registerSubscriber", topic, message_type, self.slave_uri)
         return publishers
 
     async def unregister_subscriber(self, topic: str) -> None:

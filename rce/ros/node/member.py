@@ -216,8 +216,8 @@ class GraphMember:
             await self._publish_log(stack)
         if self._settings.log_file is not None:
             self._keep_log(stack, self._settings.log_file)
-        for name, kind, handler in Loggers(self.log).handlers(self._types):
-            await self._provide(f"{self.name}/{name}", kind, handler)
+        for name, service_type, handler in Loggers(self.log).handlers(self._types):
+            await self._provide(f"{self.name}/{name}", service_type, handler)
 
     async def _publish_log(self, stack: AsyncExitStack) -> None:
         publisher = await self._topics.advertise(
@@ -238,7 +238,9 @@ class GraphMember:
         stack.callback(file.close)
         stack.callback(self.log.removeHandler, file)
 
-    async def _provide(self, name: str, kind: str | ServiceType, handler: SerializedHandler) -> Service:
+    async def _provide(
+        self, name: str, service_type: str | ServiceType, handler: SerializedHandler
+    ) -> Service:
         """Provide a service under a global name."""
         runtime, uri = self._running, self._service_uri
         if name in self._services:
@@ -248,7 +250,7 @@ class GraphMember:
             del self._services[service.name]
             await runtime.master.unregister_service(service.name, uri)
 
-        service = self._services[name] = Service(runtime, name, kind, handler, release)
+        service = self._services[name] = Service(runtime, name, service_type, handler, release)
         try:
             await runtime.master.register_service(name, uri)
         except BaseException:

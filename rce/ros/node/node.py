@@ -113,13 +113,18 @@ class Node(GraphMember):
     # Topics
 
     async def advertise(
-        self, topic: str, kind: str | MessageType, *, latch: bool = False, queue_size: int = DEFAULT_QUEUE
+        self,
+        topic: str,
+        message_type: str | MessageType,
+        *,
+        latch: bool = False,
+        queue_size: int = DEFAULT_QUEUE,
     ) -> Publisher:
         """Publish on a topic.
 
         Args:
             topic: The topic.
-            kind: Its type.
+            message_type: Its type.
             latch: Give the last message to later subscribers.
             queue_size: How many messages wait for a slow subscriber before its oldest is dropped.
 
@@ -129,15 +134,15 @@ class Node(GraphMember):
             MasterError: The master cannot be told.
         """
         runtime = self._running
-        message_type = runtime.types.message(kind)
+        known = runtime.types.message(message_type)
         return await self._topics.advertise(
-            runtime, self.resolve(topic), message_type, latch=latch, queue_size=queue_size
+            runtime, self.resolve(topic), known, latch=latch, queue_size=queue_size
         )
 
     async def subscribe(
         self,
         topic: str,
-        kind: str | MessageType,
+        message_type: str | MessageType,
         callback: MessageCallback | None = None,
         *,
         queue_size: int = DEFAULT_QUEUE,
@@ -146,7 +151,7 @@ class Node(GraphMember):
 
         Args:
             topic: The topic.
-            kind: Its type.
+            message_type: Its type.
             callback: Called with each message, in order. A plain function is called as soon as a message is
                 there and must not block; a coroutine function is awaited before the next message. Without
                 a callback, iterate over the subscriber.
@@ -159,18 +164,16 @@ class Node(GraphMember):
         """
         runtime = self._running
         name = self.resolve(topic)
-        message_type = runtime.types.message(kind)
+        known = runtime.types.message(message_type)
         if callback is None:
-            return await self._topics.subscribe(
-                runtime, name, message_type, QueueSink(queue_size), decodes=True
-            )
-        sink = sink_for(decoding(message_type, callback), queue_size, name, runtime.tasks)
-        return await self._topics.subscribe(runtime, name, message_type, sink, decodes=True)
+            return await self._topics.subscribe(runtime, name, known, QueueSink(queue_size), decodes=True)
+        sink = sink_for(decoding(known, callback), queue_size, name, runtime.tasks)
+        return await self._topics.subscribe(runtime, name, known, sink, decodes=True)
 
     async def subscribe_serialized(
         self,
         topic: str,
-        kind: str | MessageType | TypeName,
+        message_type: str | MessageType | TypeName,
         callback: SerializedCallback,
         *,
         queue_size: int = DEFAULT_QUEUE,
@@ -179,7 +182,7 @@ class Node(GraphMember):
 
         Args:
             topic: The topic.
-            kind: Its type; ``*`` for any. A :class:`~rce.ros.node.runtime.TypeName` saves loading it.
+            message_type: Its type; ``*`` for any. A :class:`~rce.ros.node.runtime.TypeName` saves loading it.
             callback: Called with ``(payload, latched)``; ``latched`` is what the publisher says of itself.
                 Plain function or coroutine function, as for :meth:`subscribe`.
             queue_size: As for :meth:`subscribe`.
@@ -191,38 +194,42 @@ class Node(GraphMember):
         """
         name = self.resolve(topic)
         sink = sink_for(callback, queue_size, name, self._running.tasks)
-        return await self._subscribe_raw(name, kind, sink)
+        return await self._subscribe_raw(name, message_type, sink)
 
     async def _subscribe_raw(
-        self, name: str, kind: str | MessageType | TypeName, sink: Sink, *, hears_own: bool = True
+        self, name: str, message_type: str | MessageType | TypeName, sink: Sink, *, hears_own: bool = True
     ) -> Subscriber:
         runtime = self._running
         known: MessageType | TypeName | None = None
-        if kind != ANY:
-            known = kind if isinstance(kind, TypeName) else runtime.types.message(kind)
+        if message_type != ANY:
+            known = (
+                message_type if isinstance(message_type, TypeName) else runtime.types.message(message_type)
+            )
         return await self._topics.subscribe(runtime, name, known, sink, decodes=False, hears_own=hears_own)
 
     async def listen(
-        self, topic: str, kind: str | MessageType | TypeName, listener: TopicListener
+        self, topic: str, message_type: str | MessageType | TypeName, listener: TopicListener
     ) -> Subscriber:
         """Take the messages of a topic as a bridge needs them: as on the wire, and those of others only.
 
         Args:
             topic: The topic.
-            kind: As for :meth:`subscribe_serialized`, and so is what is raised.
+            message_type: As for :meth:`subscribe_serialized`, and so is what is raised.
             listener: Takes the messages, at once and in order; must not block.
         """
         name = self.resolve(topic)
-        return await self._subscribe_raw(name, kind, ListenerSink(listener, name), hears_own=False)
+        return await self._subscribe_raw(name, message_type, ListenerSink(listener, name), hears_own=False)
 
     # Services
 
-    async def advertise_service(self, name: str, kind: str | ServiceType, handler: Handler) -> Service:
+    async def advertise_service(
+        self, name: str, service_type: str | ServiceType, handler: Handler
+    ) -> Service:
         """Provide a service.
 
         Args:
             name: The service.
-            kind: Its type.
+            service_type: Its type.
             handler: Called with each request; returns a response or a mapping of its fields. A plain function
                 must not block; coroutine functions run side by side for different clients. What it raises is
                 the caller's answer: :class:`~rce.ros.errors.ServiceFaultError` with its text; anything else
@@ -233,11 +240,11 @@ class Node(GraphMember):
             UnknownTypeError: There is no such type.
             MasterError: The master cannot be told.
         """
-        service_type = self._running.types.service(kind)
-        return await self._provide(self.resolve(name), service_type, coding(service_type, handler))
+        known = self._running.types.service(service_type)
+        return await self._provide(self.resolve(name), known, coding(known, handler))
 
     async def advertise_service_serialized(
-        self, name: str, kind: str | ServiceType, handler: SerializedHandler
+        self, name: str, service_type: str | ServiceType, handler: SerializedHandler
     ) -> Service:
         """Provide a service whose requests and responses are passed as they are on the wire.
 
@@ -246,14 +253,16 @@ class Node(GraphMember):
             UnknownTypeError: There is no such type.
             MasterError: The master cannot be told.
         """
-        return await self._provide(self.resolve(name), self._running.types.service(kind), handler)
+        return await self._provide(self.resolve(name), self._running.types.service(service_type), handler)
 
-    def service_client(self, name: str, kind: str | ServiceType, *, persistent: bool = True) -> ServiceClient:
+    def service_client(
+        self, name: str, service_type: str | ServiceType, *, persistent: bool = True
+    ) -> ServiceClient:
         """Make a client of a service, which need not be there yet.
 
         Args:
             name: The service.
-            kind: Its type.
+            service_type: Its type.
             persistent: Keep connections for later calls; else every call looks the provider up anew.
 
         Raises:
@@ -261,7 +270,7 @@ class Node(GraphMember):
         """
         runtime = self._running
         client = ServiceClient(
-            runtime, self.resolve(name), runtime.types.service(kind), persistent=persistent
+            runtime, self.resolve(name), runtime.types.service(service_type), persistent=persistent
         )
         self._clients.append(client)
         return client

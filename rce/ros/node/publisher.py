@@ -75,9 +75,11 @@ class Link:
 class TopicOutput:
     """A topic that the node publishes, shared by all its :class:`Publisher` handles."""
 
-    def __init__(self, runtime: Runtime, topic: str, kind: str | MessageType, queue_size: int) -> None:
+    def __init__(
+        self, runtime: Runtime, topic: str, message_type: str | MessageType, queue_size: int
+    ) -> None:
         self.topic = topic
-        self.kind_name = kind if isinstance(kind, str) else kind.name
+        self.message_type_name = message_type if isinstance(message_type, str) else message_type.name
         self.queue_size = queue_size
         self.links: list[Link] = []
         """Subscribers at the other end of a connection."""
@@ -89,19 +91,19 @@ class TopicOutput:
         self.changed = asyncio.Event()
         self.node_name = runtime.name
         self._runtime = runtime
-        self._kind = kind
+        self._message_type = message_type
 
     @property
-    def kind(self) -> MessageType:
+    def message_type(self) -> MessageType:
         """The topic's type."""
-        if isinstance(self._kind, str):
-            self._kind = self._runtime.types.message(self._kind)
-        return self._kind
+        if isinstance(self._message_type, str):
+            self._message_type = self._runtime.types.message(self._message_type)
+        return self._message_type
 
     @property
     def known_kind(self) -> MessageType | None:
         """The topic's type if it was needed already."""
-        return None if isinstance(self._kind, str) else self._kind
+        return None if isinstance(self._message_type, str) else self._message_type
 
     def accept(self, connection: Connection, fields: Mapping[str, str]) -> None:
         """Take a subscriber.
@@ -110,15 +112,17 @@ class TopicOutput:
             HandshakeRefusedError: It means another type.
         """
         require(fields, "md5sum")
-        kind = self.kind
-        check_type(fields, md5sum=kind.md5sum, kind=kind.name, subject=f"topic {self.topic}")
+        message_type = self.message_type
+        check_type(
+            fields, md5sum=message_type.md5sum, type_name=message_type.name, subject=f"topic {self.topic}"
+        )
         latched = self._latched()
         reply = {
             "callerid": self._runtime.name,
             "topic": self.topic,
-            "type": kind.name,
-            "md5sum": kind.md5sum,
-            "message_definition": kind.definition,
+            "type": message_type.name,
+            "md5sum": message_type.md5sum,
+            "message_definition": message_type.definition,
             "latching": "1" if self.is_latching else "0",
         }
         link = Link(self, connection, fields.get("callerid", ANY))
@@ -135,12 +139,13 @@ class TopicOutput:
         Raises:
             HandshakeRefusedError: It means another type.
         """
-        if md5sum not in (ANY, self.kind.md5sum):
+        if md5sum not in (ANY, self.message_type.md5sum):
             raise HandshakeRefusedError(
-                f"{self.topic} is of type {self.kind.name} there, which does not have md5 sum {md5sum}"
+                f"{self.topic} is of type {self.message_type.name} there, "
+                f"which does not have md5 sum {md5sum}"
             )
         for chunks in self._latched():
-            link.send(LocalMessage(self.kind, payload=payload_of(chunks)), latched=True)
+            link.send(LocalMessage(self.message_type, payload=payload_of(chunks)), latched=True)
         self.local_links.append(link)
         self._joined()
 
@@ -215,7 +220,7 @@ class Publisher:
     @property
     def type(self) -> MessageType:
         """The topic's type."""
-        return self._output.kind
+        return self._output.message_type
 
     @property
     def connections(self) -> int:
@@ -237,17 +242,17 @@ class Publisher:
             TypeMismatchError: The message is of another type.
             NodeClosedError: The publisher was closed.
         """
-        kind = self._output.kind
+        message_type = self._output.message_type
         if message is None:
-            message = kind.new(**fields)
+            message = message_type.new(**fields)
         elif fields:
             raise TypeError("give a message or its fields, not both")
-        elif message.__class__ is not kind.cls and not isinstance(message, Mapping):
-            raise TypeMismatchError(f"{self.topic} carries {kind.name}, not {type(message).__name__}")
+        elif message.__class__ is not message_type.cls and not isinstance(message, Mapping):
+            raise TypeMismatchError(f"{self.topic} carries {message_type.name}, not {type(message).__name__}")
         if self._output.local_links and not isinstance(message, Mapping):
-            self._publish_locally(kind, message)
+            self._publish_locally(message_type, message)
             return
-        self.publish_serialized(kind.serialize(message))
+        self.publish_serialized(message_type.serialize(message))
 
     def publish_serialized(self, payload: Payload, latch: bool = False, source: str = "") -> None:
         """Publish a serialized message, untouched.
@@ -280,12 +285,12 @@ class Publisher:
         for link in self._output.links:
             link.send(chunks, size)
 
-    def _publish_locally(self, kind: MessageType, message: Message) -> None:
+    def _publish_locally(self, message_type: MessageType, message: Message) -> None:
         """Give an object to the subscribers of this process; write it only if there are others."""
         output = self._output
         if self._closed:
             raise NodeClosedError(f"the publisher of {self.topic} is closed")
-        local_message = LocalMessage(kind, message)
+        local_message = LocalMessage(message_type, message)
         if output.links or self.latch:
             self._send(local_message.payload(), False)
         output.send_locally(local_message)

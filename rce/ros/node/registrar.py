@@ -55,11 +55,11 @@ class Registrar:
         """
         master, topics = self.master, self.topics
         for topic, output in list(topics.outputs.items()):
-            await master.register_publisher(topic, output.kind_name)
+            await master.register_publisher(topic, output.message_type_name)
             if topic not in topics.outputs:  # closed meanwhile
                 await master.unregister_publisher(topic)
         for topic, source in list(topics.inputs.items()):
-            publishers = await master.register_subscriber(topic, source.kind_name)
+            publishers = await master.register_subscriber(topic, source.message_type_name)
             if topics.inputs.get(topic) is source:
                 source.set_publishers(publishers, of_new_master=True)
             else:

@@ -35,13 +35,13 @@ class Types:
             self._registry = TypeRegistry()
         return self._registry
 
-    def message(self, kind: str | MessageType) -> MessageType:
-        """Return a message type by its name, or ``kind`` if it is one."""
-        return self.registry.message(kind) if isinstance(kind, str) else kind
+    def message(self, message_type: str | MessageType) -> MessageType:
+        """Return a message type by its name, or ``message_type`` if it is one."""
+        return self.registry.message(message_type) if isinstance(message_type, str) else message_type
 
-    def service(self, kind: str | ServiceType) -> ServiceType:
-        """Return a service type by its name, or ``kind`` if it is one."""
-        return self.registry.service(kind) if isinstance(kind, str) else kind
+    def service(self, service_type: str | ServiceType) -> ServiceType:
+        """Return a service type by its name, or ``service_type`` if it is one."""
+        return self.registry.service(service_type) if isinstance(service_type, str) else service_type
 
 
 @dataclass(slots=True)

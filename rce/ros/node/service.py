@@ -25,17 +25,17 @@ Handler = Callable[[Any], Any]
 SerializedHandler = Callable[[bytes], bytes | Awaitable[bytes]]
 
 
-def coding(kind: ServiceType, handler: Handler) -> SerializedHandler:
+def coding(service_type: ServiceType, handler: Handler) -> SerializedHandler:
     """Turn a handler of requests into one of their bytes."""
 
     def encode(response: Any) -> bytes:
-        return kind.response.serialize({} if response is None else response)
+        return service_type.response.serialize({} if response is None else response)
 
     async def finish(response: Awaitable[Any]) -> bytes:
         return encode(await response)
 
     def decode(payload: bytes) -> bytes | Awaitable[bytes]:
-        response = handler(kind.request.deserialize(payload))
+        response = handler(service_type.request.deserialize(payload))
         return finish(response) if inspect.isawaitable(response) else encode(response)
 
     return decode
@@ -48,7 +48,7 @@ class Service:
         self,
         runtime: Runtime,
         name: str,
-        kind: str | ServiceType,
+        service_type: str | ServiceType,
         handler: SerializedHandler,
         release: Callable[[Service], Awaitable[None]],
     ) -> None:
@@ -57,7 +57,7 @@ class Service:
         self.calls = 0
         """How many requests came."""
         self._runtime = runtime
-        self._kind = kind
+        self._service_type = service_type
         self._handler = handler
         self._release = release
         self._sessions: set[Session] = set()
@@ -66,9 +66,9 @@ class Service:
     @property
     def type(self) -> ServiceType:
         """The service's type."""
-        if isinstance(self._kind, str):
-            self._kind = self._runtime.types.service(self._kind)
-        return self._kind
+        if isinstance(self._service_type, str):
+            self._service_type = self._runtime.types.service(self._service_type)
+        return self._service_type
 
     def accept(self, connection: Connection, fields: Mapping[str, str]) -> None:
         """Take a client.
@@ -77,7 +77,7 @@ class Service:
             HandshakeRefusedError: It means another type.
         """
         require(fields, "md5sum")
-        check_type(fields, md5sum=self.type.md5sum, kind=self.type.name, subject=f"service {self.name}")
+        check_type(fields, md5sum=self.type.md5sum, type_name=self.type.name, subject=f"service {self.name}")
         reply = {
             "callerid": self._runtime.name,
             "service": self.name,

@@ -38,10 +38,10 @@ class ServiceClient:
     while it lasts; when it is lost, the provider is looked up anew.
     """
 
-    def __init__(self, runtime: Runtime, name: str, kind: ServiceType, *, persistent: bool) -> None:
+    def __init__(self, runtime: Runtime, name: str, service_type: ServiceType, *, persistent: bool) -> None:
         self.name = name
         """The service's global name."""
-        self.type = kind
+        self.type = service_type
         self._runtime = runtime
         self._persistent = persistent
         self._idle: list[_Call] = []
@@ -156,7 +156,9 @@ class ServiceClient:
         answer = decode_header(await call.exchange((encode_header(header),)))
         try:
             raise_error_field(answer)
-            check_type(answer, md5sum=self.type.md5sum, kind=self.type.name, subject=f"service {self.name}")
+            check_type(
+                answer, md5sum=self.type.md5sum, type_name=self.type.name, subject=f"service {self.name}"
+            )
         except HandshakeRefusedError as error:
             raise ServiceFaultError(self.name, str(error)) from error
         call.connection.header_done(has_lead=True)

@@ -106,14 +106,14 @@ class SlaveApi:
         return (
             SUCCESS,
             "subscriptions",
-            [[topic, source.kind_name] for topic, source in self.topics.inputs.items()],
+            [[topic, source.message_type_name] for topic, source in self.topics.inputs.items()],
         )
 
     def _get_publications(self, _caller: str) -> Answer:
         return (
             SUCCESS,
             "publications",
-            [[topic, output.kind_name] for topic, output in self.topics.outputs.items()],
+            [[topic, output.message_type_name] for topic, output in self.topics.outputs.items()],
         )
 
     def _get_bus_stats(self, _caller: str) -> Answer:

@@ -188,26 +188,26 @@ def sink_for(callback: ItemCallback, queue_size: int, topic: str, tasks: TaskSco
     return sink
 
 
-def decode(kind: MessageType, payload: Item) -> Message:
+def decode(message_type: MessageType, payload: Item) -> Message:
     """Read a message. Fields cut out of a view are copied once, out of bytes twice."""
     if isinstance(payload, LocalMessage):
-        return payload.message(kind)
-    return kind.deserialize(memoryview(payload) if len(payload) >= LARGE else payload)
+        return payload.message(message_type)
+    return message_type.deserialize(memoryview(payload) if len(payload) >= LARGE else payload)
 
 
-def decoding(kind: MessageType, callback: MessageCallback) -> ItemCallback:
+def decoding(message_type: MessageType, callback: MessageCallback) -> ItemCallback:
     """Turn a callback that takes messages into one that takes their bytes."""
     if inspect.iscoroutinefunction(callback):
 
         async def decode_and_wait(payload: Item, latched: bool) -> None:
             del latched
-            await callback(decode(kind, payload))
+            await callback(decode(message_type, payload))
 
         return decode_and_wait
 
     def decode_and_call(payload: Item, latched: bool) -> None:
         del latched
-        callback(decode(kind, payload))
+        callback(decode(message_type, payload))
 
     return decode_and_call
 
@@ -222,7 +222,7 @@ class Subscriber:
     def __init__(
         self,
         topic: str,
-        kind: MessageType | TypeName | None,
+        message_type: MessageType | TypeName | None,
         sink: Sink,
         release: Callable[[Subscriber], Awaitable[None]],
         connected: Callable[[], int],
@@ -239,7 +239,7 @@ class Subscriber:
         """Whether the sink's messages are read: objects will do."""
         self.hears_own = hears_own
         """Whether it takes what its own node publishes."""
-        self._kind = None if isinstance(kind, TypeName) else kind
+        self._message_type = None if isinstance(message_type, TypeName) else message_type
         self._release = release
         self._connected = connected
         self._changed = changed
@@ -275,13 +275,13 @@ class Subscriber:
         Raises:
             NodeClosedError: The subscriber has a callback, which takes the messages.
         """
-        if not isinstance(self.sink, QueueSink) or self._kind is None:
+        if not isinstance(self.sink, QueueSink) or self._message_type is None:
             raise NodeClosedError(f"the messages of {self.topic} go to a callback")
         try:
             payload, _ = await self.sink.take()
         except EOFError:
             raise StopAsyncIteration from None
-        return decode(self._kind, payload)
+        return decode(self._message_type, payload)
 
     async def close(self) -> None:
         """Stop taking messages; the last subscriber of a topic unregisters it."""

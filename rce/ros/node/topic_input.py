@@ -30,9 +30,9 @@ RETRY = Backoff(first=0.05, longest=5.0, jitter=0.5)
 class TopicInput:
     """A topic that the node subscribes to, shared by all its :class:`Subscriber` handles."""
 
-    def __init__(self, runtime: Runtime, topic: str, kind_name: str, md5sum: str) -> None:
+    def __init__(self, runtime: Runtime, topic: str, message_type_name: str, md5sum: str) -> None:
         self.topic = topic
-        self.kind_name = kind_name
+        self.message_type_name = message_type_name
         self.md5sum = md5sum
         self.subscribers: list[Subscriber] = []
         self.links: list[InputLink | LocalLink] = []
@@ -45,7 +45,7 @@ class TopicInput:
         self._orphans: set[str] = set()
         """Publishers that a restarted master has not named yet: followed until their connection ends."""
 
-    def check(self, kind_name: str, md5sum: str) -> None:
+    def check(self, message_type_name: str, md5sum: str) -> None:
         """Check that another subscriber of the node means the same type; the first concrete one counts.
 
         Raises:
@@ -55,9 +55,9 @@ class TopicInput:
             return
         if self.md5sum != ANY:
             raise TypeMismatchError(
-                f"{self.topic} is subscribed to as {self.kind_name} already, not {kind_name}"
+                f"{self.topic} is subscribed to as {self.message_type_name} already, not {message_type_name}"
             )
-        self.kind_name, self.md5sum = kind_name, md5sum
+        self.message_type_name, self.md5sum = message_type_name, md5sum
 
     def connected(self) -> int:
         """Tell how many publishers have accepted the subscription."""
@@ -200,7 +200,7 @@ class TopicInput:
         return {
             "callerid": self._runtime.name,
             "topic": self.topic,
-            "type": self.kind_name,
+            "type": self.message_type_name,
             "md5sum": self.md5sum,
             "tcp_nodelay": "1",
         }
@@ -259,7 +259,9 @@ class InputLink:
     def _greet(self, fields: Mapping[str, str]) -> None:
         raise_error_field(fields)
         target = self._target
-        check_type(fields, md5sum=target.md5sum, kind=target.kind_name, subject=f"topic {target.topic}")
+        check_type(
+            fields, md5sum=target.md5sum, type_name=target.message_type_name, subject=f"topic {target.topic}"
+        )
         self.publisher = fields.get("callerid", "")
         self._latched = fields.get("latching") == "1"
 

@@ -28,7 +28,7 @@ class Topics:
         self.inputs: dict[str, TopicInput] = {}
 
     async def advertise(
-        self, runtime: Runtime, topic: str, kind: str | MessageType, *, latch: bool, queue_size: int
+        self, runtime: Runtime, topic: str, message_type: str | MessageType, *, latch: bool, queue_size: int
     ) -> Publisher:
         """Make a publisher; return once the master knows of the topic.
 
@@ -36,13 +36,13 @@ class Topics:
             TypeMismatchError: The node publishes the topic with another type already.
             MasterError: The master cannot be told.
         """
-        name = kind if isinstance(kind, str) else kind.name
+        name = message_type if isinstance(message_type, str) else message_type.name
         output = self.outputs.get(topic)
         is_first = output is None
         if output is None:
-            output = self.outputs[topic] = TopicOutput(runtime, topic, kind, queue_size)
-        elif output.kind_name != name:
-            raise TypeMismatchError(f"{topic} is published as {output.kind_name} already, not {name}")
+            output = self.outputs[topic] = TopicOutput(runtime, topic, message_type, queue_size)
+        elif output.message_type_name != name:
+            raise TypeMismatchError(f"{topic} is published as {output.message_type_name} already, not {name}")
         output.queue_size = max(output.queue_size, queue_size)
 
         async def release(publisher: Publisher) -> None:
@@ -66,7 +66,7 @@ class Topics:
         self,
         runtime: Runtime,
         topic: str,
-        kind: MessageType | TypeName | None,
+        message_type: MessageType | TypeName | None,
         sink: Sink,
         *,
         decodes: bool,
@@ -77,7 +77,7 @@ class Topics:
         Args:
             runtime: The node's means.
             topic: The topic.
-            kind: Its type; ``None`` for any. Its name and checksum will do if nothing is decoded.
+            message_type: Its type; ``None`` for any. Its name and checksum will do if nothing is decoded.
             sink: Takes the messages.
             decodes: Whether the messages are read: the objects of publishers of this process will do.
             hears_own: Whether it takes what this node publishes.
@@ -86,7 +86,7 @@ class Topics:
             TypeMismatchError: The node subscribes to the topic with another type already.
             MasterError: The master cannot be told.
         """
-        name, md5sum = (kind.name, kind.md5sum) if kind is not None else (ANY, ANY)
+        name, md5sum = (message_type.name, message_type.md5sum) if message_type is not None else (ANY, ANY)
         source = self.inputs.get(topic)
         is_first = source is None
         if source is None:
@@ -102,7 +102,7 @@ class Topics:
 
         subscriber = Subscriber(
             topic,
-            kind,
+            message_type,
             sink,
             release,
             source.connected,

@@ -70,13 +70,13 @@ def require(fields: Mapping[str, str], *required: str) -> None:
         raise HandshakeRefusedError(f"the connection header lacks {', '.join(missing)}")
 
 
-def check_type(fields: Mapping[str, str], *, md5sum: str, kind: str, subject: str) -> None:
+def check_type(fields: Mapping[str, str], *, md5sum: str, type_name: str, subject: str) -> None:
     """Check that the other end means the same type; ``*`` on either side matches all.
 
     Args:
         fields: The other end's header.
         md5sum: This end's md5 sum.
-        kind: This end's type name.
+        type_name: This end's type name.
         subject: The topic or service, for the error's text.
 
     Raises:
@@ -85,6 +85,6 @@ def check_type(fields: Mapping[str, str], *, md5sum: str, kind: str, subject: st
     theirs = fields.get("md5sum", ANY)
     if ANY not in (theirs, md5sum) and theirs != md5sum:
         raise HandshakeRefusedError(
-            f"{subject} is of type {kind} with md5 sum {md5sum} here,"
+            f"{subject} is of type {type_name} with md5 sum {md5sum} here,"
             f" of type {fields.get('type', ANY)} with md5 sum {theirs} there"
         )

@@ -23,18 +23,18 @@ _LONGEST = 40
 """Characters of a value in an error's text."""
 
 
-def find_fault(kind: MessageType, message: Any, root: str, path: str = "") -> None:
+def find_fault(message_type: MessageType, message: Any, root: str, path: str = "") -> None:
     """Walk a message that could not be serialized.
 
     Raises:
         SerializationError: Of the first field whose value does not fit. Returns if there is none.
     """
-    for field in kind.fields:
+    for field in message_type.fields:
         where = path + field.name
         try:
             value = getattr(message, attribute(field.name))
         except AttributeError:
-            raise SerializationError(root, where, f"{short(message)} is not a {kind.name}") from None
+            raise SerializationError(root, where, f"{short(message)} is not a {message_type.name}") from None
         if field.is_array:
             fault = array_fault(field, value, root, where)
             if fault.reason:
@@ -111,19 +111,19 @@ def short(value: object) -> str:
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
-def read_fault(kind: MessageType, buffer: Buffer) -> SerializationError:
-    """Find out why ``buffer`` is not a message of ``kind``."""
+def read_fault(message_type: MessageType, buffer: Buffer) -> SerializationError:
+    """Find out why ``buffer`` is not a message of ``message_type``."""
     try:
-        end = _walk(kind, memoryview(buffer).cast("B"), 0, kind.name, "")
+        end = _walk(message_type, memoryview(buffer).cast("B"), 0, message_type.name, "")
     except SerializationError as fault:
         return fault
     return SerializationError(
-        kind.name, "", f"{len(buffer) - end} bytes too many: {len(buffer)}, the message has {end}"
+        message_type.name, "", f"{len(buffer) - end} bytes too many: {len(buffer)}, the message has {end}"
     )
 
 
-def _walk(kind: MessageType, buffer: memoryview, position: int, root: str, path: str) -> int:
-    for field in kind.fields:
+def _walk(message_type: MessageType, buffer: memoryview, position: int, root: str, path: str) -> int:
+    for field in message_type.fields:
         position = _walk_field(field, buffer, position, root, path + field.name)
     return position
 

@@ -80,7 +80,7 @@ def test_connections_need_complementing_roles_and_one_class(world: World) -> Non
     world.wired()
     world.interface("rob/sub", "SubscriberConverter")
     world.interface("c/sub", "SubscriberInterface")
-    world.interface("c/number", "PublisherInterface", cls="std_msgs/Int32")
+    world.interface("c/number", "PublisherInterface", message_type="std_msgs/Int32")
     with pytest.raises(InvalidRequestError, match="a Subscriber connects to a Publisher"):
         world.connect("rob/sub", "c/sub")
     with pytest.raises(InvalidRequestError, match="must be the same"):
@@ -120,9 +120,9 @@ def test_own_service_takes_one_connection(world: World) -> None:
     """A service of an endpoint for itself takes one connection."""
     world.wired()
     for name in ("a_ask", "z_ask"):
-        world.interface(f"c/{name}", "ServiceProviderInterface", cls="std_srvs/Empty")
-        world.interface("c/serve", "ServiceClientInterface", cls="std_srvs/Empty")
-        world.interface("c/other", "ServiceClientInterface", cls="std_srvs/Empty")
+        world.interface(f"c/{name}", "ServiceProviderInterface", message_type="std_srvs/Empty")
+        world.interface("c/serve", "ServiceClientInterface", message_type="std_srvs/Empty")
+        world.interface("c/other", "ServiceClientInterface", message_type="std_srvs/Empty")
         world.connect(f"c/{name}", "c/serve")
         with pytest.raises(ConflictError, match="takes one connection"):
             world.connect(f"c/{name}", "c/other")
@@ -130,9 +130,9 @@ def test_own_service_takes_one_connection(world: World) -> None:
 
 def test_a_service_provider_takes_one_connection(world: World) -> None:
     world.wired()
-    world.interface("rob/call", "ServiceProviderConverter", cls="std_srvs/Empty")
-    world.interface("c/one", "ServiceClientInterface", cls="std_srvs/Empty")
-    world.interface("c/two", "ServiceClientInterface", cls="std_srvs/Empty")
+    world.interface("rob/call", "ServiceProviderConverter", message_type="std_srvs/Empty")
+    world.interface("c/one", "ServiceClientInterface", message_type="std_srvs/Empty")
+    world.interface("c/two", "ServiceClientInterface", message_type="std_srvs/Empty")
     world.connect("rob/call", "c/one")
     with pytest.raises(ConflictError, match="takes one connection: disconnect it first"):
         world.connect("c/two", "rob/call")

@@ -39,14 +39,14 @@ def test_any_bytes_are_a_header_or_refused(body: bytes) -> None:
 
 @pytest.mark.parametrize(("here", "there"), [("abc", "abc"), ("*", "abc"), ("abc", "*"), ("*", "*")])
 def test_types_agree(here: str, there: str) -> None:
-    check_type({"md5sum": there}, md5sum=here, kind="a/B", subject="topic /t")
+    check_type({"md5sum": there}, md5sum=here, type_name="a/B", subject="topic /t")
 
 
 def test_types_disagree() -> None:
     with pytest.raises(
         HandshakeRefusedError, match=r"topic /t is of type a/B with md5 sum abc here, of type c/D"
     ):
-        check_type({"md5sum": "xyz", "type": "c/D"}, md5sum="abc", kind="a/B", subject="topic /t")
+        check_type({"md5sum": "xyz", "type": "c/D"}, md5sum="abc", type_name="a/B", subject="topic /t")
 
 
 def test_missing_fields_are_named() -> None:
