@@ -20,7 +20,6 @@ from rce.control.machine import machine_memory
 from rce.control.messages import MachineInfo
 from rce.control.model import LinkAddress
 from rce.guard.lobby import Lobby
-from rce.guard.proxies import TrustedProxies
 from rce.link import LinkHub
 from rce.link.address import in_url, is_any, own_address
 from rce.link.listening import listen_on
@@ -33,9 +32,8 @@ from rce.supervision.signals import end_signals
 from rce.tls.choice import TlsChoice, plain_warning
 from rce.tls.expiry import name_warning
 from rce_robot.conversion import ConversionPool
+from rce_robot.doors.client.door import ClientDoor
 from rce_robot.factory import FormFactory
-from rce_robot.gate import Gate
-from rce_robot.server import serve_robots
 from rce_robot.settings import RobotSettings
 from rce_robot.taskset import RobotTaskSet
 
@@ -44,6 +42,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rce.config.secret import Secret
+    from rce_robot.doors.base import Door
 
 _log = logging.getLogger(__name__)
 
@@ -134,14 +133,10 @@ class App:
                 tls=for_task_sets.client if for_task_sets else None,
             )
             task_set.use(channel)
-            gate = Gate(
-                task_set, settings.session, settings.origins, TrustedProxies(settings.trusted_proxies)
-            )
+            door: Door = ClientDoor(settings, listener, lobby, for_robots.server if for_robots else None)
             async with asyncio.TaskGroup() as tasks:
                 running = [tasks.create_task(channel.run())]
-                async with serve_robots(
-                    gate, settings, listener, lobby, for_robots.server if for_robots else None
-                ):
+                async with door.opened(task_set):
                     running.append(tasks.create_task(task_set.run()))
                     running.append(tasks.create_task(_announce(channel, url, ready)))
                     yield

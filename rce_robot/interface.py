@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from rce.protocol.stream import LargeData
     from rce_robot.conversion import Result
     from rce_robot.conversion.jobs import Job
+    from rce_robot.doors.base import Queued
     from rce_robot.forms import Form
-    from rce_robot.outbox import Queued
     from rce_robot.outgoing import Buffer, Rendered
 
 URGENT_BELOW = 64 << 10

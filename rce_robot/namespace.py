@@ -18,7 +18,6 @@ from rce.control.model import EndpointState, EndpointStatus, EndpointUsage, Inte
 from rce.guard.holdings import Holdings
 from rce.link import Endpoint, InterfaceError
 from rce.model.names import EndpointId, InterfaceType
-from rce.protocol.http import LATCH
 from rce_robot.exceptions import MisdirectedError
 from rce_robot.interfaces import make_interface
 
@@ -35,11 +34,10 @@ if TYPE_CHECKING:
     from rce.protocol.stream import LargeData
     from rce_robot.conversion import ConversionPool, Result
     from rce_robot.conversion.jobs import Job
+    from rce_robot.doors.base import DoorSession, Queued
     from rce_robot.forms import Form
     from rce_robot.interface import RobotInterface
-    from rce_robot.outbox import Queued
     from rce_robot.outgoing import Buffer
-    from rce_robot.session import Session
 
 
 _UNUSED = InterfaceUsage()
@@ -73,7 +71,7 @@ class NamespaceListener(Protocol):
 class Namespace:
     """A robot.
 
-    Implements :class:`rce_robot.interface.RobotSide`, :class:`rce_robot.session.Owner` and
+    Implements :class:`rce_robot.interface.RobotSide`, :class:`rce_robot.doors.base.Owner` and
     :class:`rce.guard.budget.Holder`.
 
     Invariants: at most one session; ``_interfaces`` holds exactly what the endpoint has made and not closed.
@@ -96,12 +94,12 @@ class Namespace:
         self._address = address
         self._number = 0
         """Of the last report to the master."""
-        self._told_session: Session | None = None
+        self._told_session: DoorSession | None = None
         """The session at that time."""
-        self.session: Session | None = None
+        self.session: DoorSession | None = None
         """The session from handshake to end, also while it cannot send (yet, or any more)."""
         self.dropped: Counter[str] = Counter()
-        self._live: Session | None = None
+        self._live: DoorSession | None = None
         self._forms = forms
         self._listener = listener
         self._call_timeout = call_timeout
@@ -236,7 +234,7 @@ class Namespace:
         if self.session is not None:
             self.session.fail(reason)
 
-    # rce_robot.session.Owner
+    # rce_robot.doors.base.Owner
 
     def grew(self) -> None:
         """Count what waits."""
@@ -297,20 +295,20 @@ class Namespace:
         """Have a request of the robot carried out."""
         return await self._listener.ask_master(self.id, request)
 
-    def joined(self, session: Session) -> None:
+    def joined(self, session: DoorSession) -> None:
         """Give the robot what it must know at once."""
         self._live = session
         for interface in list(self._interfaces.values()):
             interface.robot_joined()
 
-    def leaving(self, session: Session) -> None:
+    def leaving(self, session: DoorSession) -> None:
         """Fail what waits for the robot."""
         if self._live is session:
             self._live = None
         for interface in list(self._interfaces.values()):
             interface.robot_left()
 
-    def left(self, session: Session, reason: str) -> None:
+    def left(self, session: DoorSession, reason: str) -> None:
         """Tell the master."""
         if self.session is session:
             self.session = None
@@ -345,7 +343,7 @@ class Namespace:
     @property
     def knows_sources(self) -> bool:
         """Whether the robot is there and names the sources of latched messages."""
-        return self._live is not None and LATCH in self._live.features
+        return self._live is not None and self._live.knows_sources
 
     def send_latched(self, tag: str, source: str, message: Queued, *, shared: bool) -> None:
         """Send the latched message of a source, if the robot is there."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from rce.protocol.single import MAX_PAYLOAD, prefix
 
 if TYPE_CHECKING:
-    from rce_robot.outbox import Queued
+    from rce_robot.doors.base import Queued
 
 Buffer = bytes | bytearray | memoryview
 

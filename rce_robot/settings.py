@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from rce_robot.conversion.pool import ConversionSettings
-from rce_robot.outbox import OutboxLimits
+from rce_robot.doors.client.outbox import OutboxLimits
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

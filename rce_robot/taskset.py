@@ -204,7 +204,7 @@ class RobotTaskSet:
                     tasks.create_task(_end(namespace, "the robot endpoint is shutting down"))
             self._namespaces.clear()
 
-    # What the gate asks: rce_robot.gate.Admission
+    # What the gate asks: rce_robot.doors.base.Admission
 
     async def log_in(self, credentials: Credentials, address: str) -> EndpointSpec:
         """Ask the master whether a robot may come in.

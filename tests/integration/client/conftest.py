@@ -17,7 +17,7 @@ from rce.aio.backoff import Backoff
 from rce.model.requests import ConfigureComponents
 from rce_client.connection import Connection, State
 from rce_client.engine_transport import Timing
-from rce_robot.websocket import RobotSocket
+from rce_robot.doors.client.websocket import RobotSocket
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rce_client.services import ServiceClient
-from rce_robot import gate
-from rce_robot.websocket import RobotSocket
+from rce_robot.doors.client import gate
+from rce_robot.doors.client.websocket import RobotSocket
 
 if TYPE_CHECKING:
     from integration.client.conftest import Engine

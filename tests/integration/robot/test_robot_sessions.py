@@ -15,7 +15,7 @@ from websockets.typing import Origin
 
 from rce.control.messages import Probe
 from rce.control.model import EndpointState
-from rce_robot.outbox import OutboxLimits
+from rce_robot.doors.client.outbox import OutboxLimits
 from rce_robot.settings import SessionSettings
 
 if TYPE_CHECKING:

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rce.aio.queues import OverflowPolicy
-from rce_robot.outbox import Outbox, OutboxLimits, Queued
+from rce_robot.doors.base import Queued
+from rce_robot.doors.client.outbox import Outbox, OutboxLimits
 from rce_robot.outgoing import LatchedDelivery, Outgoing
 
 

@@ -29,11 +29,11 @@ from rce.ros.types import TypeRegistry
 from rce_robot.conversion import Result
 from rce_robot.conversion.jobs import HEAD, Job, decode_job, pack
 from rce_robot.conversion.worker import Worker
+from rce_robot.doors.base import Queued
 from rce_robot.exceptions import BusyError, MisdirectedError, UnreadableError
 from rce_robot.factory import FormFactory
 from rce_robot.interface import RobotInterface
 from rce_robot.interfaces import make_interface
-from rce_robot.outbox import Queued
 from rce_robot.outgoing import Outgoing, Rendered, Serialized
 from rce_robot.services import AnsweredByRobot
 

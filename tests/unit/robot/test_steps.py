@@ -12,7 +12,7 @@ from websockets.frames import Frame, Opcode
 from websockets.streams import StreamReader
 from websockets.utils import apply_mask
 
-from rce_robot.steps import LARGE_FRAME, Steps
+from rce_robot.doors.client.steps import LARGE_FRAME, Steps
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -81,7 +81,7 @@ def test_no_more_than_a_read_is_buffered_or_unmasked_at_once(monkeypatch: pytest
         sizes.append(len(data))
         return apply_mask(data, mask)
 
-    monkeypatch.setattr("rce_robot.steps.apply_mask", counted)
+    monkeypatch.setattr("rce_robot.doors.client.steps.apply_mask", counted)
     read = 10_000
     stream = masked(bytes(50 * read))
     parser = Parser()

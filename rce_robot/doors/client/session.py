@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from typing import TYPE_CHECKING, Any, Protocol, assert_never
+from typing import TYPE_CHECKING, Any, assert_never
 
 import msgspec
 from websockets.exceptions import ConnectionClosed
@@ -29,10 +29,10 @@ from rce.protocol.limits import Limits
 from rce.protocol.messages import DataMessage, ErrorReport, InterfaceStatus, LatchedSources, type_of
 from rce.protocol.stream import Fault, LargeData, ProtocolStream
 from rce.protocol.weight import is_light, utf8_in_steps
+from rce_robot.doors.client.outbox import Outbox
+from rce_robot.doors.client.websocket import LARGE_PART
 from rce_robot.exceptions import RobotError
-from rce_robot.outbox import Outbox
 from rce_robot.outgoing import LatchedDelivery, Outgoing, Serialized
-from rce_robot.websocket import LARGE_PART
 
 if TYPE_CHECKING:
     from collections import Counter
@@ -41,9 +41,9 @@ if TYPE_CHECKING:
     from rce.model.requests import Request
     from rce.protocol.messages import CallId
     from rce.protocol.stream import Event
-    from rce_robot.outbox import Queued
+    from rce_robot.doors.base import Owner, Queued
+    from rce_robot.doors.client.websocket import RobotSocket
     from rce_robot.settings import SessionSettings
-    from rce_robot.websocket import RobotSocket
 
 _log = logging.getLogger(__name__)
 
@@ -54,39 +54,11 @@ MAX_REASON = 100
 """Characters of a reason that a close frame has room for."""
 
 
-class Owner(Protocol):
-    """What a session needs of the robot it belongs to."""
-
-    def take(self, message: DataMessage) -> None:
-        """Handle a data message; raises :class:`RobotError` if it is refused."""
-
-    def take_large(self, large: LargeData) -> None:
-        """Handle a data message that was not parsed yet; raises :class:`RobotError` if it is refused."""
-
-    def keep_latched(self, i_tag: str, sources: Sequence[str]) -> None:
-        """The robot's sources at an interface other than these ended."""
-
-    def refused(self, call: CallId, problem: str) -> None:
-        """A message of a service call was refused before it could be handled."""
-
-    async def ask_master(self, request: Request) -> tuple[str, ...]:
-        """Have a request carried out; return what went wrong, as texts."""
-
-    def joined(self, session: Session) -> None:
-        """The session can send now."""
-
-    def leaving(self, session: Session) -> None:
-        """The session's connection ended; nothing can be sent any more."""
-
-    def grew(self) -> None:
-        """The session holds more bytes than before. May make it :meth:`Session.shed`."""
-
-    def left(self, session: Session, reason: str) -> None:
-        """Everything that the session received was handled. Its last word."""
-
-
 class Session:
-    """A robot that is connected. Implements :class:`rce_robot.websocket.Receiver`.
+    """A robot that is connected.
+
+    Implements :class:`rce_robot.doors.base.DoorSession`, and the ``Receiver`` of
+    :mod:`rce_robot.doors.client.websocket`.
 
     Life: made in the handshake; :meth:`run` from its end on; :meth:`on_lost` when the connection ends, with
     or without a completed handshake; then the requests that wait are carried out, and :attr:`ended` is set.
@@ -172,6 +144,11 @@ class Session:
             self._handle(event)
 
     # Memory
+
+    @property
+    def knows_sources(self) -> bool:
+        """Whether the robot can be told of the sources of latched messages."""
+        return LATCH in self.features
 
     @property
     def held(self) -> int:
@@ -274,7 +251,7 @@ class Session:
         task.add_done_callback(self._calls.discard)
         return True
 
-    # From the robot: rce_robot.websocket.Receiver
+    # From the robot: rce_robot.doors.client.websocket.Receiver
 
     def on_text(self, text: bytes) -> Iterator[None] | None:
         """Handle a text frame, a large one in steps."""

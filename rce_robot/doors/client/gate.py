@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from websockets.protocol import State
 
@@ -13,8 +13,8 @@ from rce.guard.proxies import TrustedProxies
 from rce.model.names import EndpointId
 from rce.protocol.exceptions import HandshakeError
 from rce.protocol.http import FEATURES_HEADER, read_credentials, read_features
-from rce_robot.session import Session
-from rce_robot.websocket import RobotSocket
+from rce_robot.doors.client.session import Session
+from rce_robot.doors.client.websocket import RobotSocket
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -22,27 +22,14 @@ if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 
-    from rce.control.model import EndpointSpec
     from rce.protocol.http import Credentials
+    from rce_robot.doors.base import Admission
     from rce_robot.namespace import Namespace
     from rce_robot.settings import SessionSettings
 
 _log = logging.getLogger(__name__)
 
 _FORBIDDEN, _CONFLICT = 403, 409
-
-
-class Admission(Protocol):
-    """Who lives here, and who knows who may."""
-
-    async def log_in(self, credentials: Credentials, address: str) -> EndpointSpec:
-        """Ask the master; raises :class:`HandshakeError` with its answer if the robot may not come in."""
-
-    def find(self, id: EndpointId) -> Namespace | None:  # noqa: A002
-        """Return the robot's namespace if there is one."""
-
-    async def settle(self, spec: EndpointSpec) -> Namespace:
-        """Return the robot's namespace with the spec applied."""
 
 
 class Gate:

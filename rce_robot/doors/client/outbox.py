@@ -13,28 +13,14 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from rce.aio.queues import BoundedQueue, OverflowPolicy
 
 if TYPE_CHECKING:
     from collections.abc import Hashable
 
-    from rce_robot.outgoing import Rendered
-
-
-class Queued(Protocol):
-    """What a queue holds."""
-
-    @property
-    def size(self) -> int:
-        """Bytes that it counts in the queue's limits."""
-
-    def render(self) -> Rendered | None:
-        """Make it ready to be sent; None if that turns out to be impossible.
-
-        Called when its turn has come: a message that is dropped in the queue costs no conversion.
-        """
+    from rce_robot.doors.base import Queued
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ The ``websockets`` library does the handshake, the parsing, pings and the end of
 are different here, because the time they take is a large part of a message's way through the engine:
 
 * A message that came as a whole in one frame is taken out of what was read without the library's parser
-  (:mod:`rce_robot.frames`).
+  (:mod:`rce_robot.doors.client.frames`).
 * A complete message is handed to the :class:`Receiver` from within ``data_received``; there is no queue
   and no task to be woken.
 * Frames are written straight to the transport: a server's frames are neither masked nor compressed, so a
@@ -26,8 +26,8 @@ from websockets.protocol import State
 
 from rce.buffers import unfilled, write_together
 from rce.guard.websocket import GuardedConnection
-from rce_robot.frames import FIN_BINARY, FIN_TEXT, JOIN_BELOW, add_frame, find_message
-from rce_robot.steps import LARGE_FRAME, Steps
+from rce_robot.doors.client.frames import FIN_BINARY, FIN_TEXT, JOIN_BELOW, add_frame, find_message
+from rce_robot.doors.client.steps import LARGE_FRAME, Steps
 
 if TYPE_CHECKING:
     import asyncio
