@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from websockets.exceptions import ConnectionClosed, WebSocketException
 
-from rce.aio.tasks import cancel_and_wait
+from rce.aio.tasks import run_until_first
 from rce.control.execution import MAX_DATA, NOT_RUN, Command, ended_frame
 from rce_container.exceptions import ExecutionError
 
@@ -76,11 +76,5 @@ async def _carry(sock: socket.socket, master: ClientConnection) -> None:
                 ):  # the command has ended; what it said last is still carried
                     await loop.sock_sendall(sock, frame)
 
-    tasks = [asyncio.create_task(upwards()), asyncio.create_task(downwards())]
-    try:
-        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        for task in done:
-            with contextlib.suppress(ConnectionClosed, OSError):  # either side may go at any time
-                task.result()
-    finally:
-        await cancel_and_wait(*tasks)
+    with contextlib.suppress(ConnectionClosed, OSError):  # either side may go at any time
+        await run_until_first(upwards(), downwards())

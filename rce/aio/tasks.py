@@ -124,3 +124,20 @@ async def cancel_and_wait(*tasks: asyncio.Future[Any]) -> None:
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def run_until_first(*works: Coroutine[Any, Any, object]) -> None:
+    """Run coroutines side by side until one ends; then cancel the others and wait until they have ended.
+
+    For both directions of a conversation, which is over when either is. Cancellation cancels all.
+
+    Raises:
+        Exception: What the one that ended raised; what the others raise as they are cancelled is dropped.
+    """
+    tasks = [asyncio.create_task(work) for work in works]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        await cancel_and_wait(*tasks)

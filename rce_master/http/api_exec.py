@@ -10,7 +10,7 @@ import msgspec
 from aiohttp import WSMsgType, web
 from websockets.exceptions import ConnectionClosed
 
-from rce.aio.tasks import cancel_and_wait
+from rce.aio.tasks import run_until_first
 from rce.control.execution import MAX_COMMAND, NOT_RUN, ended_frame, read_command
 from rce_master.exceptions import InvalidRequestError, MasterError
 from rce_master.http.routes import OF_USER, Call, route_table
@@ -80,15 +80,8 @@ async def _first(user: web.WebSocketResponse) -> Command:
 
 async def _relay(call: Call, user: web.WebSocketResponse, machine: ServerConnection) -> None:
     """Pass frames on until either side has gone, or the user may not do this any more."""
-    work = (_to_machine(user, machine), _to_user(machine, user), _watch(call))
-    tasks = [asyncio.create_task(one) for one in work]
-    try:
-        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        for task in done:
-            with contextlib.suppress(ConnectionClosed, ConnectionResetError):  # either side may just go
-                task.result()
-    finally:
-        await cancel_and_wait(*tasks)
+    with contextlib.suppress(ConnectionClosed, ConnectionResetError):  # either side may just go
+        await run_until_first(_to_machine(user, machine), _to_user(machine, user), _watch(call))
 
 
 async def _to_machine(user: web.WebSocketResponse, machine: ServerConnection) -> None:

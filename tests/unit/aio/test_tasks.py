@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from rce.aio.tasks import BackgroundTasks, TaskScope, cancel_and_wait
+from rce.aio.tasks import BackgroundTasks, TaskScope, cancel_and_wait, run_until_first
 
 Reported = list[BaseException]
 
@@ -186,3 +186,45 @@ async def test_cancel_and_wait_waits_for_every_task(reported: Reported) -> None:
     assert failing.done()
     assert lasting.cancelled()
     assert reported == []
+
+
+async def test_run_until_first_cancels_the_others() -> None:
+    ended: list[str] = []
+
+    async def last_words() -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            await asyncio.sleep(0)
+            ended.append("cancelled")
+
+    async def short() -> None:
+        await asyncio.sleep(0)
+        ended.append("first")
+
+    await run_until_first(last_words(), short())
+    assert ended == ["first", "cancelled"]
+
+
+async def test_run_until_first_raises_what_the_first_raised() -> None:
+    with pytest.raises(ValueError, match="broken"):
+        await run_until_first(for_ever(), fail())
+
+
+async def test_cancelling_run_until_first_cancels_all() -> None:
+    ended: list[int] = []
+    begun = asyncio.Barrier(3)
+
+    async def wait(number: int) -> None:
+        await begun.wait()
+        try:
+            await asyncio.Event().wait()
+        finally:
+            ended.append(number)
+
+    running = asyncio.create_task(run_until_first(wait(1), wait(2)))
+    await begun.wait()
+    running.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await running
+    assert sorted(ended) == [1, 2]
