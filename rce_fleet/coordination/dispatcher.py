@@ -94,12 +94,8 @@ class Dispatcher:
     def _settle(self, record: RobotRecord) -> None:
         """Place a robot that stands still in its cell."""
         state = self.state
-        touched = self.touched(record)
-        own = {cell for cell in touched if state.ledger.owner(cell) in (None, record.id)}
-        shut = {cell for cell in own if state.is_shut(cell)}
-        cell = standing_cell(state.grid, own, record.x, record.y, shut)
-        reason = hindrance(state, record, touched, own, cell)
-        state.index.set_hindered(record.id, touched if reason else ())
+        cell, own, reason = self._place_of(record)
+        state.index.set_hindered(record.id, self.touched(record) if reason else ())
         if cell is None or reason:
             if record.reason != reason:
                 record.reason = reason
@@ -112,6 +108,15 @@ class Dispatcher:
         self.outdated = True
         self.send(record, (cell,))
         self.arrive(record)
+
+    def _place_of(self, record: RobotRecord) -> tuple[int | None, set[int], str]:
+        """Return the cell for a robot that stands still, its other cells too, and why it cannot have them."""
+        state = self.state
+        touched = self.touched(record)
+        own = {cell for cell in touched if state.ledger.owner(cell) in (None, record.id)}
+        shut = {cell for cell in own if state.is_shut(cell)}
+        cell = standing_cell(state.grid, own, record.x, record.y, shut)
+        return cell, own, hindrance(state, record, touched, own, cell)
 
     def _block_left_cells(self) -> None:
         left, self.left = self.left & self.state.pending, set()
@@ -193,7 +198,7 @@ class Dispatcher:
         state, quiet = self.state, not self.outdated and self._asked is None
         for record in state.robots.values():
             stands = record.phase is Phase.HOLDING and record.stands(self.settings)
-            if stands and record.id not in state.index.hindered and self.touched(record):
+            if stands and not self._place_of(record)[2]:
                 raise InvariantError(f"{record.id} stands still and was not placed in its cell")
             is_granted_cells = quiet and record.phase is Phase.ACTIVE
             if is_granted_cells and state.ledger.may_grant(record.id, self.settings.ahead):

@@ -232,9 +232,9 @@ class FleetPlanner:
         if not was_blocked and cell not in self.state.pending:
             return Reply(True, f"cell {cell} is not blocked")
         self.state.free(cell)
+        self._dispatcher.to_settle |= self.state.index.hindered_at([cell])
         if was_blocked:
             self._dispatcher.out.append(BlockedChanged(tuple(sorted(self.state.blocked))))
-            self._dispatcher.to_settle |= self.state.index.hindered_at([cell])
         self._dispatcher.outdated = True
         return Reply(True, f"cell {cell} is free")
 

@@ -161,3 +161,17 @@ def test_a_plan_waits_for_a_robot_that_is_being_stopped() -> None:
     x, y = harness.planner.state.grid.centre(0)
     harness.tell(PoseSeen("R1", x, y, 0.0))
     assert len(harness.requests) == asked + 1
+
+
+def test_hindered_robot_gets_its_place_once_the_cell_is_free() -> None:
+    """Nothing of its own is heard in between."""
+    harness = PlannerHarness(3)
+    x, y = harness.planner.state.grid.centre(4)
+    for _ in range(3):
+        harness.tell(PoseSeen("R2", x - 0.4, y, 0.0))
+        harness.tell(ReportSeen("R2", ClientReport(harness.revisions["R2"], ClientState.IDLE)))
+        harness.now += 0.5
+    harness.tell(PoseSeen("R2", x - 0.4, y, 0.0))
+    assert "cell 3 is held by R1" in harness.planner.snapshot().robots[1].reason
+    harness.tell(RobotRemoved("R1"))
+    assert harness.sent["R2"] == (4,)
