@@ -33,7 +33,7 @@ class Desired:
     """Everything that was created and not removed.
 
     Invariant: what belongs to a container or an interface is forgotten with it; so what :meth:`restore`
-    returns never names something that it does not make itself, unless somebody else made it.
+    returns never names something that it does not make itself, unless another client made it.
     """
 
     def __init__(self) -> None:

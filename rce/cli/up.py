@@ -57,7 +57,7 @@ def bound_to(bind: str, settings: EngineSettings) -> EngineSettings:
     """Return the settings with every program listening on one address.
 
     Raises:
-        typer.BadParameter: It is no address.
+        typer.BadParameter: It is not an address.
     """
     try:
         host = fields_of(MasterSettings)["bind"].read(bind)

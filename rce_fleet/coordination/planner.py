@@ -275,8 +275,8 @@ class FleetPlanner:
         heard = record.heard(self._now, self.settings)
         if record.phase is Phase.SILENT:
             if heard:
-                self.state.change(record, Cause.HEARD, "it is heard again")
-                self._dispatcher.hold(record, "it is heard again")
+                self.state.change(record, Cause.HEARD, "it sends messages again")
+                self._dispatcher.hold(record, "it sends messages again")
         elif not heard:
             self._lose(record)
         elif record.phase is Phase.ACTIVE and self._stalled(record):

@@ -36,7 +36,7 @@ class Cause(Enum):
     LOST = "lost"
     """It or its move client is not heard any more."""
     HEARD = "heard"
-    """It is heard again."""
+    """It sends messages again."""
 
 
 ROBOT_LIFE: LifeCycle[Phase, Cause] = LifeCycle(

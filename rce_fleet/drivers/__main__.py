@@ -16,9 +16,8 @@ from rce.config.logs import start_logging
 from rce.ros.types import TypeRegistry
 from rce_client.exceptions import RefusedError
 from rce_fleet.drivers.cell_watch import CellWatch, GraphCellWatch
-from rce_fleet.drivers.cores import Cores
 from rce_fleet.drivers.engine_cell_watch import EngineCellWatch, WorldAccount
-from rce_fleet.drivers.program import Simulation
+from rce_fleet.drivers.program import Cores, Simulation
 from rce_fleet.drivers.scene import load_scene
 
 BAD_SCENE = 2

@@ -116,7 +116,7 @@ def _authenticator(
     """Choose how users are authenticated.
 
     Raises:
-        typer.BadParameter: The options would open the fleet to everybody, or contradict each other.
+        typer.BadParameter: The options would let every computer control the fleet, or contradict each other.
     """
     if isinstance(backend, RosBackend):
         if login:

@@ -1,4 +1,4 @@
-// Joins model, view and panel with the station: a socket for what happens, HTTP for what the operator wants.
+// Connects model, view and panel to the station: a WebSocket for changes, HTTP for the operator's requests.
 
 import { Fleet } from "./model.js";
 import { Panel } from "./panel.js";
@@ -119,7 +119,7 @@ function connect(delay = 500) {
   socket.addEventListener("message", (event) => {
     const received = JSON.parse(event.data);
     fleet.apply(received);
-    // A change is missing; the next connection begins with everything.
+    // A change is missing; the next connection begins with the complete state.
     if (received.type === "changes" && fleet.isBehind) socket.close();
   });
   socket.addEventListener("close", ({ code }) => {

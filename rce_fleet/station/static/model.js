@@ -1,5 +1,5 @@
-// What the page knows of the fleet. Fed by messages of the station's socket; knows nothing of the screen.
-// The station sends everything first (map, state, poses), then numbered changes.
+// The page's model of the fleet, updated by messages of the station's WebSocket; independent of the screen.
+// The station sends the complete state first (map, state, poses), then numbered changes.
 
 export const TRAIL_LENGTH = 240;
 
@@ -86,7 +86,7 @@ export class Fleet extends EventTarget {
     this.#tell(message.text, message.tone);
   }
 
-  // What an operator should read of the cells of a whole state.
+  // Events for the operator from the cells of a complete state.
   *#cellNews(message) {
     if (!this.blocked.size) return;
     for (const cell of message.blocked) if (!this.blocked.has(cell)) yield [`cell ${cell} is blocked`, "warn"];
@@ -94,7 +94,7 @@ export class Fleet extends EventTarget {
     for (const cell of this.blocked) if (!left.has(cell)) yield [`cell ${cell} is free`, "good"];
   }
 
-  // What an operator should read of robots that changed.
+  // Events for the operator from robots that changed.
   *#robotNews(robots) {
     for (const state of robots) {
       const before = this.robots.get(state.id);
@@ -102,9 +102,9 @@ export class Fleet extends EventTarget {
       if (state.replans > before.replans) yield [`${state.id} gets a new path`, "warn"];
       if (state.state === before.state) continue;
       if (state.state === "arrived") yield [`${state.id} is at its goal, cell ${state.goal}`, "good"];
-      if (state.state === "unreachable") yield [`no way leads ${state.id} to cell ${state.goal}`, "bad"];
+      if (state.state === "unreachable") yield [`no path leads ${state.id} to cell ${state.goal}`, "bad"];
       if (state.state === "silent") yield [`${state.id} is silent: ${state.reason}`, "bad"];
-      if (before.state === "silent") yield [`${state.id} is heard again`, "good"];
+      if (before.state === "silent") yield [`${state.id} sends messages again`, "good"];
     }
   }
 
@@ -148,7 +148,7 @@ export class Fleet extends EventTarget {
   }
 }
 
-// A colour that stays with a robot: chosen ones for the first, then hues spread by the golden angle.
+// A fixed colour for each robot: chosen ones for the first, then hues spread by the golden angle.
 const COLOURS = ["#2a7de1", "#d9480f", "#0f9d76", "#9c36b5", "#c2255c", "#5f7d0e", "#0b7285", "#7048e8"];
 
 export function colourOf(id) {

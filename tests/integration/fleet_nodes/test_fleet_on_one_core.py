@@ -13,8 +13,8 @@ from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
 from rce.ros.types import Message, TypeRegistry
+from rce_fleet.drivers.program import run_world
 from rce_fleet.drivers.robot_driver import RobotDriver
-from rce_fleet.drivers.runner import run_world
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.scenario import Scenario, make_scenario, midway_cell
 from rce_fleet.simulation.boxes import BoxKeeper

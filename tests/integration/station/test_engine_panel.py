@@ -128,7 +128,7 @@ async def test_the_page_shows_bars_and_advice() -> None:
         "too small: uses 95 MB",
         "rce resize c --memory 150M",
         "n waiting again in 2 s",
-        "d starting m1, is being handed over to c2",
+        "d starting m1, moving to c2",
         "m1 draining 2 containers",
     ):
         assert part in text

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rce_fleet.drivers.cores import Cores
+from rce_fleet.drivers.program import Cores
 
 A, B = "http://127.0.0.1:1/", "http://127.0.0.1:2/"
 
