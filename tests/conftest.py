@@ -212,7 +212,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.get_closest_marker("xdist_group"):
             continue
-        person = getattr(item, "callspec", None) and item.callspec.params.get("person")  # type: ignore[attr-defined]
+        callspec = getattr(item, "callspec", None)
+        person = callspec and callspec.params.get("person")
         if any("podman" in marker.args for marker in item.iter_markers("needs")):
             item.add_marker(pytest.mark.xdist_group("podman"))
         elif person:

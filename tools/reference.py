@@ -91,7 +91,7 @@ def shipped_file() -> str:
 def _programs_with_sections() -> Iterator[tuple[str, Any]]:
     """Return the commands whose options are a section of the settings file."""
     rce = _rce()
-    commands = typer.main.get_command(rce).commands  # type: ignore[attr-defined]
+    commands = typer.main.get_command(rce).commands  # type: ignore[attr-defined]  # it is a group of commands
     return ((name, commands[name]) for name in PROGRAM_SECTIONS)
 
 

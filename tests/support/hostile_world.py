@@ -31,6 +31,7 @@ from rce.control.model import EndpointState, LinkSpec, NodeState
 from rce.link import LinkError
 from rce.model.specs import InterfaceSpec, NodeSpec, Resources
 from rce_container.environment import proc
+from rce_container.runtimes.namespace import NamespaceRuntime
 from rce_container.seccomp.library import FilterUnavailableError
 from support.containers import (
     ECHO,
@@ -268,7 +269,8 @@ def _uid(pid: int) -> int:
 
 def search_from_outside(world: World) -> dict[str, list[str]]:
     """Search the memory of all that takes part, as far as this person may: who knows what?"""
-    pids = {"fork server": world.machine.runtime._fork_server.pid}  # type: ignore[attr-defined]
+    assert isinstance(world.machine.runtime, NamespaceRuntime)
+    pids = {"fork server": world.machine.runtime._fork_server.pid}
     inside = world.environment(ATTACKER)
     pids["environment"] = inside.pid
     for process in proc.descendants(inside.pid, proc.table()):

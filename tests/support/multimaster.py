@@ -43,7 +43,7 @@ class DiscoveryNetwork:
             "heartbeat_hz": FAST,
             "rosmaster_hz": FAST,
         }
-        return DiscoverySettings(**(values | more))  # type: ignore[arg-type]
+        return DiscoverySettings(**(values | more))  # type: ignore[arg-type]  # a test may give any setting
 
     @asynccontextmanager
     async def machine(
@@ -63,7 +63,7 @@ class DiscoveryNetwork:
         self, uri: str, lists: SyncLists | None, more: dict[str, object]
     ) -> AsyncIterator[Machine]:
         sync_more = {name: more.pop(name) for name in ("distinct_names", "namespaces") if name in more}
-        settings = SyncSettings(uri, lists=lists or SyncLists(), **sync_more)  # type: ignore[arg-type]
+        settings = SyncSettings(uri, lists=lists or SyncLists(), **sync_more)  # type: ignore[arg-type]  # a test may give any setting
         async with Discovery(self.settings(uri, **more)) as discovery, MasterSync(settings) as sync:
             yield Machine(uri, discovery, sync)
 

@@ -92,7 +92,7 @@ def test_a_table_without_a_row_is_refused() -> None:
 
 def test_the_table_cannot_be_changed() -> None:
     with pytest.raises(TypeError):
-        DOOR.table[Door.GONE][Act.OPEN] = Door.OPEN  # type: ignore[index]
+        DOOR.table[Door.GONE][Act.OPEN] = Door.OPEN  # type: ignore[index]  # the table cannot be changed
 
 
 @given(st.lists(st.sampled_from(Act), max_size=50))

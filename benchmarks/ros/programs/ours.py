@@ -9,6 +9,7 @@ import asyncio
 import json
 import sys
 import time
+from collections.abc import Awaitable, Callable
 
 from rce.ros.node import Node, run
 from rce.ros.types import Message
@@ -121,10 +122,17 @@ async def idle(node: Node) -> None:
 
 async def main(word: str, *arguments: str) -> None:
     """Do what the command line says."""
-    work = {"echo": echo, "ping": ping, "talk": talk, "listen": listen, "serve": serve, "call": call}
+    work: dict[str, Callable[..., Awaitable[None]]] = {
+        "echo": echo,
+        "ping": ping,
+        "talk": talk,
+        "listen": listen,
+        "serve": serve,
+        "call": call,
+    }
     work |= {"beat": beat, "idle": idle}
     async with Node(f"ours_{word}", argv=[], signals=True) as node:
-        await work[word](node, *arguments)  # type: ignore[operator]
+        await work[word](node, *arguments)
 
 
 if __name__ == "__main__":

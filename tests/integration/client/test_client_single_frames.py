@@ -31,7 +31,7 @@ class Counted:
                 self.texts += b'"DM"' in bytes(data)
             else:
                 self.marks.append(bytes(data[:1]))
-            deliver(socket, opcode, data)  # type: ignore[arg-type]
+            deliver(socket, opcode, data)  # type: ignore[arg-type]  # it asks for an Opcode of its own
 
         patch.setattr(RobotSocket, "_deliver", delivered)
 

@@ -12,6 +12,7 @@ from support.ports import free_port
 from websockets.asyncio.client import connect
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.typing import Origin
 
 from rce.aio.backoff import Backoff
 from rce.config.secret import Secret
@@ -249,7 +250,7 @@ async def test_browser_is_refused() -> None:
             async with connect(
                 f"ws://127.0.0.1:{server.port}",
                 additional_headers=headers(),
-                origin="http://evil.example",  # type: ignore[arg-type]
+                origin=Origin("http://evil.example"),
                 proxy=None,
             ):
                 pass

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from collections.abc import Awaitable
 from typing import TYPE_CHECKING
 
 import pytest
@@ -47,7 +48,12 @@ async def test_killed_link_comes_back(rig: Rig, way: str, side: int) -> None:
     await rig.join(a, b, [TOPIC_OUT, SERVICE_OUT])
     await a.connected(1, 2)
     await b.connected(1, 2)
-    b.fakes["i2"].answer = lambda _: asyncio.Event().wait()  # type: ignore[assignment,return-value]
+
+    async def hang(_: bytes) -> bytes:
+        await asyncio.Event().wait()
+        return b""
+
+    b.fakes["i2"].answer = hang
     call = asyncio.ensure_future(a.fakes["i2"].port.call(b"never answered"))
     await b.fakes["i2"].asked.wait()
     kill_link(parties[side])
@@ -303,9 +309,9 @@ async def test_overloaded_peer_says_so(rig: Rig, way: str) -> None:
     assert results.count("OverloadedError") >= 4
 
 
-async def _timed(call: object) -> str:
+async def _timed(call: Awaitable[object]) -> str:
     try:
-        await call  # type: ignore[misc]
+        await call
     except (CallTimeoutError, OverloadedError) as error:
         return type(error).__name__
     return "answered"

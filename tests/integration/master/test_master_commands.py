@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import AsyncGenerator
 from typing import TYPE_CHECKING
 
 import pytest
@@ -44,7 +45,8 @@ async def test_events_go_on_where_they_were(site: Site) -> None:
         kinds = [(await anext(events)).kind for _ in range(2)]
         await client.call("DELETE", "/containers/c")
         kinds.append((await anext(events)).kind)
-        await events.aclose()  # type: ignore[attr-defined]
+        assert isinstance(events, AsyncGenerator)
+        await events.aclose()
     assert kinds == ["user_added", "container_requested", "container_destroyed"]
 
 

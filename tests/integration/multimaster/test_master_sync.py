@@ -78,7 +78,7 @@ async def test_what_a_vanished_master_had_is_taken_back(network: DiscoveryNetwor
     ):
         await talker.advertise("chatter", STRING)
         await b.until(lambda graph: "/chatter" in graph.topic_types)
-        a.discovery._socket.send_to = lambda *_: None  # type: ignore[method-assign] # no good-bye either
+        a.discovery._socket.send_to = lambda *_: None  # type: ignore[method-assign]  # no good-bye either
         await b.until(lambda graph: "/chatter" not in graph.topic_types)
         assert [master.online for master in b.discovery.masters if master.uri == a.uri] == [False]
 

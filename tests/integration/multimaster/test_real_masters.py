@@ -17,6 +17,8 @@ from support.multimaster import STRING, DiscoveryNetwork, node, process, real_ma
 from support.ports import free_port, free_ports
 
 from rce.ros.core import Graph
+from rce.ros.multimaster.events import EventQueue
+from rce.ros.multimaster.peer_table import PeerEvent
 from rce.ros.node import Publisher
 
 TALKER = """
@@ -109,14 +111,14 @@ async def test_rospy_listens_again_after_lost_talker(network: DiscoveryNetwork, 
         await say_until_heard(orders, listener, "one")
         with far.discovery.watch() as events:
             send = near.discovery._socket.send_to
-            near.discovery._socket.send_to = lambda *_: None  # type: ignore[method-assign] # the network is gone
+            near.discovery._socket.send_to = lambda *_: None  # type: ignore[method-assign]  # the network is gone
             async with asyncio.timeout(20):
                 async for event in events:
                     if event.master.name == "near" and not event.master.online:
                         break
                 while far.sync.registrar.held:
                     await asyncio.sleep(0.05)
-                near.discovery._socket.send_to = send  # type: ignore[method-assign]
+                near.discovery._socket.send_to = send  # type: ignore[method-assign]  # the network is back
                 while not far.sync.registrar.held:
                     await asyncio.sleep(0.05)
                 await orders.wait_for_subscribers()
@@ -155,9 +157,9 @@ def _kill_master(port: int) -> None:
     found.send_signal(signal.SIGKILL)
 
 
-async def _until(events: object, name: str, change: str) -> None:
+async def _until(events: EventQueue[PeerEvent], name: str, change: str) -> None:
     async with asyncio.timeout(30):
-        async for event in events:  # type: ignore[attr-defined]
+        async for event in events:
             if (event.master.name, event.change.value) == (name, change):
                 return
 

@@ -8,12 +8,13 @@ import struct
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import Any
 
 import pytest
 from support.multimaster import STRING, DiscoveryNetwork, node
 
-from rce.ros.core import Core
+from rce.ros.core import Core, Graph
 from rce.ros.errors import ServiceFaultError
 from rce.ros.multimaster.filters import SyncLists
 from rce.ros.multimaster.relay.link import STRANGERS_PER_ADDRESS
@@ -145,6 +146,10 @@ async def test_a_namespace_for_a_master(network: DiscoveryNetwork) -> None:
         assert {"/Robot1/secret", "/amcl_pose", "/secret"} & station.graph.topic_types.keys() == set()
 
 
+def _has_subscribers(topic: str, graph: Graph) -> bool:
+    return bool(graph.subscribers(topic))
+
+
 async def heard_within(subscriber: Subscriber, publisher: Publisher) -> bool:
     """Publish once; tell whether it arrived soon. A relay takes a moment until it is wanted."""
     publisher.publish(data="go")
@@ -188,7 +193,7 @@ async def test_one_connection_carries_topics_and_services_both_ways() -> None:
         heard, got = await planner.subscribe("said", STRING), await base.subscribe("answered", STRING)
         for publisher, subscriber, core in ((said, heard, robot), (answered, got, cloud)):
             topic = publisher.topic
-            await core.wait_until(lambda graph, topic=topic: graph.subscribers(topic), timeout=20)  # type: ignore[misc]
+            await core.wait_until(partial(_has_subscribers, topic), timeout=20)
             await publisher.wait_for_subscribers(timeout=20)
             body = "x" * 3_000_000
             publisher.publish(data=body)
@@ -202,7 +207,9 @@ async def test_one_connection_carries_topics_and_services_both_ways() -> None:
 
         await planner.advertise_service("add", "roscpp/GetLoggers", lambda _: {"loggers": []})
         await planner.advertise_service("refuse", "roscpp/Empty", refuse)
-        await robot.wait_until(lambda graph: graph.service("/refuse") and graph.service("/add"), timeout=20)  # type: ignore[arg-type,return-value]
+        await robot.wait_until(
+            lambda graph: None not in (graph.service("/refuse"), graph.service("/add")), timeout=20
+        )
         assert (await base.service_client("add", "roscpp/GetLoggers").call({}, timeout=20)).loggers == []
         with pytest.raises(ServiceFaultError, match="not today"):
             await base.service_client("refuse", "roscpp/Empty").call({}, timeout=20)

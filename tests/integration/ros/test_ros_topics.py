@@ -11,7 +11,7 @@ from rce.ros.core import Core
 from rce.ros.errors import MasterUnreachableError, NodeClosedError, TypeMismatchError
 from rce.ros.node import Node, Subscriber
 from rce.ros.tcpros.header import encode_header
-from rce.ros.types import TypeRegistry
+from rce.ros.types import Message, TypeRegistry
 from rce.ros.xmlrpc import RpcClient
 
 STRING = "std_msgs/String"
@@ -199,8 +199,8 @@ async def test_callbacks_are_called_in_order_and_may_fail(
         seen: list[str] = []
         done = asyncio.Event()
 
-        async def slowly(message: object) -> None:
-            text = message.data  # type: ignore[attr-defined]
+        async def slowly(message: Message) -> None:
+            text = message.data
             await asyncio.sleep(0.02 if text == "0" else 0)
             seen.append(text)
             if text == "1":

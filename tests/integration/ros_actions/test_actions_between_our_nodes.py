@@ -141,7 +141,8 @@ async def test_a_cancelled_goal_keeps_its_result(make_node: MakeNode) -> None:
         with pytest.raises(GoalFailedError, match="preempted: enough") as caught:
             await goal.result()
         assert caught.value.state is GoalState.PREEMPTED
-        assert list(caught.value.result.sequence) == [1]  # type: ignore[union-attr]
+        assert caught.value.result is not None
+        assert list(caught.value.result.sequence) == [1]
         goal.cancel()
 
 

@@ -29,7 +29,7 @@ PATHS = st.builds("{}/{}".format, TAGS, NAMES)
 
 
 def components(**items: object) -> ConfigureComponents:
-    return ConfigureComponents(**{key: (item,) for key, item in items.items()})  # type: ignore[arg-type]
+    return ConfigureComponents(**{key: (item,) for key, item in items.items()})  # type: ignore[arg-type]  # each key has items of its own
 
 
 def interface(endpoint: str, tag: str) -> AddInterface:

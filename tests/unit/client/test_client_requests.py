@@ -96,10 +96,10 @@ async def test_an_amount_that_cannot_be_read_is_an_error_at_once() -> None:
     with pytest.raises(ValueError, match=r"^cpu: must be a number of cores"):
         await noted.create_container("c", cpu="half")
     with pytest.raises(ValueError, match=r"^restart: must be one of never, on-failure, always"):
-        await noted.add_node("c", "n", "p", "e", restart="sometimes")  # type: ignore[arg-type]
+        await noted.add_node("c", "n", "p", "e", restart="sometimes")  # type: ignore[arg-type]  # what a type checker would refuse
     assert noted.sent == []
 
 
 async def test_unknown_keywords_are_refused() -> None:
     with pytest.raises(TypeError, match="cpus"):
-        await Noted().create_container("c", cpus=2)  # type: ignore[call-arg]
+        await Noted().create_container("c", cpus=2)  # type: ignore[call-arg]  # what a type checker would refuse

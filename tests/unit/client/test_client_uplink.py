@@ -35,7 +35,7 @@ class PlayedWay:
         if message["type"] == "LT":
             self.sent.append(("LT", ",".join(data.get("sources", ()))))
         else:
-            self.sent.append((data.get("latch", ""), bytes(frames[1])[32:].decode()))  # type: ignore[arg-type]
+            self.sent.append((data.get("latch", ""), bytes(frames[1])[32:].decode()))  # type: ignore[arg-type]  # a binary frame
         return True
 
     def join(self, publisher: Publisher[bytes], *, active: bool = True) -> None:

@@ -28,8 +28,8 @@ def test_only_differences_are_done() -> None:
 
 @pytest.mark.parametrize(("now", "then"), [(1, True), (1, 1.0), ([1], [True]), ([1], [1, 2])])
 def test_another_type_is_a_difference(now: object, then: object) -> None:
-    assert difference({"/a": now}, {"/a": then}).set == {"/a": then}  # type: ignore[dict-item]
-    assert not difference({"/a": now}, {"/a": now}).set  # type: ignore[dict-item]
+    assert difference({"/a": now}, {"/a": then}).set == {"/a": then}  # type: ignore[dict-item]  # parameters of each type
+    assert not difference({"/a": now}, {"/a": now}).set  # type: ignore[dict-item]  # parameters of each type
 
 
 def test_strings_are_substituted(packages: PackageIndex, tmp_path: Path) -> None:

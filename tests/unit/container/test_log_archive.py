@@ -39,7 +39,7 @@ def live(archive: LogArchive, incarnation_id: str, text: str = "hello", id_: str
 
 
 def read(archive: LogArchive, node: str = "node", living: str = "", id_: str = BOX, **query: object) -> str:
-    message = ReadLog(request=1, id=id_, node=node, query=LogQuery(**query))  # type: ignore[arg-type]
+    message = ReadLog(request=1, id=id_, node=node, query=LogQuery(**query))  # type: ignore[arg-type]  # any of its fields
     return read_for(archive, message, living).text
 
 

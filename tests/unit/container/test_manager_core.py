@@ -249,7 +249,7 @@ def test_any_order_of_events_keeps_the_invariants(  # noqa: C901, PLR0912 - a sm
 
 
 def patch(base: int, revision: int, **parts: object) -> SpecPatch:
-    return SpecPatch(id=ID, base=base, revision=revision, **parts)  # type: ignore[arg-type]
+    return SpecPatch(id=ID, base=base, revision=revision, **parts)  # type: ignore[arg-type]  # any of its fields
 
 
 INTERFACE = InterfaceSpec(tag="i", type="PublisherInterface", message_type="p/T", addr="/i")

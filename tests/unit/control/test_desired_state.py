@@ -147,7 +147,7 @@ def test_whole_specs_and_patches_tell_the_same_difference(one: Parts, other: Par
 
 
 def status(number: int, **fields: object) -> EndpointStatus:
-    return EndpointStatus(id=ID, revision=1, state=EndpointState.RUNNING, number=number, **fields)  # type: ignore[arg-type]
+    return EndpointStatus(id=ID, revision=1, state=EndpointState.RUNNING, number=number, **fields)  # type: ignore[arg-type]  # any of its fields
 
 
 def test_status_patches_add_up() -> None:

@@ -120,7 +120,7 @@ async def test_restarted_planner_gets_goals_and_cells_again() -> None:
 
 async def test_no_cell_is_blocked_when_none_is_asked_for() -> None:
     station = FakeStation()
-    run = ScenarioRun(station, SCENARIO, station.truth, lambda _: None, blocked_cells=0)  # type: ignore[arg-type]
+    run = ScenarioRun(station, SCENARIO, station.truth, lambda _: None, blocked_cells=0)  # type: ignore[arg-type]  # it is played
     await asyncio.wait_for(run.run(), 5)
     assert station.blocks == []
     assert run.blocker.done == []

@@ -73,7 +73,7 @@ def test_a_disc_touches_what_it_overlaps() -> None:
 )
 def test_impossible_maps_are_refused(arguments: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=r"row|cell_size|blocked"):
-        GridMap(**arguments)  # type: ignore[arg-type]
+        GridMap(**arguments)  # type: ignore[arg-type]  # impossible ones too
 
 
 def test_a_wall_parts_the_map() -> None:

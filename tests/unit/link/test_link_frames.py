@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from itertools import zip_longest
+from random import Random
 
 import pytest
 from hypothesis import given
@@ -84,12 +85,12 @@ def test_frames_survive_any_cut(frames: list[Frame], cuts: list[int]) -> None:
     st.randoms(use_true_random=False),
 )
 def test_interleaved_fragments_are_put_together(
-    large: list[Frame], small: list[Frame], part: int, cut: int, random: object
+    large: list[Frame], small: list[Frame], part: int, cut: int, random: Random
 ) -> None:
     lines = [fragments(frame, max(part, 5_000)) for frame in large] + [[encode(frame)] for frame in small]
     written: list[bytes] = []
     while lines := [line for line in lines if line]:
-        line = random.choice(lines)  # type: ignore[attr-defined]
+        line = random.choice(lines)
         written.append(line.pop(0))
     got = fill(FrameReader(LIMITS), b"".join(written), [max(cut, 2_000)])
     assert sorted(got) == sorted(large + small)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TypedDict, Unpack
+
 import pytest
 from support.master_world import World
 
@@ -15,7 +17,7 @@ from rce_master.exceptions import (
     NoRoomError,
 )
 from rce_master.state import commands, placing
-from rce_master.state.changes import Transaction
+from rce_master.state.changes import Changes, Transaction
 from rce_master.state.placement import Room
 from rce_master.state.records import Container, UserRole
 from rce_master.state.settings import StateSettings
@@ -27,8 +29,15 @@ def at(world: World, tag: str, user: str = "anna") -> str:
     return world.state.tables.endpoints[f"{user}/{tag}"].task_set
 
 
-def resize(world: World, tag: str = "c", user: str = "anna", **requested: object) -> object:
-    return world.do(commands.ResizeContainer(user=user, tag=tag, changes=ResourceChanges(**requested)))  # type: ignore[arg-type]
+class Resize(TypedDict, total=False):
+    size: int
+    cpu: float
+    memory: int
+    bandwidth: int
+
+
+def resize(world: World, tag: str = "c", user: str = "anna", **requested: Unpack[Resize]) -> Changes:
+    return world.do(commands.ResizeContainer(user=user, tag=tag, changes=ResourceChanges(**requested)))
 
 
 def gone(world: World, tag: str, process: str = "c1") -> None:
@@ -229,14 +238,14 @@ def test_a_container_is_resized_while_it_runs(world: World) -> None:
     world.container(cpu=1.0, memory=100 * MB, bandwidth=5)
     world.run()
     changes = resize(world, cpu=0.5, memory=256 * MB)
-    assert list(changes.touched) == ["anna/c"]  # type: ignore[attr-defined]
-    assert [(h.kind, h.text) for h in changes.events] == [  # type: ignore[attr-defined]
+    assert list(changes.touched) == ["anna/c"]
+    assert [(h.kind, h.text) for h in changes.events] == [
         ("container_resized", "size 1, cpu 0.5, memory 256 MB, bandwidth 5B/s")
     ]
     requested = world.spec("c").resources
     assert (requested.cpu, requested.memory, requested.bandwidth) == (0.5, 256 * MB, 5)
     assert world.phase() == "running"
-    assert list(resize(world, cpu=0.5).touched) == []  # type: ignore[attr-defined]
+    assert list(resize(world, cpu=0.5).touched) == []
     resize(world, cpu=0.0)
     assert world.spec("c").resources.cpu == 0.0
 

@@ -97,7 +97,7 @@ async def test_a_file_that_is_no_store_is_refused(tmp_path: Path) -> None:
 
 async def test_a_failed_save_writes_nothing(tmp_path: Path) -> None:
     store = await SqliteStore.open(tmp_path)
-    bad = Row("users", "b", object())  # type: ignore[arg-type]
+    bad = Row("users", "b", object())  # type: ignore[arg-type]  # no store can keep it
     with pytest.raises(StoreError):
         await store.save([Row("users", "a", b"1"), bad])
     await store.save([Row("users", "c", b"3")])

@@ -198,8 +198,9 @@ class Histories(RuleBasedStateMachine):
 
     @rule(user=USERS, tag=TAGS, size=st.sampled_from([1, 2]), wait=st.booleans(), grouped=st.booleans())
     def create(self, user: str, tag: str, size: int, wait: bool = False, grouped: bool = False) -> None:
-        group = {"network": Network.GROUP, "group": "g"} if grouped else {}
-        requested = Resources(size=size, **group)  # type: ignore[arg-type]
+        requested = (
+            Resources(size=size, network=Network.GROUP, group="g") if grouped else Resources(size=size)
+        )
         self.do(commands.CreateContainer(user=user, tag=tag, resources=requested, wait=wait))
 
     @rule(user=USERS, tag=TAGS, size=st.sampled_from([1, 2, 3, 4]))

@@ -286,7 +286,7 @@ async def test_of_several_commands_only_the_bad_ones_are_refused(cloud: Cloud) -
 
 async def test_a_fault_of_ours_is_no_end(cloud: Cloud, caplog: pytest.LogCaptureFixture) -> None:
     with pytest.raises(MasterError, match="internal error"):
-        await cloud.state_service.submit("nonsense")  # type: ignore[arg-type]
+        await cloud.state_service.submit("nonsense")  # type: ignore[arg-type]  # it is refused
     assert "could not apply 'nonsense'" in caplog.text
     await cloud.state_service.submit(commands.CreateContainer(user="anna", tag="c"))
 

@@ -14,6 +14,7 @@ from rce.control.model import (
 )
 from rce_master.exceptions import ConflictError, InvalidRequestError, NotFoundError, TransitionError
 from rce_master.state import commands
+from rce_master.state.changes import Changes
 from rce_master.state.core import State
 from rce_master.state.lifecycle import (
     CONTAINER_LIFE,
@@ -30,11 +31,11 @@ MB = 1 << 20
 def status(
     tag: str, state: EndpointState = EndpointState.RUNNING, revision: int = 1, **fields: object
 ) -> EndpointStatus:
-    return EndpointStatus(id=f"anna/{tag}", revision=revision, state=state, **fields)  # type: ignore[arg-type]
+    return EndpointStatus(id=f"anna/{tag}", revision=revision, state=state, **fields)  # type: ignore[arg-type]  # any of its fields
 
 
-def kinds(changes: object) -> list[str]:
-    return [h.kind for h in changes.events]  # type: ignore[attr-defined]
+def kinds(changes: Changes) -> list[str]:
+    return [h.kind for h in changes.events]
 
 
 def test_lifecycles_refuse_what_cannot_happen() -> None:

@@ -128,7 +128,7 @@ def remote(**more: object) -> MasterInfo:
         nodes={"/talker": here},
         service_uris={"/clear": Provider("rosrpc://10.0.0.2:5001", THEIRS, is_local=True)},
     )
-    return replace(info, **more)  # type: ignore[arg-type]
+    return replace(info, **more)  # type: ignore[arg-type]  # any of its fields
 
 
 def names(entries: set[Registration]) -> set[tuple[str, str, str]]:

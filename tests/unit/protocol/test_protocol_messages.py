@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from rce.model import requests
 from rce.model.faults import join_path
-from rce.model.requests import AddNode, Connection
+from rce.model.requests import AddNode, ConfigureComponents, Connection
 from rce.model.specs import Network, NodeSpec, Resources
 from rce.protocol import messages as m
 from rce.protocol.codec import encode, encode_message
@@ -235,13 +235,17 @@ def test_nan_of_python_writers_is_understood() -> None:
 @pytest.mark.parametrize("exe", ["a.py", "sub/a.py", "a..b", "..a"])
 def test_executable_inside_the_package_is_allowed(exe: str) -> None:
     node = {"containerTag": "c", "nodeTag": "n", "pkg": "Test", "exe": exe}
-    assert read_request("CN", {"addNodes": [node]}).add_nodes[0].node.exe == exe  # type: ignore[union-attr]
+    request = read_request("CN", {"addNodes": [node]})
+    assert isinstance(request, ConfigureComponents)
+    assert request.add_nodes[0].node.exe == exe
 
 
 @pytest.mark.parametrize("exe", ["", "/bin/sh", "..", "../a", "a/..", "a/../../b", "a\0b", "a\n"])
 def test_executable_outside_the_package_is_refused(exe: str) -> None:
     node = {"containerTag": "c", "nodeTag": "n", "pkg": "Test", "exe": exe}
-    assert read_request("CN", {"addNodes": [node]}).faults  # type: ignore[union-attr]
+    request = read_request("CN", {"addNodes": [node]})
+    assert isinstance(request, ConfigureComponents)
+    assert request.faults
 
 
 def test_unknown_request_type_is_refused() -> None:

@@ -229,7 +229,7 @@ def test_binary_that_has_no_key_cannot_be_sent(value: object) -> None:
 
 
 def test_ids_are_fresh() -> None:
-    ids = {bytes(frame[:32]) for _ in range(100) for frame in encode_data("i", "a/B", b"")[1:]}  # type: ignore[arg-type]
+    ids = {bytes(frame[:32]) for _ in range(100) for frame in encode_data("i", "a/B", b"")[1:]}  # type: ignore[arg-type]  # binary frames only
     assert len(ids) == 100
 
 
