@@ -19,6 +19,7 @@ from rce.cli.program_files import from_file
 from rce.config.client import ClientConfig, load
 from rce.config.exceptions import ConfigError, Fault
 from rce.config.logs import start_logging
+from rce.masters import split_addresses
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce.supervision.signals import end_signals
@@ -132,7 +133,7 @@ def _authenticator(
             " and people log in at the page"
         )
     account = backend.account
-    asks = login if login is not None else not (_is_loopback(bind) and _is_loopback(_host(account.url)))
+    asks = login if login is not None else not (_is_loopback(bind) and _is_here(account.url))
     if not asks and not _is_loopback(bind):
         raise typer.BadParameter(
             f"--no-login with --bind {bind} would let every computer in the network control the fleet;"
@@ -141,8 +142,9 @@ def _authenticator(
     return EngineAuthenticator(account, allow_anonymous=not asks)
 
 
-def _host(url: str) -> str:
-    return urlsplit(url).hostname or ""
+def _is_here(urls: str) -> bool:
+    """Return whether all masters are on this machine."""
+    return all(_is_loopback(urlsplit(url).hostname or "") for url in split_addresses(urls))
 
 
 def _is_loopback(host: str) -> bool:

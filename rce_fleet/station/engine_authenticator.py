@@ -16,6 +16,7 @@ import aiohttp
 from aiohttp import hdrs
 from yarl import URL
 
+from rce.masters import Masters
 from rce.tls.faults import explain_to_client
 from rce.web.client import session_connector
 from rce_fleet.station.authentication import AuditedAction, AuthenticationError, StationUser
@@ -52,7 +53,7 @@ class StationAccount:
     """The user account of the station itself."""
 
     url: str
-    """URL of the master."""
+    """URL of the master; several are separated by commas, and are used in turn."""
     user: str
     password: str
     tls: Context | None = None
@@ -77,13 +78,17 @@ class EngineAuthenticator:
 
     def __init__(self, account: StationAccount, *, allow_anonymous: bool = False) -> None:
         self._account = account
-        self._api = URL(account.url) / "api/v1"
+        self._masters = Masters(account.url)
         self._allow_anonymous = allow_anonymous
         self._cache: OrderedDict[str, tuple[float, StationUser | None]] = OrderedDict()
         self._actions: asyncio.Queue[tuple[str, AuditedAction]] = asyncio.Queue(MAX_QUEUED_ACTIONS)
         self._own_token = ""
         self._session: aiohttp.ClientSession
         self._writer: asyncio.Task[None]
+
+    @property
+    def _api(self) -> URL:
+        return URL(self._masters.current) / "api/v1"
 
     @property
     def has_logins(self) -> bool:
@@ -120,9 +125,11 @@ class EngineAuthenticator:
         asked_at, known = self._cache.get(token, (0.0, None))
         if token in self._cache and now - asked_at < CACHE_S:
             return known
+        master = self._masters.current
         try:
             user = await self._ask(token)
         except _REQUEST_ERRORS as error:
+            self._masters.failed(master)
             if token in self._cache and known is not None and now - asked_at < OFFLINE_CACHE_S:
                 return known
             raise AuthenticationError(
@@ -144,10 +151,12 @@ class EngineAuthenticator:
         """
         body = {"userID": user, "password": password, "label": "station page", "lifetime": LIFETIME_S}
         headers = {"X-Forwarded-For": address} if address else {}
+        master = self._masters.current
         try:
             token = await self._log_in(body, headers)
             found = await self.authenticate(token)
         except _REQUEST_ERRORS as error:
+            self._masters.failed(master)
             raise AuthenticationError(
                 503, f"the engine cannot be reached; try again ({_reason_of(error)})"
             ) from error

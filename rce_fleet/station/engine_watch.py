@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import aiohttp
 from yarl import URL
 
+from rce.masters import Masters
 from rce.tls.faults import explain_to_client
 from rce.web.client import session_connector
 from rce_fleet.station.engine_authenticator import RequestOptions
@@ -45,11 +46,15 @@ class EngineWatch:
         on_state: Callable[[dict[str, Any]], None],
     ) -> None:
         self._tls = tls
-        self._api = URL(master) / "api/v1"
+        self._masters = Masters(master)
         self._login = {"userID": user, "password": password, "label": "operator station"}
         self._on_state = on_state
         self._token = ""
         self._last: dict[str, Any] = {}
+
+    @property
+    def _api(self) -> URL:
+        return URL(self._masters.current) / "api/v1"
 
     @property
     def _request_options(self) -> RequestOptions:
@@ -68,6 +73,7 @@ class EngineWatch:
 
     async def _watch(self, session: aiohttp.ClientSession) -> None:
         while True:
+            master = self._masters.current
             try:
                 state = await self._read(session)
             except aiohttp.ClientResponseError as error:
@@ -75,6 +81,7 @@ class EngineWatch:
                     self._token = ""
                 state = {"error": f"the master answered {error.status}: {error.message}"}
             except (aiohttp.ClientError, TimeoutError) as error:
+                self._masters.failed(master)
                 state = {"error": f"the master cannot be reached: {explain_to_client(error) or error}"}
             if state != self._last:
                 self._last = state

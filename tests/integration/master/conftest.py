@@ -79,7 +79,9 @@ class TaskSet:
         self.machine = machine or MachineInfo(name="machine", cores=2)
         self.url = url
         self.endpoints: tuple[EndpointStatus, ...] = ()
+        self.features: tuple[str, ...] = ()
         self.inbox: asyncio.Queue[ToTaskSet] = asyncio.Queue()
+        self.taken: list[ToTaskSet] = []
         self.log = b""
         self.asked: list[ReadLog] = []
         url = f"ws://{LOOPBACK}:{master.control_port}/"
@@ -93,6 +95,7 @@ class TaskSet:
             machine=self.machine,
             endpoints=self.endpoints,
             url=self.url,
+            features=self.features,
         )
 
     async def handle(self, message: ToTaskSet) -> None:
@@ -108,6 +111,7 @@ class TaskSet:
         async with asyncio.timeout(10):
             while True:
                 message = await self.inbox.get()
+                self.taken.append(message)
                 if isinstance(message, kind):
                     return message
 
@@ -152,9 +156,16 @@ class Site:
 
     @asynccontextmanager
     async def task_set(
-        self, kind: TaskSetKind, process: str, *, machine: MachineInfo | None = None, url: str = ""
+        self,
+        kind: TaskSetKind,
+        process: str,
+        *,
+        machine: MachineInfo | None = None,
+        url: str = "",
+        features: tuple[str, ...] = (),
     ) -> AsyncIterator[TaskSet]:
         made = TaskSet(self.master, kind, process, machine=machine, url=url)
+        made.features = features
         task = asyncio.create_task(made.channel.run())
         try:
             await made.get(Sync)

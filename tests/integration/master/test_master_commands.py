@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 from collections.abc import AsyncGenerator
 from typing import TYPE_CHECKING
@@ -34,6 +35,18 @@ async def test_the_client_says_what_the_master_said(site: Site) -> None:
             await client.call("DELETE", "/containers/c")
         assert caught.value.status == 404
     async with ApiClient("http://127.0.0.1:1/", "x") as client:
+        with pytest.raises(CliError, match="cannot use the master"):
+            await client.call("GET", "/user")
+
+
+async def test_of_several_masters_the_client_asks_one_that_answers(site: Site) -> None:
+    async with ApiClient(f"http://127.0.0.1:1/,{site.url}", site.token) as client:
+        assert (await client.call("GET", "/user"))["name"] == "testUser"
+    async with ApiClient(f"http://127.0.0.1:1/,{site.url}", site.token) as client, asyncio.timeout(30):
+        following = client.events()
+        await client.call("POST", "/containers", {"tag": "c"})
+        assert (await anext(following)).kind
+    async with ApiClient("http://127.0.0.1:1/,http://127.0.0.1:2/", "x") as client:
         with pytest.raises(CliError, match="cannot use the master"):
             await client.call("GET", "/user")
 
