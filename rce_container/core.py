@@ -204,6 +204,8 @@ class ManagerCore:
             case StatusWanted(id=id_):
                 if (container := self.containers.get(id_)) is not None:
                     self._tell(container)
+            case _:
+                assert_never(event)
 
     def _put(self, spec: EndpointSpec) -> None:
         if self._quitting:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import singledispatch
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, assert_never
 
 from rce.model import requests
 from rce.protocol.exceptions import MessageError
@@ -69,8 +69,21 @@ def commands_of(request: Request | Item, user: str) -> Iterator[commands.Request
                 yield commands.Disconnect(user=user, tag_a=pair.tag_a, tag_b=pair.tag_b)
             for pair in request.connect:
                 yield commands.Connect(user=user, tag_a=pair.tag_a, tag_b=pair.tag_b)
-        case _:
+        case (
+            requests.CreateContainer()
+            | requests.ResizeContainer()
+            | requests.DestroyContainer()
+            | requests.AddNode()
+            | requests.RemoveNode()
+            | requests.SetParameter()
+            | requests.DeleteParameter()
+            | requests.AddInterface()
+            | requests.RemoveInterface()
+            | requests.Connection()
+        ):
             yield _command(request, user)
+        case _:
+            assert_never(request)
 
 
 @singledispatch
