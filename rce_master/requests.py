@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rce.control.messages import ClientRequest
-    from rce.model.requests import Item, Request
+    from rce.model.requests import Component, Request
 
 
 def count_items(request: ClientRequest) -> int:
@@ -43,7 +43,7 @@ def read(user: str, request: ClientRequest) -> tuple[list[commands.Request], lis
     return list(commands_of(content, user)), [f"{request.type}: {fault}" for fault in faults]
 
 
-def commands_of(request: Request | Item, user: str) -> Iterator[commands.Request]:
+def commands_of(request: Request | Component, user: str) -> Iterator[commands.Request]:
     """Tell the commands of a request, in the order in which they are to be done.
 
     What it removes is removed first, so that one request can replace something; parameters are set and
@@ -55,7 +55,7 @@ def commands_of(request: Request | Item, user: str) -> Iterator[commands.Request
     """
     match request:
         case requests.ConfigureComponents():
-            items: list[Item] = [
+            items: list[Component] = [
                 *request.remove_nodes,
                 *request.remove_interfaces,
                 *request.delete_param,
@@ -69,18 +69,13 @@ def commands_of(request: Request | Item, user: str) -> Iterator[commands.Request
                 yield commands.Disconnect(user=user, tag_a=pair.tag_a, tag_b=pair.tag_b)
             for pair in request.connect:
                 yield commands.Connect(user=user, tag_a=pair.tag_a, tag_b=pair.tag_b)
+        case requests.CreateContainer() | requests.ResizeContainer() | requests.DestroyContainer():
+            yield _command(request, user)
         case (
-            requests.CreateContainer()
-            | requests.ResizeContainer()
-            | requests.DestroyContainer()
-            | requests.AddNode()
-            | requests.RemoveNode()
-            | requests.SetParameter()
-            | requests.DeleteParameter()
-            | requests.AddInterface()
-            | requests.RemoveInterface()
-            | requests.Connection()
+            requests.AddNode() | requests.RemoveNode() | requests.AddInterface() | requests.RemoveInterface()
         ):
+            yield _command(request, user)
+        case requests.SetParameter() | requests.DeleteParameter():
             yield _command(request, user)
         case _:
             assert_never(request)

@@ -121,9 +121,9 @@ class ConfigureConnections(Struct, frozen=True, kw_only=True, omit_defaults=True
     """Of the items that were refused in reading."""
 
 
-Item: TypeAlias = (
-    AddNode | RemoveNode | AddInterface | RemoveInterface | SetParameter | DeleteParameter | Connection
-)
+Component: TypeAlias = AddNode | RemoveNode | AddInterface | RemoveInterface | SetParameter | DeleteParameter
+"""What a container or a robot is made of."""
+Item: TypeAlias = Component | Connection
 """A part of a request that is done, or refused, by itself."""
 Request: TypeAlias = (
     CreateContainer | ResizeContainer | DestroyContainer | ConfigureComponents | ConfigureConnections
@@ -133,16 +133,17 @@ Request: TypeAlias = (
 
 def faults_of(item: Request | Item) -> Iterator[FieldFault]:
     """Find what does not fit together in a request whose fields are right. Paths name attributes."""
-    match item:
-        case CreateContainer(resources=Resources(network=Network.GROUP, group="")):
+    if isinstance(item, CreateContainer):
+        if item.resources.network is Network.GROUP and not item.resources.group:
             problem = "is missing; a container in a network of containers names its group"
             yield FieldFault(("resources", "group"), FaultCode.MISSING, problem)
-        case ResizeContainer(changes=changes) if not changes.given():
-            names = ", ".join(changes.__struct_fields__)
+    elif isinstance(item, ResizeContainer):
+        if not item.changes.given():
+            names = ", ".join(item.changes.__struct_fields__)
             problem = f"says nothing; give one or more of {names}"
             yield FieldFault(("changes",), FaultCode.MISSING, problem)
-        case AddInterface(interface=InterfaceSpec(addr="", type=type_)) if type_.endswith(
-            Form.INTERFACE.value
-        ):
-            problem = f"is missing; a {type_} needs its ROS name"
+    elif isinstance(item, AddInterface):
+        spec = item.interface
+        if not spec.addr and spec.type.endswith(Form.INTERFACE.value):
+            problem = f"is missing; a {spec.type} needs its ROS name"
             yield FieldFault(("interface", "addr"), FaultCode.MISSING, problem)

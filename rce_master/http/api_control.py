@@ -26,7 +26,7 @@ from rce_master.http.spec_models import SPELLING
 from rce_master.requests import commands_of
 
 if TYPE_CHECKING:
-    from rce.model.requests import Item, Request
+    from rce.model.requests import Component, Item, Request
     from rce_master.http.model import Model
 
 T = TypeVar("T", bound="Request | Item")
@@ -36,7 +36,7 @@ routes = route_table("control")
 _QUERY = (OF_USER,)
 
 
-async def _do(call: Call, request: Request | Item) -> None:
+async def _do(call: Call, request: Request | Component) -> None:
     """Do what is asked for.
 
     Raises:

@@ -48,7 +48,7 @@ from rce.control.server import ControlServer
 from rce.link import Endpoint, Interface, LinkHub
 from rce.model.names import EndpointId, InterfaceType
 from rce.model.specs import InterfaceSpec
-from rce.protocol.requests import write_request
+from rce.protocol.requests import read_request, write_request
 from rce_robot.app import App
 from rce_robot.conversion.pool import ConversionSettings
 from rce_robot.settings import RobotSettings, SessionSettings
@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from rce.control.messages import ToMaster
     from rce.control.peer import Peer
     from rce.link import Buffer, Port
+    from rce.model.requests import Request
 
 T = TypeVar("T")
 
@@ -104,6 +105,11 @@ class Signal:
                 self._event.clear()
                 await self._event.wait()
             return found
+
+
+def content_of(request: ClientRequest) -> Request:
+    """What a client asked for, whichever way the task set sent it."""
+    return read_request(request.type, request.data) if request.content is None else request.content
 
 
 class FakeMaster:
@@ -152,8 +158,8 @@ class FakeMaster:
             case Login():
                 peer.send(self._login(message))
             case ClientRequest():
-                assert message.content is not None
-                self.requests.append((message.id, message.type, write_request(message.content)))
+                assert (message.content is not None) is self.in_patches
+                self.requests.append((message.id, message.type, write_request(content_of(message))))
                 peer.send(ClientReply(request=message.request, errors=await self.answer(message)))
             case Status():
                 self.statuses[message.status.id] = message.status
@@ -347,7 +353,7 @@ async def running_cloud(
             on_message=master.on_message,
             on_gone=master.on_gone,
             port=0,
-            features=(TYPED_REQUESTS, PATCHES) if in_patches else (TYPED_REQUESTS,),
+            features=(TYPED_REQUESTS, PATCHES) if in_patches else (),
         )
         await stack.enter_async_context(server)
         cloud = Cloud(master, endpoint, ends, LinkAddress(machine=MACHINE, unix=str(folder / "s")))

@@ -87,6 +87,8 @@ BANS = (
     Ban("=strike_all", "killing processes of a mark", "kill_marked"),
     Ban("=keep_to_oneself", "a process that others cannot read", "set_undumpable"),
     Ban("=limit_oneself oneself", "limits of a process", "set_rlimits"),
+    Ban("=class_name =cls_name =kind_name", "the type of a message", "message_type"),
+    Ban("=ContainerData =ResizeData =ContainerSpec", "what a container asks for", "Resources"),
     Ban("realm", "the service of the master's state", "StateService"),
     Ban("desk", "the handler of a control channel", "ControlHandler"),
     Ban("=Visit =doubt doubts", "a login that is not decided, a peer that is checked", "PendingLogin, probe"),

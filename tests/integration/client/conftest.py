@@ -11,7 +11,7 @@ from ssl import SSLContext
 from typing import TYPE_CHECKING, Protocol
 
 import pytest
-from support.cloud import PASSWORD, Cloud, PeerInterface, running_cloud
+from support.cloud import PASSWORD, Cloud, PeerInterface, content_of, running_cloud
 
 from rce.aio.backoff import Backoff
 from rce.model.requests import ConfigureComponents
@@ -75,7 +75,8 @@ class Engine:
     async def _answer(self, request: ClientRequest) -> tuple[str, ...]:
         robot = request.id.partition("/")[2]
         errors = []
-        added = request.content.add_interfaces if isinstance(request.content, ConfigureComponents) else ()
+        content = content_of(request)
+        added = content.add_interfaces if isinstance(content, ConfigureComponents) else ()
         for item in added:
             spec = item.interface
             if spec.tag in self.refuse:

@@ -154,6 +154,19 @@ async def test_usage_is_reported(cloud: Cloud, robot: Robot) -> None:
     assert cloud.master.usage.memory > 0
 
 
+@pytest.mark.parametrize("current", [False, True])
+async def test_requests_reach_masters_of_both_releases(
+    dial: Dial, robot_of: type[Robot], current: bool
+) -> None:
+    """A master of the release before gets what the client wrote, a current one what was read of it."""
+    async with running_cloud(in_patches=current) as cloud, dial(cloud) as socket:
+        robot = robot_of(socket)
+        await robot.send("CC", {"containerTag": "c1", "containerData": {"memory": "5M", "cpu": "50%"}})
+        await cloud.master.changed.until(lambda: len(cloud.master.requests) == 1)
+        sent = {"containerTag": "c1", "containerData": {"memory": 5, "cpu": 0.5}}
+        assert cloud.master.requests == [(ROBOT, "CC", sent)]
+
+
 async def test_requests_go_to_the_master_in_order_and_errors_come_back(cloud: Cloud, robot: Robot) -> None:
     async def refuse(request: ClientRequest) -> tuple[str, ...]:
         return ("no room", "no luck") if request.type == "CC" else ()
