@@ -21,19 +21,17 @@ from rce.control.model import (
     PATCHES,
     EndpointSpec,
     EndpointStatus,
-    LinkAddress,
     NodeStatus,
     SpecPatch,
     StatusPatch,
 )
 from rce.control.observed import ObservedStatus
 from rce.control.tags import Unknown
-from rce.link.handover import HandoverSender, LinkAcceptor
+from rce.link.handover import LinkAcceptor
 from rce.model.names import EndpointId
 from rce.model.specs import Resources
 from rce_container import events, intake
 from rce_container.archive import LogArchive
-from rce_container.dial import dial
 from rce_container.environment import messages as m
 from rce_container.environment import proc
 from rce_container.environment.channel import Channel, connect
@@ -48,6 +46,7 @@ from rce_container.exceptions import (
 )
 from rce_container.folder import ContainerFolder
 from rce_container.limits.enforcer import LimitEnforcer
+from rce_container.links import ContainerLinks
 from rce_container.logs import last_line
 from rce_container.network import Networks
 from rce_container.packages.shelf import Shelf
@@ -60,7 +59,6 @@ _log = logging.getLogger(__name__)
 _SHIM_TIMEOUT_S = 5.0
 """What the shim gets to remove the folders of a container that ended properly."""
 _LAST_WORDS_LENGTH = 300
-_DIAL_TIMEOUT_S = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,7 +108,9 @@ class Incarnation:
         self._context = context
         self._isolated = isolated
         self._channel: Channel | None = None
-        self._sender: HandoverSender | None = None
+        self._links = ContainerLinks(context.acceptor, context.settings)
+        self._takes_errands = False
+        """Whether there is an environment for which links and limits are looked after."""
         self._desired: DesiredState | None = None
         self._pids: dict[int, int] = {}
         self._deadline: asyncio.Timeout | None = None
@@ -150,8 +150,8 @@ class Incarnation:
         self._supply.want(spec.packages)
         if self._channel is not None:
             self._channel.send(m.encode(m.Apply(spec=spec)))
-        if self._sender is not None:
-            self._errands.spawn(self._route(self._sender, spec), name=f"links of {self.id}")
+        if self._takes_errands:
+            self._errands.spawn(self._links.assign(spec), name=f"links of {self.id}")
             self._errands.spawn(self._resize(spec.resources), name=f"limits of {self.id}")
 
     def apply_patch(self, patch: SpecPatch) -> None:
@@ -164,11 +164,12 @@ class Incarnation:
         self._note_revision(patch.revision)
         if patch.contents is not None:
             self._supply.want(patch.contents.packages)
-            self._errands.spawn(self._resize(patch.contents.resources), name=f"limits of {self.id}")
+            if self._takes_errands:
+                self._errands.spawn(self._resize(patch.contents.resources), name=f"limits of {self.id}")
         if self._channel is not None:
             self._channel.send(m.encode(m.ApplyPatch(patch=patch)))
-        if self._sender is not None and (patch.links or patch.removed_links):
-            self._errands.spawn(self._route_changes(self._sender, patch), name=f"links of {self.id}")
+        if self._takes_errands and (patch.links or patch.removed_links):
+            self._errands.spawn(self._links.change(patch), name=f"links of {self.id}")
 
     def _note_revision(self, revision: int) -> None:
         try:
@@ -292,15 +293,13 @@ class Incarnation:
 
     async def _hang_up(self) -> None:
         self._deadline = None
-        sender, self._sender = self._sender, None
+        self._takes_errands = False
         await self._errands.close()
         await self._supply.close()
         if self._channel is not None:
             self._channel.close()
             self._channel = None
-        if sender is not None:
-            self._context.acceptor.forget(sender)
-            sender.close()
+        self._links.close()
 
     async def _converse(self, channel: Channel) -> None:
         pace = intake.Pace()
@@ -394,29 +393,14 @@ class Incarnation:
     # Links
 
     def _open_handover(self, channel: Channel) -> None:
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._sender = HandoverSender(ours)
-        with theirs:
+        self._takes_errands = True
+        with self._links.open() as theirs:
             channel.send(m.encode(m.Handover(features=(PATCHES,))), theirs.fileno())
 
-    async def _route(self, sender: HandoverSender, spec: EndpointSpec) -> None:
-        await self._context.acceptor.assign(sender, [link.id for link in spec.links if not link.dial])
-
-    async def _route_changes(self, sender: HandoverSender, patch: SpecPatch) -> None:
-        accepted = [link.id for link in patch.links if not link.dial]
-        dialed = [link.id for link in patch.links if link.dial]
-        await self._context.acceptor.reassign(sender, accepted, [*patch.removed_links, *dialed])
-
     async def _dial(self, channel: Channel, request: m.Dial) -> None:
-        """Connect to a peer of this container, and to nothing else."""
         links = self._desired.links.values() if self._desired is not None else ()
-        allowed: list[LinkAddress] = [link.address for link in links]
         try:
-            if request.address not in allowed:
-                raise ConnectionError("the container has no link to there")
-            async with asyncio.timeout(_DIAL_TIMEOUT_S):
-                settings = self._context.settings
-                sock = await dial(request.address, settings.machine, tls=settings.tls)
+            sock = await self._links.dial(request.address, links)
         except OSError as error:
             text = str(error) or type(error).__name__
             channel.send(m.encode(m.Dialed(request=request.request, error=text)))

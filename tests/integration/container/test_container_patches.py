@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import pytest
-from support.containers import Machine, until
+from support.containers import ECHO, Machine, until
 
 from rce.control.messages import CONTROL_VERSION, PatchSpec, PatchStatus, SpecWanted, Status, Welcome
-from rce.control.model import PATCHES, SpecPatch
+from rce.control.model import PATCHES, EndpointContents, NodeState, SpecPatch
 from rce.control.observed import ObservedStatus
-from rce.model.specs import InterfaceSpec
+from rce.model.specs import InterfaceSpec, Resources
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -150,3 +150,21 @@ async def test_programs_of_the_former_release_get_and_send_wholes(
         assert not machine.of(PatchStatus)
         await until(lambda: machine.reported(BOX).revision == 3)
         assert machine.of(Status)[-1].status == machine.reported(BOX)
+
+
+async def test_nodes_and_limits_change_by_patches(machine: Machine) -> None:
+    async with machine.engine():
+        await welcome(machine, PATCHES)
+        await machine.put(BOX, 1, interfaces=(interface("a"),))
+        early = EndpointContents(resources=Resources(cpu=0.5))  # while its processes start
+        await machine.manager.handle(PatchSpec(patch=SpecPatch(id=BOX, base=1, revision=2, contents=early)))
+        await has(machine, "a")
+        contents = EndpointContents(resources=Resources(cpu=0.5), nodes=(ECHO,))
+        await machine.manager.handle(
+            PatchSpec(patch=SpecPatch(id=BOX, base=2, revision=3, contents=contents))
+        )
+        await machine.node_is(BOX, "echo", NodeState.RUNNING)
+        await machine.manager.handle(patch(3, "b"))
+        await has(machine, "a", "b")
+        assert machine.reported_node(BOX, "echo").state is NodeState.RUNNING
+        assert not machine.of(SpecWanted)
