@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("rce", "rce_client", "rce_container", "rce_fleet", "rce_master", "rce_robot")
 OPEN = {
-    "rce/model/requests.py": "what is wrong with an item, which most items do not have",
     "rce/ros/multimaster/relay/frames.py": "numbers from the wire; what is left is JSON",
     "rce/ros/tools/plain.py": "values of any type",
     "rce_master/http/server.py": "exceptions, of which there may be more",
