@@ -19,7 +19,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 USER = "rce-test"
 SYSTEM_PYTHON = "/usr/bin/python3"
-SECRET = "the secret of the engine"
+SECRET = "what-only-the-engine-of-the-tests-may-know"
 
 
 class Person:
