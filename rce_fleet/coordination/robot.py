@@ -34,7 +34,7 @@ class Cause(Enum):
     HELD = "held"
     """It is told to stand still."""
     LOST = "lost"
-    """It or its move client is not heard any more."""
+    """The robot or its move client sends no messages any more."""
     HEARD = "heard"
     """It sends messages again."""
 
@@ -68,10 +68,10 @@ class RobotRecord:
         revision: Number of the last list of cells sent.
         phase: Its phase.
         x, y, yaw: Last pose, metres and radians; not a number before the first.
-        posed_at: When the last pose came; at first, when the robot was first heard.
+        posed_at: When the last pose came; at first, when the robot's first message came.
         report: Last report of its move client.
         reported_at: When that came, likewise.
-        obeyed_at: When its move client first said that it follows the last list and is at its end.
+        obeyed_at: When its move client first reported to be at the end of the last list.
         goal: Its goal cell.
         rest: The cell it returns to when it has no goal.
         unreachable: Whether no path leads to its goal.

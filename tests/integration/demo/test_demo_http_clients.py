@@ -1,4 +1,4 @@
-"""The station's API as the demo uses it, against a server that is played."""
+"""The demo's HTTP clients, of station and master, against a fake server."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from rce_fleet.station.client import StationClient
 FLEET = fleet(robot("Robot1", cell=3), blocked=[5])
 
 
-class Played:
+class FakeServer:
     """A server with the routes of station and master."""
 
     def __init__(self) -> None:
-        self.heard: list[tuple[str, Any]] = []
+        self.requests: list[tuple[str, Any]] = []
         self.answer: web.Response | None = None
 
     def app(self) -> web.Application:
@@ -39,14 +39,14 @@ class Played:
         return self.answer or web.Response(text=FLEET.model_dump_json(), content_type="application/json")
 
     async def put(self, request: web.Request) -> web.Response:
-        self.heard.append((request.match_info["path"], await request.json()))
+        self.requests.append((request.match_info["path"], await request.json()))
         return self.answer or web.json_response({"message": "done"})
 
     async def login(self, _: web.Request) -> web.Response:
         return self.answer or web.json_response({"token": "abc"})
 
     async def logout(self, request: web.Request) -> web.Response:
-        self.heard.append(("logout", request.headers["Authorization"]))
+        self.requests.append(("logout", request.headers["Authorization"]))
         return web.Response(status=204)
 
     async def interfaces(self, request: web.Request) -> web.Response:
@@ -56,13 +56,13 @@ class Played:
 
 
 @pytest.fixture
-def played() -> Played:
-    return Played()
+def fake() -> FakeServer:
+    return FakeServer()
 
 
 @pytest.fixture
-async def server(played: Played) -> AsyncIterator[TestServer]:
-    server = TestServer(played.app())
+async def server(fake: FakeServer) -> AsyncIterator[TestServer]:
+    server = TestServer(fake.app())
     async with server:
         yield server
 
@@ -74,14 +74,14 @@ async def session() -> AsyncIterator[aiohttp.ClientSession]:
 
 
 async def test_state_is_read_and_requests_are_sent(
-    played: Played, server: TestServer, session: aiohttp.ClientSession
+    fake: FakeServer, server: TestServer, session: aiohttp.ClientSession
 ) -> None:
     station = StationClient(session, str(server.make_url("/")))
     assert await station.fleet() == FLEET
     await station.set_goal("Robot1", 7)
     await station.set_goal("Robot1", None)
     await station.set_blocked(9, blocked=True)
-    assert played.heard == [
+    assert fake.requests == [
         ("robots/Robot1/goal", {"cell": 7}),
         ("robots/Robot1/goal", {"cell": None}),
         ("cells/9", {"blocked": True}),
@@ -95,19 +95,19 @@ async def test_state_is_read_and_requests_are_sent(
 async def test_refusals(
     status: int,
     error: type[Exception],
-    played: Played,
+    fake: FakeServer,
     server: TestServer,
     session: aiohttp.ClientSession,
 ) -> None:
-    played.answer = web.json_response({"error": "cell 9 is a wall"}, status=status)
+    fake.answer = web.json_response({"error": "cell 9 is a wall"}, status=status)
     with pytest.raises(error, match="cell 9 is a wall"):
         await StationClient(session, str(server.make_url("/"))).set_blocked(9, blocked=True)
 
 
 async def test_answer_that_is_not_a_state_is_refused(
-    played: Played, server: TestServer, session: aiohttp.ClientSession
+    fake: FakeServer, server: TestServer, session: aiohttp.ClientSession
 ) -> None:
-    played.answer = web.json_response({"robots": 3})
+    fake.answer = web.json_response({"robots": 3})
     with pytest.raises(RequestRefusedError, match="is not a fleet's state"):
         await StationClient(session, str(server.make_url("/"))).fleet()
 
@@ -121,12 +121,12 @@ async def test_unreachable_server_is_an_error(server: TestServer, session: aioht
         await read_engine_totals(url, "u", "p")
 
 
-async def test_totals_are_summed_and_the_token_is_revoked(played: Played, server: TestServer) -> None:
+async def test_totals_are_summed_and_the_token_is_revoked(fake: FakeServer, server: TestServer) -> None:
     assert await read_engine_totals(str(server.make_url("/")), "u", "p") == MessageTotals(7, 1)
-    assert played.heard == [("logout", "Bearer abc")]
+    assert fake.requests == [("logout", "Bearer abc")]
 
 
-async def test_a_refused_login(played: Played, server: TestServer) -> None:
-    played.answer = web.json_response({"error": "wrong"}, status=401)
+async def test_a_refused_login(fake: FakeServer, server: TestServer) -> None:
+    fake.answer = web.json_response({"error": "wrong"}, status=401)
     with pytest.raises(DemoError, match="401"):
         await read_engine_totals(str(server.make_url("/")), "u", "p")
