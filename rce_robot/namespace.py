@@ -14,17 +14,18 @@ from typing import TYPE_CHECKING, Any, Protocol
 import msgspec
 
 from rce.aio.queues import OverflowPolicy
-from rce.control.model import EndpointState, EndpointStatus, EndpointUsage, InterfaceUsage, StatusPatch
+from rce.control.model import EndpointUsage, InterfaceUsage
 from rce.guard.holdings import Holdings
 from rce.link import Endpoint, InterfaceError
 from rce.model.names import EndpointId, InterfaceType
 from rce_robot.exceptions import MisdirectedError
 from rce_robot.interfaces import make_interface
+from rce_robot.reporting import RobotReporter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
 
-    from rce.control.model import EndpointSpec, LinkAddress, SpecPatch
+    from rce.control.model import EndpointSpec, EndpointStatus, LinkAddress, SpecPatch, StatusPatch
     from rce.guard.budget import Ledger
     from rce.guard.holdings import Holding
     from rce.link import Interface, LinkHub, Port
@@ -91,11 +92,6 @@ class Namespace:
     ) -> None:
         self.id = id
         self.revision = 0
-        self._address = address
-        self._number = 0
-        """Of the last report to the master."""
-        self._told_session: DoorSession | None = None
-        """The session at that time."""
         self.session: DoorSession | None = None
         """The session from handshake to end, also while it cannot send (yet, or any more)."""
         self.dropped: Counter[str] = Counter()
@@ -113,13 +109,14 @@ class Namespace:
         self._endpoint = Endpoint(
             id, self._make, hub, on_change=self._changed, on_fault=self._failed, on_growth=self._account.note
         )
+        self._reporter = RobotReporter(self._endpoint, address)
 
     async def apply(self, spec: EndpointSpec) -> None:
         """Make interfaces and connections as desired; an older revision than the applied one is ignored."""
         async with self._applying:
             if spec.revision >= self.revision:
-                self.revision = spec.revision
                 await self._endpoint.apply(spec)
+                self.revision = spec.revision
         self._changed()
 
     async def patch(self, patch: SpecPatch) -> bool:
@@ -128,8 +125,8 @@ class Namespace:
             if patch.revision > self.revision:
                 if patch.base != self.revision:
                     return False
-                self.revision = patch.revision
                 await self._endpoint.patch(patch)
+                self.revision = patch.revision
         self._changed()
         return True
 
@@ -143,43 +140,11 @@ class Namespace:
 
     def status(self) -> EndpointStatus:
         """Return all that the master is told."""
-        return msgspec.structs.replace(
-            self._header(),
-            interfaces=dict(self._endpoint.interfaces),
-            connections=tuple(self._endpoint.connections),
-        )
-
-    def _header(self) -> EndpointStatus:
-        """Return a status without interfaces and connections."""
-        return EndpointStatus(
-            id=str(self.id),
-            revision=self.revision,
-            state=EndpointState.RUNNING if self.session is not None else EndpointState.ABSENT,
-            address=self._address,
-            client=self.session.client if self.session is not None else "",
-            number=self._number,
-        )
+        return self._reporter.whole(self.revision, self.session)
 
     def next_status(self, *, in_patches: bool) -> EndpointStatus | StatusPatch:
-        """Return what the master is to be told next.
-
-        Args:
-            in_patches: Whether it takes what changed. It still gets all when the robot came or left: it
-                forgets what it knew then.
-        """
-        self._number += 1
-        news = self._endpoint.take_news()
-        if not in_patches or self._number == 1 or self._told_session is not self.session:
-            self._told_session = self.session
-            return self.status()
-        header = self._header()
-        return StatusPatch(
-            status=msgspec.structs.replace(
-                header, interfaces=news.interfaces, connections=tuple(news.connections)
-            ),
-            removed_interfaces=tuple(news.removed_interfaces),
-            lost_connections=tuple(news.lost_connections),
-        )
+        """Return what the master is to be told next, ``in_patches`` if it takes those."""
+        return self._reporter.next(self.revision, self.session, in_patches=in_patches)
 
     def usage(self) -> EndpointUsage:
         """Return the counters of the interfaces that were used.

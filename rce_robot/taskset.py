@@ -316,11 +316,7 @@ class RobotTaskSet:
             Usage(
                 cpu_s=cpu_seconds(),
                 memory=resident_bytes(),
-                endpoints={
-                    str(id_): usage
-                    for id_, namespace in self._namespaces.items()
-                    if (usage := namespace.usage()).interfaces
-                },
+                endpoints={str(id_): namespace.usage() for id_, namespace in self._namespaces.items()},
                 held=self._ledger.total,
                 shed=self._ledger.shed,
                 turned_away=self._lobby.turned_away + self._hub.lobby.turned_away,

@@ -317,7 +317,7 @@ async def test_a_robot_that_stops_reading_harms_itself_only(dial: Dial, robot_of
 
         def dropped() -> bool:
             usage = cloud.master.usage
-            found = usage.endpoints["testUser/stalled"].interfaces["image"] if usage else None
+            found = usage.endpoints["testUser/stalled"].interfaces.get("image") if usage else None
             return found is not None and found.dropped > 10
 
         await cloud.master.changed.until(dropped)
