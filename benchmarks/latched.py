@@ -9,7 +9,7 @@ from typing import Any
 from benchmarks.engine import RunningEngine, pss
 from benchmarks.figures import percentile
 from benchmarks.wire import STRING, serialized_string
-from rce_client import Connection, Publisher
+from rce_client import Connection, Publisher, Serialized
 
 SIZE = 4_000_000
 """Bytes of a map of 2000 x 2000 cells."""
@@ -45,7 +45,7 @@ async def run(running: RunningEngine, *, passes: int) -> list[dict[str, Any]]:
 
 
 async def _come_late(
-    running: RunningEngine, source: Publisher[bytes], count: int, name: str
+    running: RunningEngine, source: Publisher[Serialized], count: int, name: str
 ) -> tuple[float, float, int]:
     """Connect a robot, and its interface with the source's.
 
@@ -55,7 +55,7 @@ async def _come_late(
     times: list[float] = []
     done = asyncio.Event()
 
-    def take(_: bytes) -> None:
+    def take(_: Serialized) -> None:
         times.append(perf_counter())
         if len(times) == count:
             done.set()

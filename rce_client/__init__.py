@@ -13,6 +13,7 @@ from rce_client.exceptions import (
     UnavailableError,
     UntrustedError,
 )
+from rce_client.own_interfaces import Json, Serialized
 from rce_client.services import ServiceClient, ServiceProvider
 from rce_client.topics import Publisher, Subscriber
 
@@ -23,10 +24,12 @@ __all__ = [
     "Connection",
     "InUseError",
     "InterfaceError",
+    "Json",
     "LostError",
     "NotConnectedError",
     "Publisher",
     "RefusedError",
+    "Serialized",
     "ServiceClient",
     "ServiceProvider",
     "State",

@@ -20,6 +20,8 @@ InterfaceT = TypeVar("InterfaceT", bound="ClientInterface")
 
 Json = dict[str, Any]
 """A message as an object of its fields; binary values are bytes-like."""
+Serialized = bytes | bytearray | memoryview
+"""A serialized ROS message. One that was received is a memoryview of the frame it came in: not a copy."""
 
 
 class OwnInterfaces:
@@ -36,7 +38,9 @@ class OwnInterfaces:
     @overload
     async def publisher(self, tag: str, message_type: str) -> Publisher[Json]: ...
     @overload
-    async def publisher(self, tag: str, message_type: str, *, raw: Literal[True]) -> Publisher[bytes]: ...
+    async def publisher(
+        self, tag: str, message_type: str, *, raw: Literal[True]
+    ) -> Publisher[Serialized]: ...
     async def publisher(self, tag: str, message_type: str, *, raw: bool = False) -> Publisher[Any]:
         """Make an interface of this robot that sends messages.
 
@@ -78,12 +82,12 @@ class OwnInterfaces:
         self,
         tag: str,
         message_type: str,
-        callback: Callable[[bytes], Awaitable[None] | None] | None = None,
+        callback: Callable[[Serialized], Awaitable[None] | None] | None = None,
         *,
         raw: Literal[True],
         queue_size: int = ...,
-        latches: LatchListener[bytes] | None = ...,
-    ) -> Subscriber[bytes]: ...
+        latches: LatchListener[Serialized] | None = ...,
+    ) -> Subscriber[Serialized]: ...
     async def subscriber(
         self,
         tag: str,
@@ -103,7 +107,7 @@ class OwnInterfaces:
             message_type: Message type, ``package/Type``.
             callback: Takes the messages. A plain function must not block; a coroutine function is awaited
                 before the next message. Without a callback, iterate over the subscriber.
-            raw: Messages are serialized ROS messages, as for :meth:`publisher`.
+            raw: Messages are serialized ROS messages, as for :meth:`publisher`, each a memoryview.
             queue_size: How many messages wait for a coroutine function or an iteration; then the oldest is
                 dropped.
             latches: Takes the latched messages in place of the callback, if the engine tells which they are.
@@ -139,7 +143,7 @@ class OwnInterfaces:
     @overload
     async def service_client(
         self, tag: str, message_type: str, *, raw: Literal[True]
-    ) -> ServiceClient[bytes]: ...
+    ) -> ServiceClient[Serialized]: ...
     async def service_client(self, tag: str, message_type: str, *, raw: bool = False) -> ServiceClient[Any]:
         """Make an interface of this robot that calls a service.
 
@@ -148,7 +152,8 @@ class OwnInterfaces:
         Args:
             tag: Interface tag.
             message_type: Service type, ``package/Type``.
-            raw: Requests and answers are serialized ROS messages, as for :meth:`publisher`.
+            raw: Requests and answers are serialized ROS messages, as for :meth:`publisher`; received ones
+                are memoryviews.
 
         Raises:
             InterfaceError: This program has an interface of this tag already.
@@ -179,11 +184,11 @@ class OwnInterfaces:
         self,
         tag: str,
         message_type: str,
-        handler: Callable[[bytes], Awaitable[bytes] | bytes],
+        handler: Callable[[Serialized], Awaitable[Serialized] | Serialized],
         *,
         raw: Literal[True],
         max_calls: int = ...,
-    ) -> ServiceProvider[bytes]: ...
+    ) -> ServiceProvider[Serialized]: ...
     async def service_provider(
         self,
         tag: str,
@@ -202,7 +207,8 @@ class OwnInterfaces:
             message_type: Service type, ``package/Type``.
             handler: Takes a request and returns the answer. A plain function must not block; coroutine
                 functions run side by side. What it raises is logged, and its text is the caller's error.
-            raw: Requests and answers are serialized ROS messages, as for :meth:`publisher`.
+            raw: Requests and answers are serialized ROS messages, as for :meth:`publisher`; received ones
+                are memoryviews.
             max_calls: How many calls are answered at a time; callers of more get an error.
 
         Raises:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rce.ros.node import Publisher as RosPublisher
     from rce.ros.types import TypeRegistry
     from rce_client.connection import Connection
+    from rce_client.own_interfaces import Serialized
     from rce_client.ros_bridge.plan import Plan, Span
     from rce_client.topics import Publisher
 
@@ -88,7 +89,7 @@ async def lay(span: Span, conn: Connection, node: Node) -> None:
         case Role.SERVICE_CLIENT:
             service = node.service_client(span.addr, span.message_type)
 
-            async def ask_robot(request: bytes) -> bytes:
+            async def ask_robot(request: Serialized) -> bytes:
                 return bytes(await service.call_serialized(request, timeout=CALL_TIMEOUT))
 
             await conn.service_provider(span.tag, span.message_type, ask_robot, raw=True)
@@ -109,7 +110,7 @@ class Uplink:
         publisher: Its interface.
     """
 
-    def __init__(self, conn: Connection, publisher: Publisher[bytes]) -> None:
+    def __init__(self, conn: Connection, publisher: Publisher[Serialized]) -> None:
         self._conn = conn
         self._publisher = publisher
         self._names: dict[str, str] = {}
@@ -146,11 +147,11 @@ class Downlink:
     def __init__(self, publisher: RosPublisher) -> None:
         self._publisher = publisher
 
-    def received(self, payload: bytes) -> None:
+    def received(self, payload: Serialized) -> None:
         """Publish a message."""
         self._publisher.publish_serialized(payload)
 
-    def received_latched(self, message: bytes, source: str) -> None:
+    def received_latched(self, message: Serialized, source: str) -> None:
         """Publish a message, and keep it for nodes that subscribe later."""
         self._publisher.publish_serialized(message, latch=True, source=source)
 

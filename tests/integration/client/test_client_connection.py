@@ -11,6 +11,7 @@ from support.cloud import PASSWORD
 
 from rce.link import PeerFaultError
 from rce.protocol import codec
+from rce_client import Serialized
 from rce_client.connection import Connection, State
 from rce_client.exceptions import (
     CallError,
@@ -72,7 +73,7 @@ async def test_restarted_program_gets_the_latched_message(engine: Engine) -> Non
 
 
 async def test_raw_publisher_and_subscriber(engine: Engine) -> None:
-    got: asyncio.Queue[bytes] = asyncio.Queue()
+    got: asyncio.Queue[Serialized] = asyncio.Queue()
     async with engine.connection() as conn:
         publisher = await conn.publisher("say", STRING, raw=True)
         await conn.subscriber("hear", STRING, got.put_nowait, raw=True)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rce_client.services import ServiceClient
+from rce_client import Serialized
 from rce_robot.doors.client import gate
 from rce_robot.doors.client.websocket import RobotSocket
 
@@ -44,7 +44,7 @@ async def test_raw_topics_and_services(engine: Engine, monkeypatch: pytest.Monke
         monkeypatch.setattr(gate, "read_features", lambda _query: frozenset())
     got: asyncio.Queue[bytes] = asyncio.Queue()
 
-    async def reverse(request: bytes) -> bytes:
+    async def reverse(request: Serialized) -> bytes:
         return bytes(request)[::-1]
 
     async def double(payload: bytes) -> bytes:
@@ -54,7 +54,7 @@ async def test_raw_topics_and_services(engine: Engine, monkeypatch: pytest.Monke
         assert conn.takes_single_frames is known
         publisher = await conn.publisher("say", STRING, raw=True)
         await conn.subscriber("hear", STRING, lambda message: got.put_nowait(bytes(message)), raw=True)
-        client: ServiceClient[bytes] = await conn.service_client("ask", ECHO, raw=True)
+        client = await conn.service_client("ask", ECHO, raw=True)
         await conn.service_provider("serve", ECHO, reverse, raw=True)
         for tag in ("say", "hear", "ask", "serve"):
             await conn.wait_active(tag, 30)
