@@ -1,8 +1,8 @@
 """The task set's side of the control channel: dials the master indefinitely.
 
-One task, :meth:`TaskSetChannel.run`, owns everything. A connection starts with ``Hello``, which says all that
-is there, so nothing needs to be kept while there is none. Requests are kept until they are answered: they are
-idempotent, and are sent again on the next connection.
+One task, :meth:`TaskSetChannel.run`, owns everything. A connection starts with ``Hello``, which has the whole
+state of the task set, so the channel keeps no reports while it is not connected. It keeps requests until they
+are answered: they are idempotent, and are sent again on the next connection.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ Reply = TypeVar("Reply", LoginReply, ClientReply)
 
 
 class _RefusedError(Exception):
-    """The master said no."""
+    """The master refused the connection."""
 
 
 class _Pending:
@@ -81,7 +81,7 @@ class TaskSetChannel:
     Args:
         url: Where the master is, ``ws://host:8080`` (or ``wss://``); several are dialed in turn.
         secret: Proves that this is a task set of the same engine.
-        hello: Makes the first message of every connection: all that is there now.
+        hello: Makes the first message of every connection: the current state of the task set.
         handler: Called with each message of the master but the answers to requests; one after the other, in
             order, and never cancelled by a lost connection. An exception from it is logged, and after a
             while the master is dialed again so that it says everything again.
@@ -127,7 +127,7 @@ class TaskSetChannel:
         await self._welcomed.wait()
 
     def send(self, message: ToMaster) -> None:
-        """Send a message; it is dropped while there is no connection, as ``Hello`` will say it all again."""
+        """Send a message. Without a connection it is dropped: the next ``Hello`` has the whole state."""
         if self._outbox is None:
             return
         try:
@@ -184,7 +184,7 @@ class TaskSetChannel:
             type: ``CC``, ``RC``, ``DC``, ``CN`` or ``CX``.
             data: As the client sent it; for a master that does not know
                 :data:`rce.control.messages.TYPED_REQUESTS`.
-            content: What it asks for, for one that does.
+            content: The request, for a master that does.
 
         Raises:
             MasterUnavailableError: No answer in time.
@@ -268,7 +268,7 @@ class TaskSetChannel:
         return self._pauses.next()
 
     def _tell(self, error: Exception) -> None:
-        """Log why there is no connection: plainly at first, and whenever the reason is another one."""
+        """Log why the connection failed: as a warning at first, and whenever the reason changes."""
         why = explain_to_client(error)
         words = why or str(error) or "no answer in time"
         level = logging.INFO if why is None else logging.ERROR
@@ -359,7 +359,7 @@ class TaskSetChannel:
                 self._abort("a message from the master failed")
 
     def _abort(self, reason: str) -> None:
-        """Cut the connection off; the next one starts with Hello."""
+        """Abort the connection; the next one starts with Hello."""
         _log.warning("dialing the master again: %s", reason)
         if self._socket is not None:
             self._socket.transport.abort()

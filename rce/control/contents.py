@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from rce.tls.identity import Context
 
     ReadContent = Callable[[str, int, int], Awaitable[tuple[bytes, int] | None]]
-    """Gives a piece (hash, offset, bytes) and the size of the whole; None if there is no such content."""
+    """Returns a piece (hash, offset, bytes) and the size of the whole; None if the content does not exist."""
 
 PIECE = 512 << 10
 """Bytes."""
@@ -52,7 +52,7 @@ def is_for_contents(path: str) -> bool:
 
 
 async def answer(request: Request, read: ReadContent) -> Response:
-    """Answer a request for a piece; whoever calls this has checked the secret."""
+    """Answer a request for a piece. The caller has checked the secret."""
     found = _PATH.fullmatch(request.path)
     start = _FROM.fullmatch(",".join(request.headers.get_all("Range")) or "bytes=0-")
     if found is None or start is None:

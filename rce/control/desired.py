@@ -1,4 +1,4 @@
-"""What is desired of one endpoint, kept part by part, so that a change costs what it changes. Pure."""
+"""The desired state of one endpoint, kept part by part: a change costs only what it changes. Pure."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Fit(Enum):
     """How a patch relates to what is there."""
 
     OLD = "old"
-    """What it says is known already."""
+    """Its changes are known already."""
     NEXT = "next"
     """It can be applied."""
     GAP = "gap"
@@ -84,7 +84,7 @@ class DesiredState:
 
     @property
     def whole(self) -> EndpointSpec:
-        """All that is desired."""
+        """The whole desired state."""
         contents = self.contents
         return EndpointSpec(
             id=self.id,

@@ -1,4 +1,4 @@
-"""What processes use and machines have, as task sets report it, and what the master assumes of it.
+"""Resources of processes and machines, as task sets report them, and what the master assumes about them.
 
 The kernel is asked directly: a library for it would cost each task set 4 MB.
 """
@@ -10,9 +10,9 @@ import time
 from pathlib import Path
 
 MEGABYTE = 1 << 20
-"""What is called MB where memory is spoken of: bytes."""
+"""Bytes of 1 MB, wherever memory is given in MB."""
 MIN_MEMORY = 32 * MEGABYTE
-"""A container cannot live with less memory (bytes): its environment alone needs most of this."""
+"""Least memory of a container (bytes): its environment alone needs most of this."""
 MEMORY_PER_SLOT = 64 * MEGABYTE
 """A machine offers one slot for so many bytes of its memory, unless its operator says otherwise."""
 

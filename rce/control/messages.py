@@ -1,9 +1,9 @@
 """The messages on the control channel (JSON text frames, tagged by ``t``).
 
 A task set dials the master and sends :class:`Hello`. The master answers :class:`Welcome` and
-:class:`Sync` with all that it desires there, and from then on single :class:`Put`, :class:`PatchSpec` and
-:class:`Drop`. Reports go the same way: what is there in ``Hello``, then :class:`Status` and
-:class:`PatchStatus`. Who gets a patch that does not fit what it has asks for the whole.
+:class:`Sync` with the whole desired state of the task set; later it sends single :class:`Put`,
+:class:`PatchSpec` and :class:`Drop`. Reports work the same way: the whole state in ``Hello``, then
+:class:`Status` and :class:`PatchStatus`. A receiver whose state does not fit a patch asks for the whole.
 Messages with a ``request`` number are answered by the reply with the same number.
 
 Programs of two releases that follow each other talk to one another: the master takes task sets of this
@@ -95,7 +95,7 @@ class Hello(_Message, frozen=True, kw_only=True, omit_defaults=True):
     address: LinkAddress = LinkAddress()
     """Robot task sets: where links to any of its robots are accepted."""
     endpoints: tuple[EndpointStatus, ...] = ()
-    """All that is there now."""
+    """The current status of every endpoint."""
     bearer: bool = False
     """Robot task sets: whether robots may show their credential in the header ``Authorization``."""
     features: tuple[str, ...] = ()
@@ -110,7 +110,7 @@ class Status(_Message, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class PatchStatus(_Message, frozen=True, kw_only=True, omit_defaults=True):
-    """An endpoint changed in this. Only to masters with the feature :data:`rce.control.model.PATCHES`."""
+    """The changes of an endpoint. Only to masters with the feature :data:`rce.control.model.PATCHES`."""
 
     patch: StatusPatch
 
@@ -122,14 +122,14 @@ class SpecWanted(_Message, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Gone(_Message, frozen=True, kw_only=True, omit_defaults=True):
-    """A dropped endpoint is gone with all that belonged to it."""
+    """A dropped endpoint and everything that belonged to it was removed."""
 
     id: str
     revision: int
 
 
 class Fault(_Message, frozen=True, kw_only=True, omit_defaults=True):
-    """Something failed that the endpoint's user must know of; becomes an ``ER`` and an event."""
+    """A failure that the endpoint's user must know of; becomes an ``ER`` and an event."""
 
     id: str
     text: str
@@ -148,7 +148,7 @@ class Usage(_Message, frozen=True, kw_only=True, omit_defaults=True):
     shed: int = 0
     """How often a user held too much, and lost the oldest of it."""
     turned_away: int = 0
-    """Connections that were closed because too many did not say who they are."""
+    """Connections that were closed because too many had not authenticated."""
 
 
 class Login(_Message, frozen=True, kw_only=True, omit_defaults=True):
@@ -185,7 +185,7 @@ class ClientRequest(_Message, frozen=True, kw_only=True, omit_defaults=True):
     data: Any
     """As the client sent it, for masters of the release before; else None."""
     content: Request | None = None
-    """What it asks for; for masters whose ``features`` name :data:`TYPED_REQUESTS`."""
+    """The request; for masters whose ``features`` name :data:`TYPED_REQUESTS`."""
 
 
 class LogChunk(_Message, frozen=True, kw_only=True, omit_defaults=True):
@@ -223,19 +223,19 @@ class Refused(_Message, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Sync(_Message, frozen=True, kw_only=True, omit_defaults=True):
-    """All that is desired at this task set; what else is there is to be removed."""
+    """The whole desired state of this task set; it removes everything else."""
 
     endpoints: tuple[EndpointSpec, ...]
 
 
 class Put(_Message, frozen=True, kw_only=True, omit_defaults=True):
-    """One endpoint is desired like this. An older revision than the one applied is ignored."""
+    """The desired state of one endpoint. A revision older than the applied one is ignored."""
 
     endpoint: EndpointSpec
 
 
 class PatchSpec(_Message, frozen=True, kw_only=True, omit_defaults=True):
-    """What is desired of one endpoint changed in this.
+    """The changes of one endpoint's desired state.
 
     Only to task sets with the feature :data:`rce.control.model.PATCHES`.
     """
@@ -265,7 +265,7 @@ class Notify(_Message, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Probe(_Message, frozen=True, kw_only=True, omit_defaults=True):
-    """Find out whether a robot is still there: it logs in elsewhere. One that is not is :class:`Left`."""
+    """Check whether a robot is still connected: it logs in elsewhere. If not, the answer is :class:`Left`."""
 
     id: str
 

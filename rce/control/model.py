@@ -1,9 +1,9 @@
-"""What the master desires of an endpoint and what a task set reports of it.
+"""The desired state of an endpoint, from the master, and its status, from a task set.
 
 An *endpoint* is a robot or a container. The master sends its :class:`EndpointSpec`, with a growing revision,
 to the task set where it is placed: whole at first, then what changed (:class:`SpecPatch`). The task set
-compares it with what is there and makes up the difference. Applying the same twice changes nothing. What is
-observed goes the other way in the same forms: :class:`EndpointStatus`, then :class:`StatusPatch`.
+compares it with the actual state and reconciles the two. Applying the same spec twice changes nothing. The
+status goes the other way in the same forms: :class:`EndpointStatus`, then :class:`StatusPatch`.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ class LinkAddress(Struct, frozen=True, kw_only=True, omit_defaults=True):
 class LinkSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """One end of a link to a peer endpoint. Exactly one of the two ends has ``dial`` set.
 
-    The link of an endpoint with itself is here once, and nobody dials it.
+    The link of an endpoint with itself is listed once, and neither end dials it.
     """
 
     id: str
     peer: str
     """The peer's endpoint id, ``user/tag``."""
     token: str
-    """A secret that the master gave both ends; the dialing end proves with it who it is."""
+    """A secret that the master gave both ends; the dialing end authenticates with it."""
     dial: bool
     address: LinkAddress = LinkAddress()
     """Where to dial; empty while the peer is not up (yet)."""
@@ -76,7 +76,7 @@ class EndpointKind(Enum):
 
 
 class EndpointSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """All that the master desires of one endpoint."""
+    """The whole desired state of one endpoint."""
 
     id: str
     kind: EndpointKind
@@ -121,7 +121,7 @@ class SpecPatch(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class NodeState(Enum):
-    """Where a node is in its life."""
+    """The state of a node in its life cycle."""
 
     WAITING = "waiting"
     """Not started (again) yet: nodes that it comes after are not ready, or it ended and pauses."""
@@ -130,7 +130,7 @@ class NodeState(Enum):
     RUNNING = "running"
     """Registered with the container's ROS core."""
     STUCK = "stuck"
-    """Runs, but its heartbeat stays away."""
+    """Runs, but sends no heartbeat."""
     STOPPING = "stopping"
     """Told to end."""
     EXITED = "exited"
@@ -153,7 +153,7 @@ class NodeStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class EndpointState(Enum):
-    """Where an endpoint is in its life, as its task set sees it."""
+    """The state of an endpoint in its life cycle, as its task set sees it."""
 
     STARTING = "starting"
     RUNNING = "running"
@@ -167,7 +167,7 @@ class EndpointState(Enum):
 
 
 class EndpointStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """All that a task set reports of one endpoint."""
+    """The whole status of one endpoint, as a task set reports it."""
 
     id: str
     revision: int
@@ -183,9 +183,9 @@ class EndpointStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Ids of the established connections."""
     address: LinkAddress = LinkAddress()
     client: str = ""
-    """From where a robot is connected, and since when, in words for its user; robots only."""
+    """From where and since when a robot is connected, as a text for its user; robots only."""
     number: int = 0
-    """Counts the reports of this endpoint; each patch has the number after that of what it fits."""
+    """Counts the reports of this endpoint; a patch has the number after that of the status it fits."""
 
 
 class StatusPatch(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -233,11 +233,11 @@ class EndpointUsage(Struct, frozen=True, kw_only=True, omit_defaults=True):
     memory: int = 0
     """Bytes in use."""
     memory_peak: int = 0
-    """Bytes, the most since the start; 0 if nobody counts."""
+    """Bytes, the most since the start; 0 if it is not measured."""
     memory_limit: int = 0
-    """Bytes; 0 if there is no limit."""
+    """Bytes; 0 without a limit."""
     cpu_limit: float = 0.0
-    """Cores; 0 if there is no limit."""
+    """Cores; 0 without a limit."""
     oom_kills: int = 0
     """Processes that were killed because memory ran out."""
     io_read: int = 0

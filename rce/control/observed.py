@@ -1,4 +1,4 @@
-"""What is observed of one endpoint, kept part by part, so that a change costs what it changes. Pure."""
+"""The observed status of one endpoint, kept part by part: a change costs only what it changes. Pure."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class ObservedStatus:
     """The status of one endpoint.
 
     Args:
-        status: What was reported at first.
+        status: The first report.
         max_parts: How many interfaces, and how many connections, are kept at most; others are left out.
 
     Attributes:
@@ -27,7 +27,7 @@ class ObservedStatus:
 
     @property
     def whole(self) -> EndpointStatus:
-        """All that is known."""
+        """The whole status."""
         return replace(
             self.header, interfaces=dict(self._interfaces), connections=tuple(sorted(self._connections))
         )

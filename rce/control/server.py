@@ -61,21 +61,21 @@ STRANGERS_PER_ADDRESS = PER_ADDRESS
 """Connections from one address that have not shown the secret yet."""
 
 PROOF_CHECK_S = 1.0
-"""How often it is looked whether the secrets and certificates that were shown are still accepted."""
+"""Seconds between checks whether the secrets and certificates of connected task sets are still accepted."""
 
 _GARBAGE, _POLICY, _INTERNAL, _GOING_AWAY = 1007, 1008, 1011, 1001
 _MAX_REASON = 123  # bytes of a WebSocket close frame's reason
 
 
 class ControlServer:
-    """Takes task sets in. An async context manager: listens inside.
+    """Accepts task sets. An async context manager: listens inside.
 
-    Callbacks are awaited one after the other for each peer, so a slow one slows that peer only. What they
-    raise is logged and ends that peer's connection, nothing else.
+    Callbacks are awaited one after the other for each peer, so a slow one slows that peer only. An exception
+    from a callback is logged and ends only that peer's connection.
 
     Args:
         secret: What task sets must prove to have.
-        on_hello: A task set came. What it sends to the peer follows ``Welcome``. May raise
+        on_hello: A task set connected. Messages that it sends to the peer follow ``Welcome``. May raise
             :class:`PeerRefusedError`; then no other callback is called for that peer.
         on_message: A task set sent something (answers to :meth:`Peer.read_log` are not passed on).
         on_gone: A task set that ``on_hello`` took has left, however it ended.
@@ -124,7 +124,7 @@ class ControlServer:
         self._timeouts = timeouts
         self._peers: dict[str, Peer] = {}
         self._shown: WeakKeyDictionary[ServerConnection, str] = WeakKeyDictionary()
-        """What each task set that is connected proved itself by."""
+        """The credential of each connected task set."""
         self._watcher: asyncio.Task[None] | None = None
         self._server: Server | None = None
 
@@ -152,7 +152,7 @@ class ControlServer:
             self._port,
             process_request=self._admit,
             create_connection=behind_gate(connection, self._gate),
-            origins=[None],  # no browser's page has any business here
+            origins=[None],  # pages in browsers must not connect here
             compression=None,
             open_timeout=self._timeouts.open,
             ping_interval=self._timeouts.ping_interval,
