@@ -1,4 +1,4 @@
-"""Service calls: who waits for an answer, and who works on one."""
+"""Service calls: those that wait for an answer, and those that are being served."""
 
 from __future__ import annotations
 
@@ -57,19 +57,19 @@ class PendingCalls:
         return self._answers.pop(call_id, None) is not None
 
     def answer(self, call_id: int, payload: bytes) -> None:
-        """Hand an answer to who waits for it, if somebody still does."""
+        """Hand an answer to its caller, if the caller still waits."""
         answer = self._answers.pop(call_id, None)
         if answer is not None and not answer.done():
             answer.set_result(payload)
 
     def fail(self, call_id: int, error: Exception) -> None:
-        """Hand an error to who waits for the answer, if somebody still does."""
+        """Fail a call with an error, if its caller still waits."""
         answer = self._answers.pop(call_id, None)
         if answer is not None and not answer.done():
             answer.set_exception(error)
 
     def fail_all(self, make_error: Callable[[], Exception]) -> None:
-        """Hand an error to everybody who waits."""
+        """Fail every waiting call with an error."""
         for call_id in list(self._answers):
             self.fail(call_id, make_error())
 
@@ -80,7 +80,7 @@ class CallServer:
     A request is held until it has been answered. When memory is short, the oldest is answered with a fault.
 
     At most :attr:`LinkLimits.serving` requests are served at a time; :attr:`LinkLimits.waiting` more wait in
-    order, and what comes then is answered with a fault at once.
+    order, and later ones are answered with a fault at once.
     """
 
     def __init__(
@@ -167,7 +167,7 @@ class CallServer:
                 channel.reply(call_id, answer)
 
     def _finish(self, channel: Channel, call_id: int) -> bool:
-        """Take note that a request was served; false if nobody waits for its answer any more."""
+        """Take note that a request was served; return false if its caller no longer waits."""
         if self._serving.get((channel, call_id)) is not asyncio.current_task():
             return False
         del self._serving[channel, call_id]

@@ -1,4 +1,4 @@
-"""What carries the frames of a link: a socket, or a pair of objects in one process."""
+"""Carriers of a link's frames: a socket, or a pair of objects in one process."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _TURN = 1 << 20
 
 
 class CarrierHandler(Protocol):
-    """Who takes what a carrier brings."""
+    """Receives the frames and the end of a carrier."""
 
     def frame_received(self, frame: Frame) -> None:
         """Take a frame of the peer.
@@ -98,7 +98,7 @@ class Carrier(ABC):
 
     @abstractmethod
     def abort(self, reason: Exception) -> None:
-        """End the carrier at once; who handles the frames is told the reason in a later step."""
+        """End the carrier at once; its handler is told the reason in a later step of the event loop."""
 
     @abstractmethod
     def close(self) -> None:
@@ -106,15 +106,15 @@ class Carrier(ABC):
 
     @abstractmethod
     async def wait_closed(self) -> None:
-        """Wait until the carrier has ended and holds nothing any more."""
+        """Wait until the carrier has ended and has released everything."""
 
 
 class LocalCarrier(Carrier):
     """One half of a link between two endpoints of one process.
 
     Payloads are handed over as they are. Delivery is a later step of the event loop, so that interfaces which
-    answer at once cannot recurse. A step takes what lay there when it began, up to 1 MB or one larger
-    message, so that two of them cannot hold the loop.
+    answer at once cannot recurse. A step delivers the messages that were there when it began, up to 1 MB or
+    one larger message, so that two halves cannot block the loop.
     """
 
     kind = "local"

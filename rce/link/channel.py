@@ -135,7 +135,7 @@ class Channel:
             carrier.send(self._queue, Frame(FrameType.DATA, self.number, source, flags, payload))
 
     def send_sources(self, sources: Collection[int]) -> None:
-        """Tell the peer which sources' latched messages are in force, after all that was sent before."""
+        """Tell the peer which sources' latched messages are in force, after everything sent before."""
         carrier = self.link.carrier
         if self.established and carrier is not None and LATCH in carrier.features:
             carrier.send(self._queue, encode_sources(self.number, sources))
@@ -174,7 +174,7 @@ class Channel:
             self.fault(call_id, error)
 
     def fault(self, call_id: int, error: Exception) -> None:
-        """Answer a request with what went wrong."""
+        """Answer a request with a fault."""
         carrier = self.link.carrier
         if carrier is not None:
             text = (str(error) or type(error).__name__).encode(errors="replace")[:_MAX_FAULT]

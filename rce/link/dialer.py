@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _LONG_ENOUGH = 1.0
-"""A connection that lasted so many seconds was a good one: the next pause is a short one."""
+"""After a connection that lasted so many seconds, the next pause is short again."""
 
 
 async def keep_dialed(link: Link, hub: LinkHub) -> None:

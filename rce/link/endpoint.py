@@ -1,4 +1,4 @@
-"""A robot or a container: makes what its spec says, and keeps it so."""
+"""A robot or a container: reconciles its interfaces, links and connections with its spec."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Endpoint:
 
     def __init__(
         self,
-        id: EndpointId,  # noqa: A002 - what it is
+        id: EndpointId,  # noqa: A002 - the word of the wire format
         factory: InterfaceFactory,
         hub: LinkHub,
         *,
@@ -70,7 +70,7 @@ class Endpoint:
         self._channels = ChannelTable()
         self._desired = DesiredState(EndpointSpec(id=str(id), kind=EndpointKind.ROBOT, revision=-1))
         self._due = Difference()
-        """What of it may not be made yet."""
+        """The parts that may not be made yet."""
         self._news = WiringNews()
         self._backlog = Backlog(on_growth)
         self._holdings = Holdings(on_growth)
@@ -96,7 +96,7 @@ class Endpoint:
         return self._channels.established
 
     def take_news(self) -> WiringNews:
-        """Return what became of interfaces and connections since this was called last."""
+        """Return the changes of interfaces and connections since the last call."""
         news, self._news = self._news, WiringNews()
         for tag in news.changed_interfaces:
             slot = self._slots.get(tag)
@@ -133,7 +133,7 @@ class Endpoint:
         return self._backlog.bytes + self._holdings.bytes + unfinished
 
     def shed(self, size: int) -> None:
-        """Throw away what is held until ``size`` bytes are free, as far as there is anything to throw away.
+        """Drop held payloads until ``size`` bytes are free, or nothing is left to drop.
 
         First the oldest messages of topics, where most waits; then the oldest requests and latched messages.
         """
@@ -155,12 +155,12 @@ class Endpoint:
                 link.drop_unfinished(self.waiting_bytes - goal)
 
     async def apply(self, spec: EndpointSpec) -> None:
-        """Make up the difference between ``spec`` and what is there.
+        """Reconcile the actual state with ``spec``.
 
-        What is equal in both is not touched. Returns when what is no longer desired is gone, and what is new
-        has begun to be made: interfaces start and links are dialed in the background. An interface that
-        cannot be made or started is reported to ``on_fault`` and does not hinder the others; it is not tried
-        again before its spec changes.
+        Parts that are equal in both are not touched. Returns when the parts that are no longer desired are
+        gone and the creation of new ones has begun: interfaces start and links are dialed in the background.
+        An interface that cannot be made or started is reported to ``on_fault`` and does not affect the
+        others; it is not tried again before its spec changes.
 
         Raises:
             RuntimeError: The endpoint is closed.
@@ -275,7 +275,7 @@ class Endpoint:
         return carriers
 
     async def _close_slots(self, slots: list[InterfaceSlot]) -> None:
-        """Close interfaces, all at the same time; they are closed also if nobody waits for it any more."""
+        """Close interfaces, all at the same time; cancelling this does not stop the closing."""
         for slot in slots:
             del self._slots[slot.spec.tag]
             self._news.changed_interfaces[slot.spec.tag] = None
@@ -400,7 +400,7 @@ class Endpoint:
         self._changed()
 
     def _changed(self) -> None:
-        """Call ``on_change`` soon, once for all that changes until then."""
+        """Call ``on_change`` soon, once for all changes until then."""
         if self._notice is None and not self._closed:
             self._notice = asyncio.get_running_loop().call_soon(self._tell)
 

@@ -1,14 +1,14 @@
-"""What may go wrong on links.
+"""Errors of links.
 
 ::
 
     LinkError
     +-- ProtocolError             the peer broke the rules of the frames; the connection is dropped
-    +-- LinkRefusedError          the accepting end turned the dialing end away
+    +-- LinkRefusedError          the accepting end refused the dialing end
     +-- LinkLostError             the connection of a link ended
     +-- InterfaceError            an interface cannot be made or started as its spec says
     +-- CallError                 a service call got no answer
-        +-- NotConnectedError     there is no peer to ask
+        +-- NotConnectedError     no peer is connected
         +-- PeerFaultError        the peer answered with a fault
         +-- PeerLostError         the peer went away before it answered
         +-- CallTimeoutError      no answer in time
@@ -20,7 +20,7 @@ from __future__ import annotations
 
 
 class LinkError(Exception):
-    """Base of all that this package raises."""
+    """Base of all errors of this package."""
 
 
 class ProtocolError(LinkError):
@@ -28,7 +28,7 @@ class ProtocolError(LinkError):
 
 
 class LinkRefusedError(LinkError):
-    """The accepting end turned the dialing end away; the text is its reason."""
+    """The accepting end refused the dialing end; the text is its reason."""
 
 
 class LinkLostError(LinkError):
@@ -47,7 +47,7 @@ class CallError(LinkError):
 
 
 class NotConnectedError(CallError):
-    """There is no peer to ask."""
+    """No peer is connected."""
 
     def __str__(self) -> str:
         return super().__str__() or "not connected"

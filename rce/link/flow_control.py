@@ -1,9 +1,10 @@
 """How much may pass on one connection, when this end's endpoint or the peer's has a limit.
 
-Sending is simply paced. What comes in cannot be sorted any more once it lies in the kernel's buffers, so the
-limited end says in advance how far its peer may send: a GRANT frame holds an offset in the stream of bytes,
-counted from the connection's beginning. The peer's bulk waits there, in its own queues, which drop their own;
-its small messages continue. A peer that sends much more than was granted is not read from until that is paid.
+Sending is paced. Incoming bytes cannot be reordered once they are in the kernel's buffers, so the limited end
+says in advance how far its peer may send: a GRANT frame holds an offset in the stream of bytes, counted from
+the beginning of the connection. The peer's bulk messages wait in the peer's own queues, which drop the oldest
+of them when full; its small messages continue. A peer that sends much more than was granted is not read from
+until that is paid.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class Stream(Protocol):
         """Send what waits."""
 
     def pause_reading(self) -> None:
-        """Leave what comes in the kernel's buffers."""
+        """Leave incoming bytes in the kernel's buffers."""
 
     def resume_reading(self) -> None:
         """Take :meth:`pause_reading` back."""
@@ -66,7 +67,7 @@ class FlowControl:
 
     @property
     def open(self) -> bool:
-        """Whether there is no limit at all."""
+        """Whether neither end has a limit."""
         return self._pacer is None and self._allowed == _NO_LIMIT
 
     def pace(self, pacer: Pacer | None) -> None:
@@ -87,7 +88,7 @@ class FlowControl:
         """Take the peer's GRANT.
 
         Raises:
-            ProtocolError: It is none.
+            ProtocolError: The frame is not a GRANT.
         """
         if len(payload) != _OFFSET.size:
             raise ProtocolError("bad GRANT")
@@ -119,7 +120,7 @@ class FlowControl:
         return FRAGMENT_SIZE if self._pacer is None else self._pacer.part
 
     def count_received(self) -> None:
-        """Look at what has come; stop reading if it is far more than was granted."""
+        """Count incoming bytes; stop reading if they are far more than was granted."""
         pacer = self._pacer
         if pacer is None:
             return
@@ -133,7 +134,7 @@ class FlowControl:
         self._extend()
 
     def close(self) -> None:
-        """Wait for nothing any more."""
+        """Stop waiting for the limit."""
         if self._pacer is not None:
             for go in (self._extend, self._read_on, self._stream.go_on):
                 self._pacer.forget(go)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _BUSY_PAUSE = 0.1
-"""Seconds to wait after the system refused to accept, for want of file descriptors for example."""
+"""Seconds to wait after the system refused to accept, for example because file descriptors ran out."""
 _FD = array.array("i")
 
 
@@ -115,7 +115,7 @@ class HandoverReceiver:
             self._sock.close()
 
     def _read(self) -> None:
-        """Take all that has come."""
+        """Take every waiting connection."""
         while self._open:
             try:
                 received, descriptors = _receive(self._sock)
@@ -165,7 +165,7 @@ class LinkAcceptor:
         timeouts: Of links.
         limits: Of links.
         tls: Refuse links without TLS.
-        everything: Takes the links that nobody was assigned to, in place of refusing them.
+        everything: Takes the links that are not assigned to a sender; if None, they are refused.
 
     Attributes:
         lobby: Accepted connections that have not been handed over yet.
@@ -283,7 +283,7 @@ class LinkAcceptor:
             _log.info("a link was not handed over: %s", str(error) or type(error).__name__)
 
     async def _find(self, link: str) -> LinkSender:
-        """Return who takes a link; the news of it may still be on its way."""
+        """Return the sender of a link; its assignment may still be on its way."""
         if self._everything is not None:
             return self._everything
         try:

@@ -1,4 +1,4 @@
-"""How a link begins: HELLO, its answer, and what each end knows beyond the first version (sans-I/O)."""
+"""The handshake of a link: HELLO, its answer, and the features of each end (sans-I/O)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Hello(msgspec.Struct, frozen=True, kw_only=True):
     link: str
     token: str
     features: tuple[str, ...] = ()
-    """What the dialing end knows beyond the first version; unknown words mean nothing."""
+    """The dialing end's features beyond the first version; unknown words are ignored."""
 
 
 class Welcome(msgspec.Struct, frozen=True, kw_only=True):
@@ -27,7 +27,7 @@ class Welcome(msgspec.Struct, frozen=True, kw_only=True):
 LATCH = "latch"
 """Feature: latched messages name their source, and SOURCES takes back those of sources that ended."""
 FEATURES = (LATCH,)
-"""What is known here beyond the first version of links."""
+"""This end's features beyond the first version of links."""
 
 _hello_decoder = msgspec.json.Decoder(Hello)
 _welcome_decoder = msgspec.json.Decoder(Welcome)
@@ -73,7 +73,7 @@ def parse_opening(frame: Frame) -> tuple[str, bool]:
         The link, and whether TLS follows.
 
     Raises:
-        ProtocolError: It begins no link.
+        ProtocolError: The frame does not begin a link.
     """
     if frame.type is not FrameType.SECURE:
         return parse_hello(frame).link, False
@@ -87,11 +87,11 @@ def check_answer(frame: Frame) -> frozenset[str]:
     """Read the accepting end's answer to HELLO.
 
     Returns:
-        The features that it knows.
+        The features that the peer knows.
 
     Raises:
-        LinkRefusedError: It does not want the link.
-        ProtocolError: It is no answer.
+        LinkRefusedError: The peer refuses the link.
+        ProtocolError: The frame is not an answer to HELLO.
     """
     if frame.type is FrameType.REFUSE:
         raise LinkRefusedError(bytes(frame.payload).decode(errors="replace"))

@@ -1,4 +1,4 @@
-"""One process's place in the web of links: it listens, dials, and joins endpoints of the same process."""
+"""The links of one process: listens, dials, and joins endpoints of the same process."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ class LinkHub:
         for acceptor in self._doormen:
             await acceptor.close()
         await self._greetings.close()
-        await asyncio.sleep(0)  # connections that were just being accepted come into view
+        await asyncio.sleep(0)  # connections that were just being accepted are registered
         carriers = list(self._carriers)
         for carrier in carriers:
             carrier.abort(LinkLostError("the hub is closed"))
@@ -179,7 +179,7 @@ class LinkHub:
     # Endpoints of this process
 
     def register(self, link: Link) -> None:
-        """Let a link be found by its id: its peer dials."""
+        """Register a link under its id: its peer dials."""
         self._accepting[link.spec.id] = link
         for waiter in self._waiters.get(link.spec.id, ()):
             if not waiter.done():
@@ -191,7 +191,7 @@ class LinkHub:
             del self._accepting[link.spec.id]
 
     async def wait_registered(self, link_id: str, timeout: float | None) -> None:
-        """Wait until the accepting end of a link is registered anew, or ``timeout`` seconds (none: ever)."""
+        """Wait until the accepting end of a link is registered anew, at most ``timeout`` seconds."""
         waiter = self.loop.create_future()
         self._waiters.setdefault(link_id, set()).add(waiter)
         try:
@@ -205,7 +205,7 @@ class LinkHub:
     # Dialing
 
     def can_reach(self, spec: LinkSpec) -> bool:
-        """Tell whether :meth:`connect` has anywhere to go; else only a registration can help."""
+        """Return whether :meth:`connect` can reach the link; if not, it must be registered here first."""
         if spec.id in self._accepting:
             return True
         address = spec.address
@@ -220,7 +220,7 @@ class LinkHub:
 
         Raises:
             OSError: It cannot be reached, or not in time.
-            LinkError: It does not want the link, or does not speak as it should.
+            LinkError: The peer refuses the link, or breaks the protocol.
         """
         local = self._accepting.get(spec.id)
         if local is not None:
@@ -332,7 +332,7 @@ class LinkHub:
             guest.leave()
 
     async def _adopt_secure(self, sock: socket.socket, link_id: str) -> None:
-        """Begin TLS as the accepting end; what comes then is a connection like others."""
+        """Begin TLS as the accepting end; then continue as with any other connection."""
         try:
             async with asyncio.timeout(self.timeouts.handshake):
                 await accept_secure(sock, (await self._wait_for(link_id)).spec, self._accept)

@@ -1,4 +1,4 @@
-"""What ends a connection: interfaces, and the ports they send through."""
+"""Interfaces, the ends of connections, and the ports they send through."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ Buffer: TypeAlias = bytes | bytearray | memoryview
 
 
 class Port(Protocol):
-    """What an interface may do with its peers."""
+    """An interface's access to its peers."""
 
     @property
     def spec(self) -> InterfaceSpec:
-        """What the interface was made for."""
+        """The interface's spec."""
         ...
 
     def send(self, payload: Buffer, *, latched: bool = False, source: str = "") -> None:
@@ -53,7 +53,7 @@ class Port(Protocol):
 
         Raises:
             TypeError: The interface is not a service provider.
-            NotConnectedError: There is no peer.
+            NotConnectedError: No peer is connected.
             PeerFaultError: The peer answered with a fault.
             PeerLostError: The connection ended before the answer came.
             CallTimeoutError: No answer in time.
@@ -83,7 +83,7 @@ class Interface(ABC):
 
     @abstractmethod
     async def close(self) -> None:
-        """Give up all that the interface holds."""
+        """Release everything that the interface holds."""
 
     def receive(self, payload: bytes, *, latched: bool) -> None:
         """Take a peer's message. For publisher interfaces; must not block."""
@@ -105,7 +105,7 @@ class Interface(ABC):
         """
         raise NotImplementedError(f"{type(self).__name__} serves no requests")
 
-    def on_active(self, active: bool) -> None:  # noqa: B027 - not everybody wants to know
+    def on_active(self, active: bool) -> None:  # noqa: B027 - not every interface needs it
         """Notice that the first connection was established or the last one lost. Must not block."""
 
 

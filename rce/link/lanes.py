@@ -36,7 +36,7 @@ Chunk = tuple[bytes | memoryview, ...]
 
 
 class Lanes:
-    """All that waits on one link."""
+    """The frames that wait on one link."""
 
     def __init__(self, limits: LinkLimits) -> None:
         self._max_begun = limits.unfinished_bytes

@@ -1,4 +1,4 @@
-"""One endpoint's end of a link: its channels, over whatever carries them at present."""
+"""One endpoint's end of a link: its channels, over the present carrier."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Link:
     def drop_unfinished(self, size: int) -> None:
         """Drop the oldest messages that have not come as a whole yet, until ``size`` bytes are free.
 
-        The link continues. Who waits for one of them is told; the log and the counters tell of the others.
+        The link continues. Calls that wait for one of them fail; the log and the counters record the others.
         """
         dropped = [] if self.carrier is None else self.carrier.drop_unfinished(size)
         for frame in dropped:
@@ -86,7 +86,7 @@ class Link:
         del self._channels[channel.number]
 
     def attach(self, carrier: Carrier) -> None:
-        """Go on over a new carrier; a former one is closed, as its peer has given it up."""
+        """Continue over a new carrier; a former one is closed, as its peer has given it up."""
         self.detach()
         _log.debug("link %s to %s is up (%s)", self.spec.id, self.spec.peer, carrier.kind)
         self.carrier = carrier

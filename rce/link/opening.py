@@ -22,12 +22,12 @@ class LinkSender(Protocol):
         """Pass a connection and what was read from it; the caller closes its own copy afterwards.
 
         Raises:
-            OSError: It is not taken.
+            OSError: The connection is refused.
         """
 
 
 class PlainLinkRefusedError(LinkRefusedError):
-    """A link came without TLS where it is demanded."""
+    """A peer dialed without TLS, and TLS is required."""
 
     for_peer = b"links are taken in TLS only here; start the peer's program with --tls too"
 
@@ -41,7 +41,7 @@ class ReceivedHello:
     Attributes:
         link: Id of the link that the peer asks for.
         secure: Whether TLS follows.
-        data: All that was read.
+        data: The bytes that were read.
     """
 
     def __init__(self, link: str, secure: bool, data: bytes) -> None:

@@ -1,4 +1,4 @@
-"""What waits to be sent on one channel, and its counters."""
+"""The outgoing queue of one channel, and its counters."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ SMALL_MESSAGE = 4 * KIB
 """Messages up to this size are urgent.
 
 Poses, goals, cancellations, states and most service calls fit; images, maps and long scans do not. A whole
-one adds no more to anybody's waiting than a thirtieth of a fragment.
+one delays any other message by no more than a thirtieth of a fragment.
 """
 
 
 @dataclass(slots=True)
 class Counters:
-    """What one interface moved; see :class:`~rce.control.model.InterfaceUsage`."""
+    """The traffic of one interface; see :class:`~rce.control.model.InterfaceUsage`."""
 
     messages_in: int = 0
     messages_out: int = 0
@@ -58,7 +58,7 @@ class Counters:
 
 
 class Backlog:
-    """What waits on all channels of one endpoint.
+    """The payload that waits on all channels of one endpoint.
 
     Args:
         on_growth: Called after something was added.
@@ -73,7 +73,7 @@ class Backlog:
 
 
 class Lane(Enum):
-    """Where a channel's queue stands in line."""
+    """The lane of a channel's queue."""
 
     NONE = "none"
     URGENT = "urgent"
@@ -202,7 +202,7 @@ class OutgoingQueue:
 
 
 def _key(frame: Frame) -> int | None:
-    """Return what a message is kept for until a newer one comes; None if it may be dropped."""
+    """Return the key under which a message is kept until a newer one comes; None if it may be dropped."""
     if frame.type is FrameType.SOURCES:
         return 0
     return frame.id if frame.type is FrameType.DATA and frame.flags & LATCHED else None

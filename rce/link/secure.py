@@ -1,4 +1,4 @@
-"""Begin TLS on a link's connection; see :mod:`rce.link.encryption` for what it proves."""
+"""Begin TLS on a link's connection; :mod:`rce.link.encryption` describes what the handshake proves."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ async def dial_secure(
         make: Makes the carrier.
 
     Raises:
-        LinkRefusedError: The peer takes no TLS.
+        LinkRefusedError: The peer does not accept TLS.
         OSError: The handshake failed (:class:`ssl.SSLError`).
     """
     if not spec.address.tls:

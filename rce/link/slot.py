@@ -31,7 +31,7 @@ class InterfaceSlot:
         role: What the interface does.
         started: Whether it can be used.
         active: Whether it has an established connection.
-        counters: What it moved.
+        counters: Its traffic.
         server: Serves the peers' requests; service clients only.
     """
 
@@ -66,7 +66,7 @@ class InterfaceSlot:
 
     @property
     def spec(self) -> InterfaceSpec:
-        """What the interface was made for."""
+        """The interface's spec."""
         return self._spec
 
     def send(self, payload: Buffer, *, latched: bool = False, source: str = "") -> None:
@@ -101,7 +101,7 @@ class InterfaceSlot:
     # The life of the interface
 
     def make(self, factory: InterfaceFactory) -> None:
-        """Make the interface. Raises whatever the factory raises."""
+        """Make the interface. Exceptions of the factory are passed on."""
         self._interface = interface = factory(self)
         if self.role is Role.SERVICE_CLIENT:
             self.server = CallServer(interface.serve, self._limits, self._spec.tag, self._holdings)
@@ -138,7 +138,7 @@ class InterfaceSlot:
         self._channels[channel.number] = channel
 
     def remove(self, channel: Channel) -> None:
-        """Let a connection go; it was closed before."""
+        """Remove a connection; it was closed before."""
         del self._channels[channel.number]
         self._unlatch(self._heard.retain(channel.number))
 
@@ -172,7 +172,7 @@ class InterfaceSlot:
             self._fault_once(str(error) or type(error).__name__)
 
     def message_dropped(self, channel: Channel, source: int | None) -> None:
-        """Take note that a peer's message was dropped while it came in: what its source latched is old."""
+        """Take note that a peer's message was dropped on arrival: its source's latched message is outdated."""
         self.counters.dropped += 1
         self._fault_once("memory is short; a message was dropped while it came in")
         if source is not None:

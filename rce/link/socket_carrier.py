@@ -74,7 +74,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         self._kind = ""
         self._writable = False
         self._straight = False
-        """Writable, and without a limit: what finds nothing waiting needs not to ask anybody."""
+        """Writable, and without a limit: a message is sent at once if none waits before it."""
         self._flow: FlowControl | None = None
         self.sent = 0
         self.received = 0
@@ -95,7 +95,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         """Wait for the peer's first frame.
 
         Raises:
-            ProtocolError: The peer sent something else than frames.
+            ProtocolError: The peer sent something other than frames.
             LinkLostError: The connection ended first.
         """
         await asyncio.shield(self._first)
@@ -195,7 +195,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         self._end(LinkLostError("closed"), flush=True)
 
     def abort(self, reason: Exception) -> None:
-        """End at once; whoever handles the frames is told the reason."""
+        """End at once; the handler is told the reason."""
         if isinstance(reason, ProtocolError):
             _log.warning("link dropped: %s", reason)
         self._end(reason, flush=False)
@@ -243,7 +243,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         self._writable = self._straight = False
 
     def resume_writing(self) -> None:
-        """Go on handing bytes to the transport."""
+        """Continue handing bytes to the transport."""
         self._writable = True
         self._straight = self._flow is None
         self.go_on()
@@ -261,12 +261,12 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
     # rce.link.flow_control.Stream
 
     def go_on(self) -> None:
-        """Send what waits, as far as the socket takes it and the limits let it pass."""
+        """Send waiting frames, as far as the socket and the limits allow."""
         if self._writable and self._turn is None:
             self._pump()
 
     def pause_reading(self) -> None:
-        """Leave what comes in the kernel's buffers."""
+        """Leave incoming bytes in the kernel's buffers."""
         if self._transport is not None and not self._transport.is_closing():
             self._transport.pause_reading()
 
@@ -284,7 +284,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         return self._flow
 
     def _look_at_flow(self) -> None:
-        """Do without the flow control once nobody has a limit any more."""
+        """Remove the flow control when neither end has a limit any more."""
         if self._flow is not None and self._flow.open:
             self._flow = None
             self._straight = self._writable
@@ -348,7 +348,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
                 return
 
     def _next_through(self, flow: FlowControl) -> Chunk | None:
-        """Return what may be sent next, paid for. Frames of the link itself never wait: it lives by them."""
+        """Return the next frame that may be sent, paid for. Frames of the link itself never wait."""
         urgent = self._lanes.control or self._lanes.urgent
         limit = FRAGMENT_SIZE if self._lanes.control else flow.room(urgent=urgent)
         chunk = self._lanes.next(limit) if limit else None
@@ -367,12 +367,12 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         return size
 
     def _heartbeat(self) -> None:
-        """Ask a silent peer whether it lives; give a peer up that was silent for too long."""
+        """Send a PING to a silent peer; end the carrier if the peer was silent for too long."""
         now = self._loop.time()
         stood_still = now - self._beat > 2 * self._timeouts.heartbeat  # or this is the first beat
         paused = self._flow is not None and self._flow.paused
         if stood_still or paused:
-            self._heard = now  # nothing was read: that is not the peer's silence
+            self._heard = now  # this end read nothing: the peer may have sent something
         self._beat = now
         silent = now - self._heard
         if silent >= self._timeouts.silence:

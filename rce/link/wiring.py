@@ -1,4 +1,4 @@
-"""The channels of an endpoint's interfaces, what became of them, and what could not be made."""
+"""The channels of an endpoint's interfaces, their changes, and the parts that could not be made."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class WiringNews:
-    """What became of an endpoint's interfaces and connections in a while."""
+    """Changes of an endpoint's interfaces and connections over a period."""
 
     changed_interfaces: dict[str, None] = field(default_factory=dict)
     changed_connections: dict[int, None] = field(default_factory=dict)
