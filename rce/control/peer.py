@@ -53,7 +53,7 @@ class Peer:
         return frozenset(self.hello.features)
 
     def send(self, message: ToTaskSet) -> None:
-        """Send a message; never blocks. A peer that is too far behind is disconnected and sends Hello again."""
+        """Send a message; never blocks. A peer that is too far behind is disconnected, and dials again."""
         if self._left:
             return
         try:

@@ -172,7 +172,7 @@ class InterfaceSlot:
             self._fault_once(str(error) or type(error).__name__)
 
     def message_dropped(self, channel: Channel, source: int | None) -> None:
-        """Take note that a peer's message was dropped on arrival: its source's latched message is outdated."""
+        """Take note that a peer's message was dropped on arrival: what its source latched is outdated."""
         self.counters.dropped += 1
         self._fault_once("memory is short; a message was dropped while it came in")
         if source is not None:
