@@ -78,7 +78,7 @@ class App:
             ready: Called with the task set's name and its runtime when it listens.
 
         Returns:
-            Whether the containers were let go of, so that the program can be started anew
+            Whether the containers were released, so that the program can be started again
             (:mod:`rce_container.renewal`); else they ended.
 
         Raises:
@@ -166,7 +166,7 @@ class App:
         return Masters(f"{scheme}://{in_url(host)}:{self.control_port}" for host in hosts)
 
     def _library(self, state: StateFolder, masters: Masters, tls: Context | None) -> Library:
-        """Where packages that users bring come from. Blocks."""
+        """Return the source of the packages that users bring. Blocks."""
         client = ContentClient(masters, self.secret, tls=tls)
         cache = PackageCache(state.library, client.piece, space=self.settings.bundle_space)
         requested = self.settings.requirements
@@ -198,7 +198,7 @@ def choose_runtime(requested: str, runtimes: dict[str, Runtime]) -> tuple[Runtim
 
     Args:
         requested: A runtime's name, or ``auto``: namespaces if they work here, else plain processes.
-        runtimes: All there are.
+        runtimes: All runtimes.
 
     Returns:
         The runtime and what users should know of it; empty if all is well.
@@ -239,15 +239,15 @@ def package_path(given: Sequence[Path]) -> tuple[Path, ...]:
 
 
 class Quitting:
-    """Hears signals from now on; a manager that comes later ends at once what an earlier one left.
+    """Handles signals from now on; a manager that starts after a signal ends adopted containers at once.
 
     Attributes:
-        renewal: Whether the program is to let go of its containers and start anew.
+        renewal: Whether the program is to release its containers and start again.
     """
 
     def __init__(self) -> None:
         self.told = asyncio.Event()
-        """Set by the first signal."""
+        """Set by the first signal to end."""
         self._manager: Manager | None = None
         self._let_go: Callable[[], object] = lambda: None
         self.renewal = False
@@ -257,11 +257,11 @@ class Quitting:
         loop.add_signal_handler(RENEW, self._on_renewal)
 
     def on_renewal(self, let_go: Callable[[], object]) -> None:
-        """Have something called when the program is to start anew."""
+        """Register a callback for the request to start the program again."""
         self._let_go = let_go
 
     def of(self, manager: Manager) -> asyncio.Event:
-        """Return what tells a manager to end; a second signal makes it kill its containers."""
+        """Return the event that tells a manager to end; a second signal makes it kill its containers."""
         self._manager = manager
         return self.told
 
@@ -271,7 +271,7 @@ class Quitting:
         self.told.set()
 
     def _on_renewal(self) -> None:
-        if self.told.is_set() or self.renewal:  # an end that has begun continues
+        if self.told.is_set() or self.renewal:  # a shutdown that has begun continues
             return
         _log.info("starting anew; containers stay")
         self.renewal = True
@@ -307,6 +307,6 @@ def _existing(path: Path) -> Path:
 
 
 def _compile_engine() -> None:
-    """Compile what containers import: they see it read-only, and could never keep the result."""
+    """Compile the modules that containers import: containers, which see them read-only, cannot do it."""
     for package in ("rce", "rce_container"):
         compileall.compile_dir(source_root() / package, quiet=2)

@@ -1,8 +1,8 @@
-"""The logs of containers, of those that live and, for a while, of those that ended.
+"""The logs of running containers and, for a limited time, of ended ones.
 
-``STATE/logs/USER/TAG/MARK`` holds the logs of one incarnation of a container from its first moment on, so
-that nothing has to be saved when it ends, however that happens. ``MARK.json`` beside it, out of the
-container's reach, says when the incarnation began and how it ended.
+``STATE/logs/USER/TAG/MARK`` holds the logs of one incarnation of a container from its start, so the logs are
+complete however the incarnation ends. ``MARK.json`` beside it, which the container cannot reach, records when
+the incarnation began and how it ended.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class IncarnationRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Kept(NamedTuple):
-    """An incarnation whose logs are there."""
+    """An incarnation whose logs are kept."""
 
     record: IncarnationRecord
     folder: Path
@@ -65,7 +65,7 @@ class LogArchive:
         self._days = days
         self._space = space
         self._lock = threading.Lock()
-        """Held while empty folders are removed or filled: a thread of its own prunes."""
+        """Held while empty folders are removed or filled: pruning runs in a separate thread."""
 
     def begin(self, id_: str, incarnation_id: str, now: float) -> Path:
         """Make the folder for the logs of a new incarnation.
@@ -86,7 +86,7 @@ class LogArchive:
         return folder
 
     def end(self, id_: str, incarnation_id: str, reason: str, now: float) -> None:
-        """Note how an incarnation ended; done once, the first word counts."""
+        """Record how an incarnation ended. Only the first call has an effect."""
         folder = self._folder(id_) / incarnation_id
         record = _read(folder)
         if record is None or record.ended:
@@ -97,28 +97,28 @@ class LogArchive:
             _log.warning("how container %s ended cannot be noted: %s", id_, error)
 
     def find(self, incarnation_id: str) -> Kept | None:
-        """The incarnation with an id, whosever it is. Looks at every container; see :meth:`get`."""
+        """Return the incarnation with an id, of any user. Searches every container; see :meth:`get`."""
         found = (_kept(folder / incarnation_id) for folder in self._tags())
         return next((kept for kept in found if kept is not None), None)
 
     def get(self, id_: str, incarnation_id: str) -> Kept | None:
-        """The incarnation with an id, of a container."""
+        """Return the incarnation of a container by id."""
         return _kept(self._folder(id_) / incarnation_id)
 
     def folders(self) -> dict[str, Path]:
-        """Where the logs of all incarnations are, by id."""
+        """Return the log folders of all incarnations, by id."""
         return {kept.record.incarnation_id: kept.folder for kept in self._all()}
 
     def ended(self, id_: str) -> list[Kept]:
-        """The ended incarnations of a container, the newest first."""
+        """Return the ended incarnations of a container, the newest first."""
         found = [kept for kept in self._incarnations(self._folder(id_)) if kept.record.ended]
         return sorted(found, key=_age)
 
     def settle(self, living: Collection[str], now: float) -> None:
-        """Note the end of incarnations that nobody saw end.
+        """Record the end of incarnations whose end no manager observed.
 
         Args:
-            living: The marks of incarnations of which something may be there.
+            living: The marks of incarnations that may have processes or folders.
             now: The time.
         """
         for kept in list(self._all()):
@@ -126,7 +126,7 @@ class LogArchive:
                 self._settle(kept, now)
 
     def settle_one(self, incarnation_id: str, now: float) -> None:
-        """Note the end of an incarnation that nobody saw end."""
+        """Record the end of an incarnation whose end no manager observed."""
         kept = self.find(incarnation_id)
         if kept is not None:
             self._settle(kept, now)
@@ -137,7 +137,7 @@ class LogArchive:
         self.end(kept.record.id, kept.record.incarnation_id, reason, now)
 
     def prune(self, now: float) -> None:
-        """Remove what is too old or too much, the oldest first."""
+        """Remove logs that exceed the age or space limit, the oldest first."""
         ended = sorted((kept for kept in self._all() if kept.record.ended), key=_age)
         space = self._space
         incarnations: dict[str, int] = {}
@@ -176,7 +176,7 @@ class LogArchive:
 
 
 def _children(folder: Path) -> list[Path]:
-    """What is in a folder; nothing if it is gone: incarnations are pruned meanwhile."""
+    """List a folder; an incarnation may be pruned meanwhile, so a missing folder counts as empty."""
     try:
         return list(folder.iterdir())
     except (FileNotFoundError, NotADirectoryError):

@@ -1,7 +1,7 @@
-"""What a manager decides: events in, instructions out. Pure: no I/O, no clock, no task.
+"""The manager's decisions: events in, instructions out. Pure: no I/O, no clock, no task.
 
-A container lives several incarnations, one after the other, each with an id of its own. Events of a
-life that is over are ignored.
+A container has several incarnations, one after the other, each with its own id. Events of an ended
+incarnation are ignored.
 """
 
 from __future__ import annotations
@@ -53,32 +53,33 @@ from rce_container.events import (
 from rce_container.life import ALIVE, CONTAINER_LIFE, LifeEvent, Phase
 
 BACKOFF = Backoff(first=0.5, longest=30.0)
-"""Pauses before a container that ended is made again. The first time in a row it is made again at once."""
+"""Delays before a container that ended is recreated; the first time in a row it is recreated at once.
+"""
 STABLE_S = 30.0
-"""A container that ran for so long starts at the first pause again."""
+"""A container that ran for this long starts at the first delay again."""
 
 
 @dataclass(slots=True)
 class Container:
-    """What is known of one container."""
+    """The manager's record of one container."""
 
     id: str
     course: StateMachine[Phase, LifeEvent]
     desired: DesiredState | None = None
-    """None also for an adopted one of which the master has not spoken yet."""
+    """None also for an adopted container that the master has not mentioned yet."""
     drop_revision: int = 0
     incarnation_id: str = ""
     address: LinkAddress = field(default_factory=LinkAddress)
     reported: ObservedStatus | None = None
     failures: int = 0
-    """How often it ended since it was stable last."""
+    """How often it has ended since it was last stable."""
     running_since: float | None = None
     ticket: int = 0
     detail: str = ""
     told: str = ""
-    """The last failure that the user was told of."""
+    """The last failure that was reported to the user."""
     number: int = 0
-    """Of the last report to the master."""
+    """The number of the last report to the master."""
 
     @property
     def known_revision(self) -> int:
@@ -89,23 +90,23 @@ class Container:
 
     @classmethod
     def make(cls, id_: str, phase: Phase, **fields: Any) -> Self:
-        """Make one in a phase."""
+        """Make a record in a phase."""
         return cls(id_, CONTAINER_LIFE.start(phase, id_), **fields)
 
     @property
     def phase(self) -> Phase:
-        """Where it is in its life."""
+        """The phase of the container."""
         return self.course.state
 
     @property
     def status(self) -> EndpointStatus:
-        """What the master is told."""
+        """Return the status for the master."""
         if self.reported is None or self.phase not in {*ALIVE, Phase.STOPPING}:
             return self.describe(EndpointStatus(id=self.id, revision=0, state=_STATES[self.phase]))
         return self.describe(self.reported.whole)
 
     def describe(self, base: EndpointStatus) -> EndpointStatus:
-        """Add to what the environment says what it does not know."""
+        """Add to the environment's status the fields that it does not know."""
         state = EndpointState.STOPPING if self.phase is Phase.STOPPING else base.state
         return msgspec.structs.replace(
             base,
@@ -133,8 +134,8 @@ _STATES = {
 class ManagerCore:
     """All containers of one manager.
 
-    Invariants: a container has an incarnation id exactly while something of it may be there; one that is
-    gone is forgotten.
+    Invariants: a container has an incarnation id exactly while it may have processes or folders; a container
+    that is gone is forgotten.
     """
 
     def __init__(self) -> None:
@@ -144,11 +145,11 @@ class ManagerCore:
         self._now = 0.0
 
     def handle(self, event: Event, now: float) -> list[Instruction]:
-        """Take in what happened; return what is to be done about it.
+        """Handle an event; return the resulting instructions.
 
         Args:
             event: What happened.
-            now: Seconds on a clock that never goes back.
+            now: Seconds on a monotonic clock.
         """
         self._now = now
         self._out = []
@@ -171,11 +172,11 @@ class ManagerCore:
 
     @property
     def statuses(self) -> tuple[EndpointStatus, ...]:
-        """What there is, for the master."""
+        """Return the status of all containers, for the master."""
         return tuple(container.status for container in self.containers.values())
 
     def resources(self, id_: str) -> Resources:
-        """What a container that is desired asks for."""
+        """Return the resources that a desired container requests."""
         desired = self.containers[id_].desired
         return desired.contents.resources if desired is not None else Resources()
 
@@ -189,7 +190,7 @@ class ManagerCore:
             if container.phase in {*ALIVE, Phase.CLEANING}:
                 assert container.incarnation_id, f"{id_} is {container.phase.value} without an incarnation"
 
-    # What the master desires
+    # Desired state from the master
 
     def _hear(self, event: Put | Patch | Drop | Sync | StatusWanted) -> None:
         match event:
@@ -268,7 +269,7 @@ class ManagerCore:
                 self._out.append(Stop(container.id, container.incarnation_id, reason))
             self._tell(container)
 
-    # What happens to containers
+    # Events of containers
 
     def _adopt(self, event: Adopted) -> None:
         id_ = event.status.id
@@ -325,7 +326,7 @@ class ManagerCore:
             self._tell(container)
 
     def _change(self, container: Container, patch: StatusPatch) -> None:
-        """Take over what an environment changed in its report: it made a whole one before."""
+        """Apply a patch to an environment's report; a whole report came before it."""
         if container.reported is None:
             return
         container.reported.patch(patch)
@@ -357,7 +358,7 @@ class ManagerCore:
         container.reported = None
         if container.phase is Phase.GONE:
             self._revive_or_forget(container)
-        elif container.desired is None:  # adopted, and the master has not spoken of it yet
+        elif container.desired is None:  # adopted, and the master has not mentioned it yet
             del self.containers[container.id]
         else:
             self._pause(container)
@@ -379,7 +380,7 @@ class ManagerCore:
         container.course.advance(LifeEvent.DUE)
         self._start(container)
 
-    # What is done about it
+    # Instructions
 
     def _start(self, container: Container) -> None:
         self._out.append(Start(container.id))

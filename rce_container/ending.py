@@ -1,4 +1,4 @@
-"""Ends what a container task set left that was killed, without a master."""
+"""Ends the containers that a killed container task set left, without a master."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from rce_container.runtimes.process import ProcessRuntime
 from rce_container.settings import ContainerSettings
 
 RUNNING_TIMEOUT_S = 60.0
-"""Longer than a task set that was told to end takes for it."""
+"""Seconds; longer than a task set takes to shut down."""
 KILLED_TIMEOUT_S = 30.0
-"""For the end of one that was killed; the kernel may have much to clean up."""
+"""Seconds for the end of a killed task set; the kernel may have much to clean up."""
 _BUSY_PAUSE_S = 0.05
 _log = logging.getLogger(__name__)
 
@@ -38,13 +38,13 @@ _log = logging.getLogger(__name__)
 async def end_containers(
     settings: ContainerSettings, state_dir: Path, *, timeout: float = RUNNING_TIMEOUT_S
 ) -> None:
-    """End the containers of a state directory as their task set would, and remove all that is left of them.
+    """End the containers of a state directory as their task set would, and remove their remains.
 
-    A task set that still uses the directory is waited for: it may be about to end. One that does not, because
-    it hangs or was stopped (SIGSTOP), is killed.
+    Wait for a task set that still uses the directory: it may be about to end. Kill a task set that does not
+    end, because it hangs or was stopped (SIGSTOP).
 
     Args:
-        settings: How long nodes are given.
+        settings: How long nodes may take to end.
         state_dir: The task set's state directory.
         timeout: Seconds to wait for a task set.
 
@@ -79,7 +79,7 @@ async def end_containers(
 
 @contextlib.asynccontextmanager
 async def _taken(state_dir: Path, timeout: float) -> AsyncIterator[StateFolder]:
-    """Take a state directory as soon as no other process has it; kill the one that keeps it too long."""
+    """Lock a state directory as soon as no other process holds it; kill a process that holds it too long."""
     folder = StateFolder(state_dir, run_dir())
     state = await _take_within(folder, timeout)
     if state is None and (owner := folder.owner()) is not None:
@@ -93,7 +93,7 @@ async def _taken(state_dir: Path, timeout: float) -> AsyncIterator[StateFolder]:
 
 
 async def _take_within(folder: StateFolder, timeout: float) -> StateFolder | None:
-    """Take a state directory; None if another process still has it after some seconds."""
+    """Lock a state directory; return None if another process still holds it after some seconds."""
     deadline = asyncio.get_running_loop().time() + timeout
     while True:
         try:

@@ -1,4 +1,4 @@
-"""The environment: applies the container's desired state and reports what is."""
+"""The environment: applies the container's desired state and reports the actual state."""
 
 from __future__ import annotations
 
@@ -52,15 +52,15 @@ _UNUSED = InterfaceUsage()
 
 
 class Environment:
-    """One container from the inside. Its :meth:`run` lives as long as the container.
+    """One container, seen from the inside. Its :meth:`run` lasts as long as the container.
 
     It ends when a manager says so, when :meth:`end` is called, or when no manager was connected for the
     grace time.
 
     Args:
-        boot: What the manager says of the container.
+        boot: The manager's description of the container.
         control: A listening unix socket; managers connect to it.
-        links: A listening unix socket; peers' links come in on it.
+        links: A listening unix socket; accepts peers' links.
         node_server: Starts nodes that are Python scripts; None for none.
     """
 
@@ -80,7 +80,7 @@ class Environment:
         self._end_reason = ""
         self._desired = DesiredState(EndpointSpec(id=boot.id, kind=EndpointKind.CONTAINER, revision=-1))
         self._patches: list[SpecPatch] = []
-        """What is to be done about interfaces and connections, if it is not all of them."""
+        """Changes of interfaces and connections that are to be applied, unless all of them are due."""
         self._all_due = False
         self._holds_back = False
         """Whether interfaces wait for packages."""
@@ -99,7 +99,7 @@ class Environment:
         self._causes = Causes(self._ask)
 
     async def run(self) -> None:
-        """Live; returns when every process, socket and task of the container has ended."""
+        """Run the container; return when all its processes, sockets and tasks have ended."""
         async with contextlib.AsyncExitStack() as stack:
             reaper = stack.enter_context(Reaper(self._node_server))
             self._executions = Executions(reaper, self._environ, self._boot.mark, self._boot.home)
@@ -139,7 +139,7 @@ class Environment:
         _log.info("ended: %s", self._end_reason)
 
     def end(self, reason: str) -> None:
-        """Begin to end the container, whole."""
+        """Begin to end the whole container."""
         _log.info("ending: %s", reason)
         self._end_reason = self._end_reason or reason
         self._ending.set()
@@ -186,7 +186,7 @@ class Environment:
             "ROS_PACKAGE_PATH": packages,
         }
 
-    # What is desired
+    # Desired state
 
     def _apply(self, spec: EndpointSpec) -> None:
         if spec.revision < self._desired.revision or self._ending.is_set():
@@ -208,7 +208,7 @@ class Environment:
         self._news.set()
 
     def _apply_contents(self) -> None:
-        """Make parameters and nodes as desired."""
+        """Apply the desired parameters and nodes."""
         contents = self._desired.contents
         self._user_packages.apply(contents.packages)
         self._set_parameters()
@@ -216,13 +216,13 @@ class Environment:
         self._nodes.apply(contents.nodes)
 
     def _apply_all(self) -> None:
-        """Have all interfaces and connections looked at."""
+        """Schedule a check of all interfaces and connections."""
         self._all_due = True
         self._patches.clear()
         self._news.set()
 
     def _take_user_packages(self) -> None:
-        """Go on with what waited for packages that have come."""
+        """Continue with the nodes and interfaces that waited for packages which have arrived."""
         self._user_packages.look()
         self._set_parameters()
         self._nodes.lack(self._user_packages.lacking(self._desired.contents.nodes))
@@ -264,12 +264,12 @@ class Environment:
             self._changed()
 
     async def _apply_possible(self, desired: EndpointSpec) -> None:
-        """Make all interfaces and connections but those that wait for packages."""
+        """Make all interfaces and connections, except those that wait for packages."""
         possible = self._user_packages.hold_back(desired, self._endpoint.desired_interfaces)
         self._holds_back = possible is not desired
         await self._endpoint.apply(possible)
 
-    # What is
+    # Actual state
 
     def _changed(self) -> None:
         if self._report_due is None:
@@ -303,14 +303,14 @@ class Environment:
     # rce_container.environment.graph.NodeListener
 
     def node_appeared(self, name: str) -> bool:
-        """Take note of a node of the container that is up."""
+        """Note that a node of the container has registered."""
         if not self._nodes.registered(name):
             return False
         self._rosout.known(name)
         return True
 
     def node_identified(self, name: str, pid: int) -> None:
-        """Take note of the process of a node that is up."""
+        """Note the process of a node that has registered."""
         if self._nodes.registered_process(name, pid):
             self._rosout.known(name)
 
@@ -325,7 +325,7 @@ class Environment:
             await accept(self._control, self._greet)
 
     def _greet(self, sock: socket.socket) -> None:
-        """Take a new manager in place of the one before."""
+        """Replace the current manager by a new one."""
         if self._channel is not None:
             self._channel.close()
         elif self._grace is not None:

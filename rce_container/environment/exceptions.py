@@ -1,4 +1,4 @@
-"""What goes wrong inside a container.
+"""The errors inside a container.
 
 EnvironmentFaultError         told to the user as it is; the rest of the container continues
 ├── NodeError            a node cannot be started

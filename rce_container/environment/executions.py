@@ -22,13 +22,13 @@ from rce_container.environment.process import kill_marked
 _log = logging.getLogger(__name__)
 
 MAX_EXECUTIONS = 16
-"""Commands that run at the same time in one container."""
+"""How many commands may run at the same time in one container."""
 HANGUP_S = 2.0
-"""What a command gets to end after SIGHUP, when its user is gone."""
+"""Seconds that a command has to end after SIGHUP, when its user has disconnected."""
 REST_S = 1.0
-"""How long what it wrote last may take to be read, once the command has ended."""
+"""Seconds to read the last output of a command that has ended."""
 PART_S = 5.0
-"""How long the user's side may take to take what the command wrote last."""
+"""Seconds that the user's side may take to read the last output."""
 SHELLS = ("/bin/bash", "/bin/sh")
 _SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGKILL})
 _NOT_FOUND, _NOT_EXECUTABLE = 127, 126
@@ -39,8 +39,8 @@ class Executions:
 
     Args:
         reaper: Starts processes and waits for them.
-        environ: Gives the environment variables of the container's nodes.
-        mark: The container's; all processes of a command carry one made of it.
+        environ: Returns the environment variables of the container's nodes.
+        mark: The container's mark; all processes of a command carry a mark derived from it.
         home: Where commands start.
     """
 
@@ -55,7 +55,7 @@ class Executions:
         self._number = 0
 
     def start(self, command: Command, sock: socket.socket) -> None:
-        """Run a command; ``sock`` keeps message boundaries, and is this object's now."""
+        """Run a command; ``sock`` keeps message boundaries, and this object owns it from now on."""
         self._number += 1
         if self._tasks.closed:  # the container ends
             sock.close()
@@ -79,7 +79,7 @@ class Executions:
                     last = await self._execute(command, sock, f"{self._mark}.command.{number}")
                 await loop.sock_sendall(sock, last.encode())
                 await _part(sock)
-            except OSError as error:  # the user is gone
+            except OSError as error:  # the user has disconnected
                 _log.info("command %d: %s", number, error)
 
     async def _execute(self, command: Command, sock: socket.socket, mark: str) -> Frame:
@@ -107,7 +107,7 @@ class Executions:
 
 
 async def _part(sock: socket.socket) -> None:
-    """Wait until the user's side has taken all; closing with input unread would throw it away."""
+    """Wait until the user's side has read all output; closing with input unread would discard it."""
     sock.shutdown(socket.SHUT_WR)
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(PART_S):
@@ -134,7 +134,7 @@ class _Pipes:
         self._close(*self._open)
 
     def close_childs(self) -> None:
-        """Close the ends that are the child's."""
+        """Close the child's ends."""
         self._close(*self.of_child)
 
     def close_input(self) -> None:
@@ -168,7 +168,7 @@ class _Terminal:
         self._close(*self._open)
 
     def close_childs(self) -> None:
-        """Close the end that is the child's."""
+        """Close the child's end."""
         self._close(self.of_child[0])
 
     def close_input(self) -> None:
@@ -198,7 +198,7 @@ class _Conversation:
         self._turn = asyncio.Lock()
 
     async def hold(self, mark: str) -> Frame:
-        """Go on until the command has ended, or its user is gone.
+        """Pass data until the command has ended, or its user has disconnected.
 
         Returns:
             The last frame.
@@ -209,7 +209,7 @@ class _Conversation:
             await asyncio.wait((self._child.ended, listening), return_when=asyncio.FIRST_COMPLETED)
             if not self._child.ended.done():
                 await self._hang_up()
-            # What it left running in the background would keep its streams open.
+            # Processes that the command left in the background would keep its streams open.
             await kill_marked(mark, variable=NODE_MARK)
             await asyncio.wait(outputs, timeout=REST_S)
         finally:
@@ -229,7 +229,7 @@ class _Conversation:
                 await self._loop.sock_sendall(self._sock, Frame(part, data).encode())
 
     async def _listen(self) -> None:
-        """Do what the user says; returns when the user is gone or says nothing that makes sense."""
+        """Handle the user's frames; return when the user disconnects or sends an invalid frame."""
         while received := await self._loop.sock_recv(self._sock, MAX_DATA + 2):
             try:
                 frame = decode(received)

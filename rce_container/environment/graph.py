@@ -57,11 +57,11 @@ class Graph(Protocol):
         """Delete a parameter that was set."""
 
     async def listen(self, topic: str, on_message: Callable[[], None]) -> Subscription:
-        """Call ``on_message`` for each message of a topic, whatever its type.
+        """Call ``on_message`` for each message of a topic, of any type.
 
         Raises:
             GraphError: The topic cannot be listened to.
         """
 
     async def watch_nodes(self, listener: NodeListener) -> None:
-        """Tell of nodes that appear, until cancelled."""
+        """Report nodes that register, until cancelled."""

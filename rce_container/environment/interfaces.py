@@ -19,23 +19,23 @@ if TYPE_CHECKING:
     from rce.ros.types import TypeRegistry
 
 READY_TIMEOUT_S = 30.0
-"""How long an interface waits for nodes that start one after the other, at most."""
+"""Maximum time that an interface waits for nodes that start one after the other."""
 _LOOK_AGAIN_S = 0.05
 
 
 class Readiness:
-    """Makes a started interface mean: it will be heard.
+    """Delays a started interface until nodes of the container are ready for it.
 
     Args:
-        settling: Whether nodes of the container are just starting, or soon will, and may yet take up a topic
-            or service.
+        settling: Whether nodes of the container are starting, or soon will, and may yet register a topic or
+            service.
     """
 
     def __init__(self, settling: Callable[[], bool]) -> None:
         self._settling = settling
 
     async def wait(self, ready: Awaitable[object]) -> None:
-        """Wait for ``ready`` while there is hope for it, and give it up then."""
+        """Wait for ``ready`` as long as nodes are starting."""
         task = asyncio.ensure_future(ready)
         try:
             async with asyncio.timeout(READY_TIMEOUT_S):
@@ -48,7 +48,7 @@ class Readiness:
 
 
 class RosInterface(Interface):
-    """What the four kinds have in common."""
+    """Base of the four kinds of interfaces."""
 
     def __init__(self, port: Port, node: Node, readiness: Readiness) -> None:
         super().__init__(port)
@@ -58,7 +58,7 @@ class RosInterface(Interface):
         self.message_type = port.spec.message_type
 
     async def start(self) -> None:
-        """Take up the topic or service, and wait until a starting node did so too."""
+        """Register the topic or service, and wait until a starting node has registered it too."""
         try:
             await self.open()
         except RosError as error:
@@ -66,11 +66,11 @@ class RosInterface(Interface):
 
     @abstractmethod
     async def open(self) -> None:
-        """Do the work of :meth:`start`; errors of ROS may go through."""
+        """Do the work of :meth:`start`; may raise errors of ROS."""
 
 
 class PublisherInterface(RosInterface):
-    """Publishes in the container what the peers send."""
+    """Publishes the peers' messages in the container."""
 
     publisher: Publisher | None = None
 
@@ -90,19 +90,19 @@ class PublisherInterface(RosInterface):
             self.publisher.publish_serialized(payload, latch=True, source=source)
 
     def unlatch(self, sources: Collection[str]) -> None:
-        """Give later nodes nothing of these sources any more."""
+        """Stop giving messages of these sources to nodes that subscribe later."""
         if self.publisher is not None:
             for source in sources:
                 self.publisher.unlatch(source)
 
     async def close(self) -> None:
-        """Take the topic back."""
+        """Unadvertise the topic."""
         if self.publisher is not None:
             await self.publisher.close()
 
 
 class SubscriberInterface(RosInterface):
-    """Sends to the peers what nodes of the container publish, not what its own interfaces do."""
+    """Sends messages of the container's nodes to the peers, but not those of its own interfaces."""
 
     subscriber: Subscriber | None = None
 
@@ -125,7 +125,7 @@ class SubscriberInterface(RosInterface):
         self.port.send(payload, latched=True, source=source)
 
     def source_ended(self, source: str) -> None:
-        """Give later peers nothing of a node that ended."""
+        """Stop giving messages of an ended node to peers that come later."""
         self._sources.pop(source, None)
         self.port.keep_latched(self._sources)
 
@@ -141,12 +141,12 @@ class ServiceClientInterface(RosInterface):
     client: ServiceClient | None = None
 
     async def open(self) -> None:
-        """Look for the service."""
+        """Look up the service."""
         self.client = self.node.service_client(self.addr, self.message_type)
         await self.readiness.wait(self.node.wait_for_service(self.addr))
 
     async def serve(self, payload: bytes) -> Buffer:
-        """Pass one request on and return the answer; a failing service's text reaches the caller."""
+        """Pass a request on and return the answer; the caller gets the error text of a failing service."""
         assert self.client is not None
         return await self.client.call_serialized(payload)
 
@@ -157,7 +157,7 @@ class ServiceClientInterface(RosInterface):
 
 
 class ServiceProviderInterface(RosInterface):
-    """Offers a service in the container that the peer provides."""
+    """Offers in the container a service that the peer provides."""
 
     service: Service | None = None
 
@@ -172,7 +172,7 @@ class ServiceProviderInterface(RosInterface):
             raise RosError(f"{self.addr}: {error}") from error
 
     async def close(self) -> None:
-        """Take the service back."""
+        """Unadvertise the service."""
         if self.service is not None:
             await self.service.close()
 
@@ -189,9 +189,9 @@ class InterfaceMaker:
     """Makes a container's interfaces; a :data:`rce.link.InterfaceFactory`.
 
     Args:
-        node: The environment's own node, which takes up topics and services.
+        node: The environment's own node, which registers topics and services.
         types: Knows the messages' and services' types.
-        readiness: What the interfaces wait for.
+        readiness: Decides how long interfaces wait for nodes.
     """
 
     def __init__(self, node: Node, types: TypeRegistry, readiness: Readiness) -> None:

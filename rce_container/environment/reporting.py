@@ -1,4 +1,4 @@
-"""What managers are told of a container: all at first, then what changed if they take that."""
+"""Reports to managers about a container: the whole status first, then patches if they accept them."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from rce_container.environment.channel import Channel
 
 FEATURES = (EXEC, PATCHES)
-"""What this environment can do that one of an earlier release could not."""
+"""The features of this environment that earlier releases do not have."""
 
 
 class Reporter:
-    """Says the same only once to each manager.
+    """Sends each manager only changes.
 
     Args:
         endpoint: Has the container's interfaces and connections.
@@ -31,23 +31,23 @@ class Reporter:
     def __init__(self, endpoint: Endpoint) -> None:
         self._endpoint = endpoint
         self._told: EndpointStatus | None = None
-        """What the manager was told last; without interfaces and connections, if it takes patches."""
+        """The last report to the manager; without interfaces and connections, if it takes patches."""
         self._takes_patches = False
 
     def begin(self) -> None:
-        """Take note that a new manager came, of which nothing is known."""
+        """Start over for a new manager, whose features are not known yet."""
         self._told = None
         self._takes_patches = False
 
     def learn(self, features: Collection[str]) -> None:
-        """Take note of what the manager can do."""
+        """Note the manager's features."""
         self._takes_patches = PATCHES in features
 
     def report(self, channel: Channel, header: EndpointStatus) -> None:
-        """Tell the manager what it does not know yet.
+        """Send the manager the changes since its last report.
 
         Args:
-            channel: Leads to the manager.
+            channel: Connects to the manager.
             header: The container's status without interfaces and connections.
         """
         if self._told is not None and self._takes_patches:

@@ -1,4 +1,4 @@
-"""A container's graph in ROS 1: a core of its own, and the environment's node in it."""
+"""A container's graph in ROS 1: its own core, and the environment's node in it."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Ros1Graph:
         node: The environment's node.
         types: Knows the messages' and services' types.
         address: Where nodes are reached.
-        settling: Whether nodes are starting, or soon will, and may yet take up topics and services.
+        settling: Whether nodes are starting, or soon will, and may yet register topics and services.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Ros1Graph:
         self._core.delete_param(name)
 
     async def listen(self, topic: str, on_message: Callable[[], None]) -> Subscription:
-        """Call ``on_message`` for each message of a topic, whatever its type.
+        """Call ``on_message`` for each message of a topic, of any type.
 
         Raises:
             GraphError: The topic cannot be listened to.
@@ -87,11 +87,11 @@ class Ros1Graph:
             raise GraphError(str(error)) from error
 
     async def follow_records(self, take: Callable[[bytes, bool], None]) -> None:
-        """Give the records that nodes tell ``/rosout`` to ``take``, for as long as the graph lives."""
+        """Pass the records that nodes publish on ``/rosout`` to ``take``, as long as the graph lives."""
         await self._node.subscribe_serialized(AGGREGATE, TypeName(KIND, MD5SUM), take)
 
     async def watch_nodes(self, listener: NodeListener) -> None:
-        """Tell of nodes that appear, until cancelled."""
+        """Report nodes that register, until cancelled."""
         with self._core.watch() as events:
             async with RpcClient() as client, asyncio.TaskGroup() as tasks:
                 async for event in events:
@@ -99,7 +99,7 @@ class Ros1Graph:
                         tasks.create_task(self._identify(client, event.node, listener), name="identify")
 
     async def _identify(self, client: RpcClient, name: str, listener: NodeListener) -> None:
-        """Ask a node whose name tells nothing for its process."""
+        """Ask a node with an unknown name for its process."""
         uri = self._core.graph.nodes.get(name)
         if uri is None or name == f"/{OWN_NODE}":
             return

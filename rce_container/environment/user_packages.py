@@ -1,4 +1,4 @@
-"""Which of the packages that the user brought are there yet, and what a node is started with because of it.
+"""The packages that the user brought and that have arrived, and the launch environment of nodes.
 
 The manager puts each into the folder :attr:`rce_container.environment.messages.Boot.user_packages`, as
 ``SHA256/NAME``; it appears whole.
@@ -19,11 +19,11 @@ from rce.packages.versions import newest, split_package
 from rce.ros.packages import PATH_VARIABLES, PackageIndex
 
 REQUIREMENTS = ".requirements"
-"""Folder beside a package, with what its ``requirements.txt`` asked for."""
+"""Folder beside a package, with the modules that its ``requirements.txt`` asked for."""
 
 
 class LaunchEnvironment(NamedTuple):
-    """What a node is started with."""
+    """The launch environment of a node."""
 
     spec: NodeSpec
     """The node; its package without a version."""
@@ -51,21 +51,21 @@ class UserPackages:
         self.index = PackageIndex(self._packages)
 
     def apply(self, wanted: tuple[PackageSpec, ...]) -> None:
-        """Take over what is desired, and look at what is there."""
+        """Apply the desired packages, and check which have arrived."""
         self._wanted = wanted
         self.look()
 
     def look(self) -> None:
-        """Look at what is there."""
+        """Check which packages have arrived."""
         self.index.path = self._path(None)
 
     @property
     def is_waiting(self) -> bool:
-        """Whether something is still to come."""
+        """Whether a package has yet to arrive."""
         return not all(map(self._is_there, self._wanted))
 
     def lacking(self, nodes: Iterable[NodeSpec]) -> dict[str, str]:
-        """Tell which nodes cannot start because their package is still to come, and say so in words."""
+        """Return the nodes whose package has yet to arrive, each with a text about it."""
         texts = {}
         for node in nodes:
             package = self._find(node.pkg)
@@ -74,11 +74,11 @@ class UserPackages:
         return texts
 
     def hold_back(self, spec: EndpointSpec, before: Collection[InterfaceSpec]) -> EndpointSpec:
-        """Leave out interfaces whose type may be in a package that is still to come, with what hangs on them.
+        """Leave out interfaces whose type may be in a package yet to arrive, with their connections.
 
         Args:
-            spec: What is desired.
-            before: Interfaces that are there; they stay.
+            spec: The desired state.
+            before: Interfaces that exist; they stay.
         """
         coming = {package.name for package in self._wanted if not self._is_there(package)}
         if not coming:
@@ -93,7 +93,7 @@ class UserPackages:
         return msgspec.structs.replace(spec, interfaces=kept, connections=connections)
 
     def launch_environment(self, node: NodeSpec, environ: Mapping[str, str]) -> LaunchEnvironment:
-        """Work out what a node is started with.
+        """Return the launch environment of a node.
 
         Args:
             node: The node.
@@ -114,13 +114,13 @@ class UserPackages:
         )
 
     def _find(self, pkg: str) -> PackageSpec | None:
-        """Find what a node names; None if its user brought no such package."""
+        """Return the package that a node names; None if its user brought no such package."""
         name, version = split_package(pkg)
         fitting = [one for one in self._wanted if one.name == name and version in ("", one.version)]
         return newest(fitting, lambda one: one.version)
 
     def _path(self, first: PackageSpec | None) -> tuple[Path, ...]:
-        """The package path: of one package, of the newest of each name, of the others, of the machine."""
+        """Return the package path: one package, the newest of each name, the others, the machine's."""
         names = dict.fromkeys(package.name for package in self._wanted)
         chosen = [first, *map(self._find, names), *self._wanted]
         roots = [self._root(package) for package in chosen if package is not None and self._is_there(package)]

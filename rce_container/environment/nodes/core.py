@@ -1,7 +1,7 @@
-"""What is decided about a container's nodes: events in, instructions out. Pure: no I/O, no clock, no task.
+"""Decisions about a container's nodes: events in, instructions out. Pure: no I/O, no clock, no task.
 
-A node lives several lives, numbered over all nodes. Events of a life that is over are ignored. A node never
-has two processes: the next life is launched when all of the last one has ended.
+A node has several lives, numbered over all nodes. Events of an ended life are ignored. A node never has two
+processes: its next life is launched after all processes of the last one have ended.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from rce_container.environment.nodes.order import StartOrder, levels, ready_to_e
 from rce_container.environment.nodes.record import LAST_CHANCE_S, Node
 
 BACKOFF = Backoff(first=0.5, longest=30.0)
-"""Pauses before a node that ended is started again."""
+"""Delays before a node that ended is started again."""
 FIRST_BEAT_WITHIN_S = 30.0
-"""How long after its start a node may take for its first heartbeat."""
+"""Seconds from a node's start within which its first heartbeat has to arrive."""
 REGISTERS_WITHIN_S = 10.0
-"""A node that did not register with the ROS core for so long probably never will."""
+"""A node that did not register with the ROS core within this time probably never will."""
 SETTLES_WITHIN_S = 0.5
-"""After a node's first registration its others follow within this time."""
+"""A node's other registrations follow its first one within this time."""
 SOON_S = 5.0
 """A node that is started again within this time is worth waiting for."""
 
@@ -59,7 +59,7 @@ class NodesCore:
         self._nodes: dict[str, Node] = {}
         self._order = StartOrder()
         self._impossible: dict[str, str] = {}
-        """Nodes that can never start as things are, with the reason."""
+        """Nodes that can never start with the present specifications, with the reason."""
         self._lacking: Mapping[str, str] = {}
         """Nodes that lack what they are launched with, with the reason."""
         self._lives = count(1)
@@ -67,11 +67,11 @@ class NodesCore:
         self._now = 0.0
 
     def handle(self, event: Event, now: float) -> list[Instruction]:
-        """Take in what happened; return what is to be done about it.
+        """Handle an event; return the resulting instructions.
 
         Args:
             event: What happened.
-            now: Seconds on a clock that never goes back.
+            now: Seconds on a monotonic clock.
         """
         self._now, self._out = now, []
         match event:
@@ -94,11 +94,11 @@ class NodesCore:
         self._launch_those_whose_turn_it_is()
         return self._out
 
-    # What is asked
+    # Queries
 
     @property
     def statuses(self) -> tuple[NodeStatus, ...]:
-        """What there is to report, by tag."""
+        """Return the nodes' statuses, by tag."""
         return tuple(self._nodes[tag].status() for tag in sorted(self._nodes))
 
     @property
@@ -111,12 +111,12 @@ class NodesCore:
         )
 
     def life(self, tag: str) -> int:
-        """The number of a node's newest life; 0 if there is none."""
+        """Return the number of a node's newest life; 0 if it has none."""
         node = self._nodes.get(tag)
         return node.life if node is not None else 0
 
     def is_settling(self, now: float) -> bool:
-        """Whether a node has yet to take up its topics and services, and is likely to do so soon."""
+        """Whether a node has yet to register its topics and services, and is likely to do so soon."""
         return any(self._settles_at(node) > now for node in self._nodes.values())
 
     @property
@@ -133,7 +133,7 @@ class NodesCore:
             limit = node.spec.max_restarts
             assert not limit or node.in_a_row <= limit
 
-    # What happens
+    # Events
 
     def _desire(self, desired: dict[str, NodeSpec]) -> None:
         for tag, node in list(self._nodes.items()):
@@ -190,7 +190,7 @@ class NodesCore:
             self._become(node, LifeEvent.REGISTER)
 
     def _beat(self, tag: str) -> bool:
-        """Take a heartbeat; whether it changes anything."""
+        """Handle a heartbeat; return whether it changes anything."""
         node = self._nodes.get(tag)
         if node is None or not node.has_process:
             return False
@@ -220,7 +220,7 @@ class NodesCore:
         self._tell(node, f"is stuck: {node.detail}{again}")
 
     def _end(self, node: Node, code: int | None, reason: str, *, hopeless: bool = False) -> None:
-        """A life ended, or could not begin."""
+        """Handle the end of a life, or of an attempt to start one."""
         stopped = node.state is NodeState.STOPPING
         node.pid, node.exit_code = 0, code
         if stopped and node.failing:
@@ -244,7 +244,7 @@ class NodesCore:
             self._become(node, LifeEvent.DONE, detail="ended")
 
     def _again(self, node: Node, reason: str, *, failed: bool) -> None:
-        """Start a node that ended again, after a pause, unless that was done too often."""
+        """Restart a node that ended, after a delay, unless it was restarted too often."""
         if node.ran_well(self._now):
             node.in_a_row = 0
         limit = node.spec.max_restarts
@@ -271,7 +271,7 @@ class NodesCore:
         node.told = ""
         self._tell(node, _failure(reason))
 
-    # What is done about it
+    # Instructions
 
     def _end_those_whose_turn_it_is(self) -> None:
         """Nodes that are not desired end in the reverse of their start order, changed ones at once."""
@@ -306,7 +306,7 @@ class NodesCore:
         return node.spec.tag in self._impossible
 
     def _awaited(self, node: Node) -> list[str]:
-        """The nodes before it that are not ready."""
+        """Return the nodes that have to be ready before it and are not."""
         assert node.desired is not None, "one that is not desired is forgotten, not waiting"
         return [tag for tag in node.desired.after if not self._nodes[tag].is_ready]
 
@@ -329,7 +329,7 @@ class NodesCore:
         self._out.append(Halt(node.spec.tag, node.life, node.share))
 
     def _renew(self, node: Node, life_event: LifeEvent) -> None:
-        """Begin anew with what is desired."""
+        """Start again with the desired specification."""
         assert node.desired is not None
         self._become(node, life_event)
         node.spec = node.desired
@@ -353,7 +353,7 @@ class NodesCore:
             node.told = text
             self._out.append(Tell(f"node {node.spec.tag} {text}"))
 
-    # What is worked out
+    # Helpers
 
     def _settles_at(self, node: Node) -> float:
         match node.state:

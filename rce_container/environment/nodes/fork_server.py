@@ -19,10 +19,10 @@ _HANDLED = "PYTHONUNBUFFERED"
 
 
 class NodeForkServer:
-    """Starts Python scripts without starting a Python.
+    """Starts Python scripts without starting a Python interpreter.
 
     Args:
-        sock: Leads to the node fork server.
+        sock: Connects to the node fork server.
     """
 
     def __init__(self, sock: socket.socket) -> None:
@@ -35,7 +35,7 @@ class NodeForkServer:
         """Start a process, a child of this one, if it is a script for this very Python. Blocks briefly.
 
         Returns:
-            Its pid; 0 if it has to be started in the ordinary way.
+            Its pid; 0 if the node has to be started in the ordinary way.
         """
         if self._sock is None or not fits(argv, env, os.environ):
             return 0
@@ -54,14 +54,14 @@ class NodeForkServer:
         return int(answer)
 
     def close(self) -> None:
-        """Let the node fork server end."""
+        """End the node fork server."""
         if self._sock is not None:
             self._sock.close()
             self._sock = None
 
 
 def fits(argv: Sequence[str], env: Mapping[str, str], own: Mapping[str, str]) -> bool:
-    """Whether a command is a script for this Python, with nothing that would make Python another one."""
+    """Whether a command is a script for this Python, with the same variables that shape an interpreter."""
     return (
         len(argv) > 1
         and argv[0] == sys.executable
@@ -72,7 +72,7 @@ def fits(argv: Sequence[str], env: Mapping[str, str], own: Mapping[str, str]) ->
 
 
 def _hides_a_module(folder: Path) -> bool:
-    """Whether a script in this folder would import something from there that is here from elsewhere."""
+    """Whether a script in this folder would import a module from there that is loaded here from elsewhere."""
     try:
         names = {path.name.partition(".")[0] for path in folder.iterdir()}
     except OSError:
@@ -81,7 +81,7 @@ def _hides_a_module(folder: Path) -> bool:
 
 
 def _shaping(env: Mapping[str, str]) -> dict[str, str]:
-    """The variables that Python and the dynamic linker read when a program starts."""
+    """Return the variables that Python and the dynamic linker read when a program starts."""
     return {
         name: value
         for name, value in env.items()

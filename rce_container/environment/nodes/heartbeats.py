@@ -1,4 +1,4 @@
-"""Listens to the topics by which nodes show that they are well."""
+"""Listens to the heartbeat topics of nodes."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ class _Listening(NamedTuple):
 
 
 class Heartbeats:
-    """Subscribes to the heartbeat topics of a container's nodes, whatever their types.
+    """Subscribes to the heartbeat topics of a container's nodes, of any message type.
 
     Args:
         graph: The container's graph.
-        on_beat: Takes the tag of a node that gave a sign.
+        on_beat: Takes the tag of a node that sent a heartbeat.
         on_fault: A topic cannot be listened to; a text for the user.
     """
 
@@ -30,7 +30,7 @@ class Heartbeats:
         self._on_fault = on_fault
         self._listening: dict[str, _Listening] = {}
         self._refused: dict[str, str] = {}
-        """Topics that cannot be listened to, by the nodes' tags; the user was told."""
+        """Topics that cannot be subscribed to, by the nodes' tags; reported to the user."""
 
     async def follow(self, specs: Iterable[NodeSpec]) -> None:
         """Listen to exactly the topics that these nodes name."""
@@ -58,6 +58,6 @@ class Heartbeats:
 
 
 def topic_of(spec: NodeSpec) -> str:
-    """The global name of a node's heartbeat topic, which may be relative or private to the node."""
+    """Return the global name of a node's heartbeat topic, which may be relative or private to the node."""
     caller = "/" + "/".join(filter(None, (spec.namespace.strip("/"), spec.name or spec.tag)))
     return names.resolve(spec.heartbeat, caller)

@@ -1,4 +1,4 @@
-"""What a node's process is started with: its arguments and its environment."""
+"""The arguments and the environment of a node's process."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ class Launch(NamedTuple):
     argv: list[str]
     env: dict[str, str]
     ros_name: str
-    """The global ROS name that it was told to take; empty if it chooses by itself."""
+    """The global ROS name that it is to take; empty if it chooses its own name."""
 
 
 def prepare(launch_environment: LaunchEnvironment, mark: str) -> Launch:
     """Work out how to start a node.
 
     Args:
-        launch_environment: What it is started with.
+        launch_environment: The folders and variables of its launch.
         mark: The value of :data:`NODE_MARK`.
 
     Raises:

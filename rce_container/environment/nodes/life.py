@@ -1,7 +1,8 @@
-"""The life of a node: its states, what may happen in each, and what follows.
+"""The life cycle of a node: its states, the events of each, and the transitions.
 
-What each state means is said at :class:`rce.control.model.NodeState`. A node has a process exactly while it
-is starting, running, stuck or stopping. One that is not desired any more is forgotten as soon as it has none.
+:class:`rce.control.model.NodeState` describes each state. A node has a process exactly while it
+is starting, running, stuck or stopping. A node that is not desired any more is forgotten as soon as it has no
+process.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Starting processes and waiting for them, adopted orphans included."""
+"""Starts processes and waits for them, adopted orphans included."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Child:
         self.pid = pid
         """The process id, which is also its group's and its session's."""
         self.ended = ended
-        """Its exit code; negative for a signal."""
+        """The exit code; negative for a signal."""
         self._process = process
 
     def signal_group(self, number: signal.Signals) -> None:
@@ -41,10 +41,10 @@ class Child:
 
 
 class Reaper:
-    """Waits for every child of this process, so that orphans which the kernel hands to it leave no zombie.
+    """Waits for every child of this process, so that orphans which it adopts leave no zombies.
 
     Use as a context manager in the main thread, one per process, and start processes by :meth:`spawn` only:
-    it collects exit codes that nobody else will see then.
+    it collects the exit codes of all children, which then nothing else can read.
 
     Args:
         node_server: Starts the processes that it can; None for none.
@@ -78,7 +78,7 @@ class Reaper:
             pid = self._node_server.spawn(argv, env=env, cwd=cwd, stdout=stdout, stderr=stderr)
             if pid:
                 return self._keep(Child(pid, ended))
-        process = subprocess.Popen(  # noqa: S603 - what a user's package offers is what runs here
+        process = subprocess.Popen(  # noqa: S603 - runs the programs of users' packages
             argv,
             env=env,
             cwd=cwd,
@@ -106,7 +106,7 @@ class Reaper:
             env: All of its environment variables.
             cwd: Where it starts.
             streams: The descriptors.
-            terminal: The first of them becomes the session's terminal.
+            terminal: Whether the first of them becomes the session's terminal.
 
         Raises:
             OSError: It cannot be started.
