@@ -53,7 +53,7 @@ class Handle(Protocol):
 
 
 async def release(handle: Handle) -> None:
-    """Close a handle at the end of a block; that the master cannot be told any more is not worth an error."""
+    """Close a handle at the end of a block; ignore it if the master cannot be reached any more."""
     try:
         await handle.close()
     except MasterError as error:

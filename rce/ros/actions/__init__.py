@@ -1,4 +1,4 @@
-"""Actions: long tasks that a node asks another one for, with feedback, cancellation and a result.
+"""Actions: long tasks that one node requests from another, with feedback, cancellation and a result.
 
 On the wire it is ROS's actionlib: five topics below the action's name.
 """

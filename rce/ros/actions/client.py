@@ -1,4 +1,4 @@
-"""Action clients: the five topics around trackers of goals."""
+"""Action clients: the five topics of an action, and a tracker for each goal."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 PATIENCE = 10.0
-"""Seconds of silence of a server, which should speak five times a second, after which its goals are lost."""
+"""Seconds without a status of the server, which should send five a second, after which its goals are lost."""
 
 TICK = 0.25
-"""Seconds between two looks whether something must be repeated or given up, while goals are under way."""
+"""Seconds between checks whether a message must be repeated or a goal given up, while goals are under way."""
 
 
 class ActionClient:
@@ -38,7 +38,7 @@ class ActionClient:
     ``async with ActionClient(node, "fibonacci", "actionlib_tutorials/FibonacciAction") as client:``
     ``goal = await client.send(order=5)``, ``print(await goal.result())``
 
-    Leaving the block forgets the goals, which continue at the server; here, they are lost.
+    Leaving the block forgets the goals: they continue at the server, and count as lost here.
 
     Attributes:
         name: The action's global name.
@@ -59,7 +59,7 @@ class ActionClient:
             name: The action's name: the namespace of its topics.
             kind: Its type, such as ``actionlib_tutorials/FibonacciAction``; ``Action`` may be left out.
             patience: Seconds of silence of the server after which its goals are lost; ``math.inf``: never.
-                While simulated time stands still, nothing is missed.
+                Time does not count while simulated time stands still.
         """
         self.name = node.resolve(name)
         self._node = node
@@ -120,7 +120,7 @@ class ActionClient:
         """Wait until a server has spoken and all five topics are connected.
 
         Raises:
-            TimeoutError: There is none within ``timeout`` seconds.
+            TimeoutError: No server was connected within ``timeout`` seconds.
         """
         async with asyncio.timeout(timeout):
             await self._heard.wait()
@@ -175,7 +175,7 @@ class ActionClient:
         """Ask the server to end all goals made up to a time, those of other clients and late ones too."""
         self._cancel.publish(stamp=time)
 
-    # What the server says
+    # Messages of the server
 
     def _status_received(self, message: Message) -> None:
         now = self._clock.now()
@@ -208,7 +208,7 @@ class ActionClient:
         if goal is not None:
             goal.feedback_received(message.feedback)
 
-    # Looking after goals
+    # Repeating messages and giving goals up
 
     async def _look_after_goals(self) -> None:
         while True:
@@ -246,6 +246,6 @@ class ActionClient:
 
 
 def _patient_clock(node: Node) -> PatientClock:
-    """A machine's clock may be set back; silence is not measured in that, unless time is simulated."""
+    """Return the clock for silence: not the time of day, which may be set back, unless time is simulated."""
     machine = asyncio.get_running_loop().time
     return PatientClock(machine, node.time if node.is_time_simulated else machine)

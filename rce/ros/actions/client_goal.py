@@ -1,4 +1,4 @@
-"""A goal as the program sees it that asked for it."""
+"""A goal as the requesting program sees it."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class ClientGoal:
     ) -> None:
         self.goal_id = goal_id
         self.tracker = tracker
-        """What is known of it."""
+        """The goal's state."""
         self._send_cancel = send_cancel
         self._on_feedback = on_feedback
         self._on_change = on_change
@@ -72,21 +72,21 @@ class ClientGoal:
 
     @property
     def comm_state(self) -> CommState:
-        """How far the exchange with the server is."""
+        """The state of the communication with the server."""
         return self.tracker.comm
 
     @property
     def text(self) -> str:
-        """The server's words on its state."""
+        """The server's text on the goal's state."""
         return self.tracker.text
 
     @property
     def is_done(self) -> bool:
-        """Whether the result is there or the goal is lost."""
+        """Whether the result has come or the goal is lost."""
         return self.tracker.is_done
 
     def cancel(self) -> None:
-        """Ask the server to end it; without effect once it is over. How it ended, its result tells."""
+        """Ask the server to end the goal; without effect once it is over. The result tells how it ended."""
         if not self.is_done:
             self._send_cancel(self)
 
@@ -126,7 +126,7 @@ class ClientGoal:
             await self._arrived.wait()
         return self._feedback.take()
 
-    # What the client tells
+    # For the client
 
     def feedback_received(self, feedback: Message) -> None:
         """Take feedback."""
@@ -139,7 +139,7 @@ class ClientGoal:
             self._arrived.set()
 
     def changed(self, passed: tuple[CommState, ...], result: Message | None = None) -> None:
-        """Take what the tracker made of an event."""
+        """Take a change of the tracker's state."""
         if not passed:
             return
         if self.is_done:

@@ -1,4 +1,4 @@
-"""What can go wrong with actions.
+"""Errors of actions.
 
 ::
 
@@ -31,8 +31,8 @@ class GoalFailedError(ActionError):
     Attributes:
         goal_id: Which goal.
         state: How it ended: aborted, rejected, preempted, recalled or lost.
-        text: What the server says about it.
-        result: The result that came all the same; None for a lost goal.
+        text: The server's text on it.
+        result: The result, which comes for failed goals too; None for a lost goal.
     """
 
     def __init__(self, goal_id: str, state: GoalState, text: str, result: Message | None) -> None:
@@ -55,7 +55,7 @@ class IllegalTransitionError(InvalidTransitionError, ActionError):
 
 
 class UnknownGoalError(ActionError, LookupError):
-    """There is no such goal, or not any longer.
+    """The server does not know the goal, or no longer.
 
     Attributes:
         goal_id: Which goal.

@@ -1,4 +1,4 @@
-"""What an action server remembers of its goals. Pure: events and the time go in, what changed comes out.
+"""The goals that an action server keeps. Pure: takes events and the time, and returns what changed.
 
 Rules of ROS's own servers that clients rely on:
 
@@ -32,11 +32,11 @@ class Entry:
 
     Attributes:
         goal_id: Its name and stamp.
-        state: How it stands.
-        text: The server's words on it.
+        state: Its state.
+        text: The server's text on its state.
         has_come: False for a goal of which only the cancellation has come.
         forget_at: When it leaves the list, seconds; None while it is not over.
-        recent: What happened to it last.
+        recent: Its latest event.
     """
 
     goal_id: GoalId
@@ -48,7 +48,7 @@ class Entry:
 
 
 class Arrival(Enum):
-    """What a goal that comes means to a server."""
+    """How a server classifies an incoming goal."""
 
     NEW = auto()
     """It is to be worked on."""
@@ -73,7 +73,7 @@ class GoalLedger:
         """Return a goal's entry.
 
         Raises:
-            UnknownGoalError: There is none (any longer).
+            UnknownGoalError: The goal is not in the list (any more).
         """
         try:
             return self._entries[goal_id]
@@ -125,14 +125,14 @@ class GoalLedger:
         return asked
 
     def begin_anew(self) -> None:
-        """Learn that time jumped back: cancellations of all goals up to a time are void."""
+        """Take note that time jumped back: cancellations of all goals up to a time are void."""
         self._cancelled_up_to = 0
 
     def apply(self, goal_id: str, event: GoalEvent, now: float, text: str = "") -> Entry:
-        """Let something happen to a goal.
+        """Apply an event to a goal.
 
         Raises:
-            UnknownGoalError: There is no such goal.
+            UnknownGoalError: The server does not know the goal.
             IllegalTransitionError: It is not possible in the goal's state; nothing was changed.
         """
         entry = self[goal_id]
@@ -143,7 +143,7 @@ class GoalLedger:
         return entry
 
     def listed(self, now: float) -> Iterable[Entry]:
-        """Forget what is to be forgotten and return the rest, the oldest first."""
+        """Remove expired goals and return the rest, the oldest first."""
         overdue = [
             key
             for key, entry in self._entries.items()

@@ -1,4 +1,4 @@
-"""Action servers: the five topics around a ledger of goals, a policy and the program's handler."""
+"""Action servers: the five topics of an action, a ledger of goals, a policy and the program's handler."""
 
 from __future__ import annotations
 
@@ -136,11 +136,11 @@ class ActionServer:
 
     async def _keep_publishing(self, period: float) -> None:
         while True:
-            await asyncio.sleep(period)  # of real time: clients learn how goals stand while time stands still
+            await asyncio.sleep(period)  # real time: clients need the list while ROS time stands still
             self._see_time()
             self._publish_status()
 
-    # What clients say
+    # Messages of clients
 
     def _goal_received(self, message: Message) -> None:
         goal_id, now = GoalId.read(message.goal_id), self._see_time()
@@ -195,10 +195,10 @@ class ActionServer:
         if not goal.state.is_over:
             self.transition(self._ledger[goal.id], event, text, None)
 
-    # What the program says
+    # Calls of the program
 
     def transition(self, entry: Entry, event: GoalEvent, text: str, result: Message | Content | None) -> None:
-        """Let something happen to a goal and tell its clients.
+        """Apply an event to a goal and tell its clients.
 
         Raises:
             IllegalTransitionError: It is not possible in the goal's state.
@@ -213,7 +213,7 @@ class ActionServer:
             self._publish_result(entry, content.result)
 
     def publish_feedback(self, entry: Entry, feedback: Message | Content) -> None:
-        """Tell a goal's clients how it goes.
+        """Publish feedback to a goal's clients.
 
         Raises:
             SerializationError: The feedback does not fit its type.
@@ -239,7 +239,7 @@ class ActionServer:
         except asyncio.CancelledError:
             work.give_up(goal, STOPPED)
             raise
-        except Exception as error:  # noqa: BLE001 - the program's own fault is the client's to know
+        except Exception as error:  # noqa: BLE001 - the client gets every failure of the program
             _log.exception("the handler of %s failed on goal %s", self.name, goal.id)
             work.give_up(goal, f"{type(error).__name__}: {error}")
         finally:

@@ -1,4 +1,4 @@
-"""A goal as the program sees it that works on it."""
+"""A goal as the program that works on it sees it."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ Content = Mapping[str, Any]
 
 
 class GoalServer(Protocol):
-    """What a goal needs of its server."""
+    """The server, as its goals use it."""
 
     def transition(self, entry: Entry, event: GoalEvent, text: str, result: Message | Content | None) -> None:
-        """Let something happen to a goal and tell its clients."""
+        """Apply an event to a goal and tell its clients."""
 
     def publish_feedback(self, entry: Entry, feedback: Message | Content) -> None:
-        """Tell the goal's clients how it goes."""
+        """Publish feedback to the goal's clients."""
 
     async def sleep(self, seconds: float) -> bool:
         """Sleep in ROS time; tell whether the node continues."""
@@ -64,15 +64,15 @@ class ServerGoal:
 
     @property
     def state(self) -> GoalState:
-        """How the goal stands."""
+        """The goal's state."""
         return self._entry.state
 
     @property
     def text(self) -> str:
-        """What was said last on how it stands."""
+        """The latest text on the goal's state."""
         return self._entry.text
 
-    # What happens to it
+    # Transitions
 
     def accept(self, text: str = "") -> None:
         """Begin to work on it.
@@ -91,7 +91,7 @@ class ServerGoal:
         self._server.transition(self._entry, GoalEvent.REJECT, text, result)
 
     def succeed(self, result: Message | Content | None = None, text: str = "") -> None:
-        """End it: it was reached. ``result`` is a message, or a mapping of its fields.
+        """End the goal with success. ``result`` is a message, or a mapping of its fields.
 
         Raises:
             IllegalTransitionError: It was not accepted, or is over.
@@ -100,7 +100,7 @@ class ServerGoal:
         self._server.transition(self._entry, GoalEvent.SUCCEED, text, result)
 
     def abort(self, text: str = "", result: Message | Content | None = None) -> None:
-        """End it: it is given up.
+        """End the goal without success.
 
         Raises:
             IllegalTransitionError: It was not accepted, or is over.
@@ -118,14 +118,14 @@ class ServerGoal:
         self._server.transition(self._entry, GoalEvent.CANCEL, text, result)
 
     def publish_feedback(self, feedback: Message | Content | None = None, /, **fields: Any) -> None:
-        """Tell the clients how it goes, by a message, a mapping of its fields, or its fields.
+        """Publish feedback, given as a message, as a mapping of its fields, or by its fields.
 
         Raises:
             SerializationError: A value does not fit its field.
         """
         self._server.publish_feedback(self._entry, fields if feedback is None else feedback)
 
-    # Being asked to end
+    # Cancellation
 
     @property
     def cancel_requested(self) -> bool:
@@ -153,5 +153,5 @@ class ServerGoal:
             await cancel_and_wait(sleeping, stopping)
 
     def request_cancel(self) -> None:
-        """Ask the handler to end it; the server does, programs may."""
+        """Ask the handler to end the goal. The server calls this; a program may too."""
         self._stop.set()

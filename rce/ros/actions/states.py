@@ -57,7 +57,7 @@ _OVER = frozenset(
 
 
 class GoalEvent(Enum):
-    """What happens to a goal at its server."""
+    """An event of a goal at its server."""
 
     ACCEPT = auto()
     """The server begins to work on it."""
@@ -109,7 +109,7 @@ GOAL_LIFE: LifeCycle[GoalState, GoalEvent] = LifeCycle(
     },
     error=IllegalTransitionError,
 )
-"""A goal at its server. What is not here cannot happen."""
+"""A goal at its server. Transitions that are not listed are illegal."""
 
 
 class CommState(Enum):

@@ -1,4 +1,4 @@
-"""What an action client knows of one goal. Pure: events and the time go in, the states passed come out."""
+"""An action client's state of one goal. Pure: takes events and the time, and returns the states passed."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class GoalTracker:
         since: When the communication state began.
         comm: The communication state.
         state: The goal's state, as the server last said.
-        text: The server's words on it.
+        text: The server's text on its state.
         is_acknowledged: Whether the server has ever listed the goal.
         sent_at: When the goal, or its cancellation, was sent last.
     """
@@ -48,13 +48,13 @@ class GoalTracker:
         return self.comm is CommState.DONE
 
     def listed(self, state: GoalState, text: str, now: float) -> tuple[CommState, ...]:
-        """Take what the server's list says.
+        """Take the goal's entry in the server's list.
 
         Returns:
-            The communication states that were passed, the present one last; empty if there is no change.
+            The communication states that were passed, the present one last; empty if nothing changed.
 
         Raises:
-            IllegalTransitionError: No goal goes this way; nothing was changed.
+            IllegalTransitionError: The transition is illegal; nothing was changed.
         """
         if self.is_done:
             return ()
@@ -82,7 +82,7 @@ class GoalTracker:
         return self._pass((*passed, CommState.DONE), now)
 
     def cancelled(self, now: float) -> tuple[CommState, ...]:
-        """Learn that a cancellation was sent; it changes nothing for a goal that ends already."""
+        """Take note that a cancellation was sent; it changes nothing for a goal that ends already."""
         if self.comm in _ENDING:
             return ()
         self.sent_at = now

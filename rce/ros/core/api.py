@@ -1,4 +1,4 @@
-"""The Master API and the Parameter Server API: checks arguments, asks the graph, words the answers.
+"""The Master API and the Parameter Server API: check arguments, query the graph, format the answers.
 
 http://wiki.ros.org/ROS/Master_API, http://wiki.ros.org/ROS/Parameter%20Server%20API
 """
@@ -30,7 +30,7 @@ NOTHING: dict[str, Any] = {
     "hasParam": False,
     "getParamNames": [],
 }
-"""What these methods' failures carry as value: as rosmaster's, of the type that is expected."""
+"""The value in a failed answer of each method: of the expected type, as rosmaster's."""
 
 
 class MasterApi:
@@ -47,8 +47,8 @@ class MasterApi:
 
         Args:
             graph: The state.
-            uri: Tells the core's own URI.
-            perform: Takes what follows from an operation.
+            uri: Returns the core's own URI.
+            perform: Takes the outcome of an operation.
             on_shutdown: Takes the reason when the core is told to end; without it, that is refused.
         """
         self._graph = graph

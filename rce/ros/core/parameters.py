@@ -16,7 +16,7 @@ from rce.ros.xmlrpc.dispatch import BadArgumentError
 Tree = dict[str, Any]
 
 UNSET: Tree = {}
-"""What a subscriber is told of a parameter that is not set."""
+"""The value that a subscriber gets for a parameter that is not set."""
 
 
 class ParameterTree:
@@ -29,7 +29,7 @@ class ParameterTree:
         """Return a parameter or, as a dictionary, all of a namespace.
 
         Raises:
-            KeyError: There is neither.
+            KeyError: Neither exists.
         """
         value: Any = self._root
         for segment in names.segments(name):
@@ -50,7 +50,7 @@ class ParameterTree:
         """Set a parameter, or replace a whole namespace by a dictionary.
 
         Raises:
-            BadArgumentError: The root would become something else than a namespace.
+            BadArgumentError: The root would become something other than a namespace.
         """
         path = names.segments(name)
         value = copy.deepcopy(value)
@@ -103,11 +103,11 @@ class ParameterTree:
 
 
 def affected(subscribed: Iterable[str], name: str) -> Iterator[tuple[str, str]]:
-    """Tell whom a change of ``name`` concerns.
+    """Return the subscriptions that a change of ``name`` concerns.
 
     Yields:
-        ``(subscribed name, name to report)``: who subscribed to a namespace is told the changed parameter;
-        who subscribed to something inside a changed namespace is told their own.
+        ``(subscribed name, name to report)``: a subscriber of a namespace is told the changed parameter;
+        a subscriber of something inside a changed namespace is told its own name.
     """
     changed = name.rstrip(names.SEPARATOR) + names.SEPARATOR
     for subscription in subscribed:

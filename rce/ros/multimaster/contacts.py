@@ -23,13 +23,13 @@ _log = logging.getLogger(__name__)
 CONTACT_TIMEOUT = 5.0
 STATE_TIMEOUT = 20.0
 ORIGINS_TIMEOUT = 3.0
-"""Seconds that others get to answer."""
+"""Seconds that others may take to answer."""
 
 SYNC_INFO = "get_sync_info"
 
 
 async def ask_contact(rpc: RpcClient, key: PeerKey) -> Contact:
-    """Ask a discovery who it is.
+    """Ask a discovery for its contact.
 
     Raises:
         MalformedStateError: It does not answer, or not in the known form, or does not know its master yet.
@@ -73,7 +73,7 @@ class OriginsReader:
         self._clients: dict[str, ServiceClient] = {}
 
     async def read(self, snapshot: Snapshot) -> Origins:
-        """Ask all that are among the registrations in ``snapshot``."""
+        """Ask all synchronizations among the registrations in ``snapshot``."""
         hosts = self._hosts()
         found: list[Any] = []
         for service, uri in snapshot.service_uris.items():

@@ -1,4 +1,4 @@
-"""A discovery: announces its master, finds others, tells its graph and its program of them."""
+"""A discovery: announces its master, finds others, and reports them to its graph and its program."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ from rce.ros.xmlrpc import RpcClient, RpcServer
 _log = logging.getLogger(__name__)
 
 DEAD_AFTER_POLLS = 3
-"""After so many questions without an answer, others are told that this master is gone."""
+"""After so many requests without an answer, others are told that this master is gone."""
 
 FIRST_REQUESTS = 3
-"""How often, at the start, everybody is asked for their state."""
+"""How often, at the start, all masters are asked for their state."""
 
 
 class Discovery:
@@ -71,7 +71,7 @@ class Discovery:
         self._robots = RobotHosts(settings.robot_addresses, self._beat_now.set)
         self._is_master_up = True
         self._is_listening = False
-        """Heartbeats that come before or after are left alone: they are repeated."""
+        """Whether heartbeats are handled; earlier and later ones are ignored, as they are repeated."""
         self._last_request = 0.0
         self._stack = AsyncExitStack()
         self._monitor: MasterMonitor
@@ -278,7 +278,7 @@ class Discovery:
             self._answer(sender, to_group=to_group)
 
     def _answer(self, sender: tuple[str, int], *, to_group: bool) -> None:
-        """Send the own state to who asked for it, and to the group if that was asked or has several ends."""
+        """Send the own state to the asking host, and to the group if that was asked or has several ends."""
         now = self._now()
         if (
             to_group or sender[0] == self._own.host
@@ -297,14 +297,14 @@ class Discovery:
             )
 
     def _unicast_addresses(self) -> list[tuple[str, int]]:
-        """Whom heartbeats are sent to one by one: everybody that is known, if not to the group."""
+        """The hosts that heartbeats are sent to one by one: all known ones, if not to the group."""
         known = self._robots.addresses
         if not self.settings.send_mcast:
             named = {host for host, _ in known} | {self._own.host}
             known = known + [(host, self.settings.mcast_port) for host in self._neighbours.hosts - named]
         return known
 
-    # What follows
+    # Steps and events
 
     def _follow(self, step: Step) -> None:
         for event in step.events:

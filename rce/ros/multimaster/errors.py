@@ -1,4 +1,4 @@
-"""What can go wrong between masters.
+"""Errors of multimaster.
 
 ::
 
@@ -8,7 +8,7 @@
         +-- MalformedStateError      a master's description that cannot be read
         +-- NoSuchInterfaceError     an interface or address to discover on that is not there
         +-- NoDiscoveryError         no discovery runs at a master
-        +-- NothingToRelayError      the type of a topic or service cannot be learned: nobody offers it
+        +-- NothingToRelayError      the type of a topic or service cannot be learned: no node offers it
         +-- LinkBrokenError          the other end of a relay link breaks its protocol or refuses
 """
 
@@ -30,7 +30,7 @@ class MalformedStateError(MultimasterError):
 
 
 class NoSuchInterfaceError(MultimasterError):
-    """There is no such network interface or address on this machine."""
+    """The network interface or address does not exist on this machine."""
 
 
 class NoDiscoveryError(MultimasterError):

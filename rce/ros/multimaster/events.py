@@ -14,7 +14,7 @@ MAX_WAITING = 10_000
 
 
 class EventQueue(Generic[T]):
-    """What happened, in order; never ends."""
+    """Events, in order; never ends."""
 
     def __init__(self) -> None:
         self._events: BoundedQueue[T] = BoundedQueue(MAX_WAITING, max_bytes=0)  # events count no bytes

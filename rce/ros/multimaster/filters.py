@@ -1,7 +1,7 @@
-"""What is synchronized: lists of patterns under the names that master_sync's users know. Pure.
+"""Filters of what is synchronized: lists of patterns with the names of master_sync. Pure.
 
-``ignore`` wins over ``sync``; an empty ``sync`` list takes everything that is not ignored. What belongs to a
-master itself (``/rosout``, the loggers' services, discovery's and sync's own) is never taken.
+``ignore`` wins over ``sync``; an empty ``sync`` list takes everything that is not ignored. The topics and
+services of a master itself (``/rosout``, the loggers' services, discovery's and sync's own) are never taken.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ NameList = list[Any]
 
 @dataclass(slots=True)
 class SyncLists:
-    """What a user chose, under master_sync's names; see :meth:`read`."""
+    """The lists that a user set, with master_sync's names; see :meth:`read`."""
 
     ignore_hosts: NameList = field(default_factory=list)
     sync_hosts: NameList = field(default_factory=list)
@@ -144,7 +144,7 @@ class SyncLists:
         """Take the values of an interface file or of a configuration.
 
         Raises:
-            MultimasterError: There is a name or kind of value that means nothing here.
+            MultimasterError: A name, or the kind of a value, is unknown.
         """
         lists = cls()
         for name, value in values.items():

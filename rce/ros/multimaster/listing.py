@@ -52,7 +52,7 @@ async def find_service(master: MasterClient, ending: str) -> str:
     """Return the first service whose name ends so.
 
     Raises:
-        NoDiscoveryError: There is none.
+        NoDiscoveryError: No such service is registered.
         MasterUnreachableError: The master does not answer.
     """
     try:

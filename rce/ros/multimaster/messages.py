@@ -65,7 +65,7 @@ def read_master_state(message: Any) -> PeerEvent:
     """Read a ``MasterState``, its state with the quotes that older definitions have or without.
 
     Raises:
-        ValueError: Its state is none of the three.
+        ValueError: Its state is not one of the three.
     """
     return PeerEvent(PeerChange(message.state.strip("'\"")), read_ros_master(message.master))
 

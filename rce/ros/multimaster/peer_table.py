@@ -1,7 +1,7 @@
-"""Who is there: what heartbeats, and silence, say of other masters. Pure: the time comes from outside.
+"""The table of known masters, by their heartbeats and silence. Pure: the time comes from outside.
 
-Every call returns a :class:`Step`: the events to tell and what to ask of whom. A master is known by the
-address of its heartbeats and the port of its RPC server; it is told of once its RPC server said its name.
+Every call returns a :class:`Step`: the events to report and the requests to send. A master is identified by
+the address of its heartbeats and the port of its RPC server; it is reported once that server gave its name.
 
 A master whose heartbeats come often (:data:`QUALITY_HZ` and more) is offline when they stay out for
 ``measurement_intervals / rate * timeout_factor`` seconds. One whose heartbeats are rare is asked, after
@@ -27,13 +27,13 @@ CONTACT_RETRY = 2.0
 """Seconds between attempts to learn a master's name."""
 
 MAX_PEERS = 1024
-"""How many masters are known at once; more are ignored: inventing them costs an attacker nothing."""
+"""How many masters are known at once; more are ignored, as an attacker can forge any number."""
 
 MAX_BEATS = 256
 
 
 class PeerKey(NamedTuple):
-    """Tells one discovery from another."""
+    """Identifies a discovery."""
 
     host: str
     """Address that its heartbeats come from."""
@@ -46,7 +46,7 @@ class PeerKey(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """What a discovery's RPC server says of itself."""
+    """A discovery's contact, as its RPC server reports it."""
 
     master_uri: str
     master_name: str
@@ -55,7 +55,7 @@ class Contact(NamedTuple):
 
 
 class PeerChange(Enum):
-    """What happened to a master."""
+    """The kind of a change of a master."""
 
     NEW = "new"
     CHANGED = "changed"
@@ -87,11 +87,11 @@ class PeerEvent:
 
 @dataclass(slots=True)
 class Step:
-    """What follows from a call."""
+    """The events and requests that follow from a call."""
 
     events: list[PeerEvent] = field(default_factory=list)
     ask_contact: list[PeerKey] = field(default_factory=list)
-    """Whose RPC server to ask for its name; the answer goes to :meth:`PeerTable.contacted`."""
+    """The peers whose RPC server to ask for its name; the answer goes to :meth:`PeerTable.contacted`."""
     request_state: list[str] = field(default_factory=list)
     """Hosts to send a request to."""
 
@@ -101,14 +101,14 @@ class Link(NamedTuple):
 
     name: str
     quality: float
-    """Percent of the expected heartbeats that came; -1 while that cannot be told."""
+    """Percent of the expected heartbeats that came; -1 while that is unknown."""
     silence: float
     """Seconds since the last heartbeat."""
 
 
 @dataclass(frozen=True, slots=True)
 class LivenessSettings:
-    """When a silent master is given up; names and meanings are those of master_discovery."""
+    """When a silent master counts as gone; names and meanings are those of master_discovery."""
 
     measurement_intervals: float = 5.0
     """Heartbeats over which the quality of a link is measured."""
@@ -166,12 +166,12 @@ class PeerTable:
             if peer.contact is not None and peer.online
         ]
 
-    # What happens
+    # Events
 
     def received(self, host: str, beat: Heartbeat, now: float) -> Step:
         """Take a heartbeat.
 
-        A request makes its sender known; that it is to be answered is not decided here.
+        A request makes its sender known; the caller decides whether to answer it.
         """
         step = Step()
         key = PeerKey(host, beat.rpc_port)
@@ -188,7 +188,7 @@ class PeerTable:
         return step
 
     def contacted(self, key: PeerKey, contact: Contact, now: float) -> Step:
-        """Take what a discovery's RPC server said of itself."""
+        """Take a discovery's contact, as its RPC server reported it."""
         step = Step()
         peer = self._peers.get(key)
         if peer is None:
@@ -224,7 +224,7 @@ class PeerTable:
         return step
 
     def leave(self) -> Step:
-        """Forget everybody: this discovery ends."""
+        """Forget all masters: this discovery ends."""
         step = Step()
         for peer in list(self._peers.values()):
             self._remove(peer, step)
@@ -243,7 +243,7 @@ class PeerTable:
         if peer.contact is None:
             self._due_contact(peer, now, step)
         elif not peer.online:
-            # Another master may stand where this one stood: it is online when it has said who it is.
+            # Another master may have taken this one's address: it is online once its contact is known.
             if peer.contact_due is None:
                 peer.contact_due = now
             self._due_contact(peer, now, step)

@@ -1,4 +1,4 @@
-"""Keeps remote nodes registered at the local master: adds, takes back, and comes back after a restart."""
+"""Keeps remote nodes registered at the local master: adds, removes, and restores after a restart."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rce.ros.node.master import MasterClient
 _log = logging.getLogger(__name__)
 
 RECORD = "~registrations"
-"""Parameter that holds what is registered, so that a successor can take it back after a kill."""
+"""Parameter that records the registrations, so that a successor can remove them after a kill."""
 
 UPDATE_TIMEOUT = 5.0
 MASTER_CALLER = "/master"
@@ -38,7 +38,7 @@ _ORDER = tuple(_REGISTER)
 
 
 class Registrar:
-    """All that one synchronization has registered, by the master that it is from.
+    """All registrations of one synchronization, by the remote master.
 
     Attributes:
         held: ``{master URI: entries}``.
@@ -63,15 +63,15 @@ class Registrar:
     async def hold(
         self, origin: str, wanted: set[Registration], publishers: Mapping[str, Iterable[str]]
     ) -> list[Clash]:
-        """Have exactly ``wanted`` registered of a remote master.
+        """Make exactly the registrations ``wanted`` for a remote master.
 
         Args:
             origin: The remote master's URI.
-            wanted: What shall be registered of it.
+            wanted: Its registrations.
             publishers: Topic -> URIs of its publishers at the remote master; its subscribers keep them.
 
         Returns:
-            What could not be registered, because the local graph has something of that name.
+            The entries that could not be registered, because the local graph has one of that name.
 
         Raises:
             MasterError: The local master does not answer; to be tried again.
@@ -86,7 +86,7 @@ class Registrar:
         return clashes
 
     async def release(self, origin: str) -> None:
-        """Take back everything of a remote master.
+        """Remove all registrations of a remote master.
 
         Raises:
             MasterError: The local master does not answer; to be tried again.
@@ -108,7 +108,7 @@ class Registrar:
                 await self._register(origin, fine, {})
 
     async def take_back_leftovers(self) -> None:
-        """Unregister what a synchronization that was killed has left.
+        """Remove the registrations of a synchronization that was killed.
 
         Raises:
             MasterError: The local master does not answer.
@@ -147,7 +147,7 @@ class Registrar:
         if not entries:
             return
         ordered = sorted(entries, key=lambda entry: (_ORDER.index(entry.kind), entry.name, entry.node))
-        # Held before it is registered: who asks meanwhile where a node is from gets the right answer.
+        # Recorded before it is registered: questions for a node's origin get the right answer meanwhile.
         self.held.setdefault(origin, set()).update(entries)
         try:
             await self._record()
@@ -184,7 +184,7 @@ class Registrar:
             self._recorded = text
 
     async def _tell_subscriber(self, entry: Registration, uris: list[str]) -> None:
-        """Tell a remote subscriber of the publishers: a master leaves that to the answer, which came here."""
+        """Send a remote subscriber its publishers, which the master only gave in its answer to this node."""
         arguments = (MASTER_CALLER, entry.name, uris)
         try:
             await self._master.rpc.call(entry.uri, "publisherUpdate", arguments, timeout=UPDATE_TIMEOUT)

@@ -27,7 +27,7 @@ PlainMethod = Callable[..., Any]
 
 
 class PlainDispatcher(Dispatcher):
-    """Answers with what the methods return; what they raise is answered as a fault."""
+    """Answers with the methods' return values; exceptions are answered as faults."""
 
     def __init__(self, methods: Mapping[str, PlainMethod]) -> None:
         super().__init__({})
@@ -38,7 +38,7 @@ class PlainDispatcher(Dispatcher):
         try:
             method, arguments = decode_call(document)
             return encode_response(self._answer(method, arguments))
-        except Exception as error:  # noqa: BLE001 - whatever was wrong, the caller is told
+        except Exception as error:  # noqa: BLE001 - the caller gets every failure
             if not isinstance(error, MalformedDocumentError | _RefusedError):
                 _log.exception("a call of the discovery failed")
             return encode_fault(_FAULT, f"{type(error).__name__}: {error}")
@@ -62,7 +62,7 @@ class _RefusedError(Exception):
 
 @dataclass(slots=True)
 class DiscoveryApi:
-    """What other discoveries, synchronizations and fkie's tools ask of a discovery."""
+    """The methods that other discoveries, synchronizations and fkie's tools call on a discovery."""
 
     uri: str
     """The master's URI."""
@@ -73,7 +73,7 @@ class DiscoveryApi:
     monitor_uri: Callable[[], str]
     info: Callable[[], MasterInfo | None]
     md5sum: Callable[[str], str | None]
-    """Tells the checksum of a message type, None if that is not known."""
+    """Returns the checksum of a message type, None if the type is not known."""
 
     def methods(self) -> dict[str, PlainMethod]:
         """Return the method table."""

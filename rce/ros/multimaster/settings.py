@@ -1,4 +1,4 @@
-"""How a discovery is set up; names and meanings are those of master_discovery's parameters."""
+"""Settings of a discovery; names and meanings are those of master_discovery's parameters."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LIVENESS = LivenessSettings()
 
 
 def local_master(uri: str = "") -> str:
-    """Return ``uri``, or what ``ROS_MASTER_URI`` says, or the usual master of this machine."""
+    """Return ``uri``, or ``ROS_MASTER_URI``, or the default master of this machine."""
     return uri or os.environ.get("ROS_MASTER_URI", "") or DEFAULT_MASTER_URI
 
 
@@ -62,7 +62,7 @@ class DiscoverySettings:
 
     @property
     def liveness(self) -> LivenessSettings:
-        """When a silent master is given up."""
+        """When a silent master counts as gone."""
         return LivenessSettings(
             self.measurement_intervals,
             self.timeout_factor,

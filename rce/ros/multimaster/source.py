@@ -1,4 +1,4 @@
-"""Where a master's registrations are read from: over XML-RPC, or from a core in the same process."""
+"""Sources of a master's registrations: XML-RPC, or a core in the same process."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Snapshot:
 
 
 class MasterSource(Protocol):
-    """Tells what is registered at a master."""
+    """Reads the registrations of a master."""
 
     async def read(self) -> Snapshot:
         """Read everything.
@@ -89,7 +89,7 @@ class RpcSource:
         )
 
     async def wait(self, longest: float) -> None:
-        """Wait: a master tells nobody of changes."""
+        """Wait ``longest`` seconds: a master does not announce changes."""
         await asyncio.sleep(longest)
 
     async def _many(self, calls: Sequence[tuple[str, ...]]) -> list[Any]:

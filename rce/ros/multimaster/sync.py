@@ -1,4 +1,4 @@
-"""A synchronization: what other masters have, as far as the user wants it, is here too."""
+"""A synchronization: registers the entries of other masters here, as far as the user's filters take them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _log = logging.getLogger(__name__)
 
 DISCOVERY_URI = "/master_discovery/masteruri"
 REFRESH = 5.0
-"""Seconds between complete looks at the discovery's list, besides the changes that it tells."""
+"""Seconds between reads of the discovery's whole list, besides the changes that it announces."""
 
 LOOK_FOR_DISCOVERY = 0.5
 WATCH_MASTER = 1.0
@@ -69,10 +69,10 @@ class SyncSettings:
     """This side's name on relay links; if empty, the local master's."""
 
     def __post_init__(self) -> None:
-        """Refuse relay links from everybody.
+        """Refuse relay links from other machines without a token.
 
         Raises:
-            MultimasterError: Other machines could connect, and there is no token that they must have.
+            MultimasterError: Other machines could connect, and no token is set that they must have.
         """
         if self.relay_listen is not None:
             check_listening(self.relay_addr, self.relay_token)
@@ -167,7 +167,7 @@ class MasterSync:
     # The discovery
 
     async def _follow_discovery(self) -> None:
-        """Keep the remotes as the discovery's list has them; its changes come in between."""
+        """Keep the remotes in step with the discovery's list and its changes."""
         has_discovery = True
         while True:
             self._waiting = {}
@@ -191,7 +191,7 @@ class MasterSync:
         return uri
 
     async def _listen_for_changes(self) -> None:
-        """Hear every discovery: constants differ between releases, and the checksum with them."""
+        """Listen to discoveries of any release: their constants differ, and so does the checksum."""
         types = await self._master.call("getTopicTypes")
         found = {topic for topic, kind in types if kind == messages.MASTER_STATE} - self._changes_topics
         for topic in found:
@@ -219,7 +219,7 @@ class MasterSync:
             self._waiting[event.master.uri] = event
 
     def _take_waiting(self) -> None:
-        """Take the changes that came while the list was asked for: they may be newer than it."""
+        """Apply the changes that came while the list was requested: they may be newer than it."""
         waiting, self._waiting = self._waiting or {}, None
         for event in waiting.values():
             self._take_change(event)
@@ -289,7 +289,7 @@ class MasterSync:
     def _make_ends(
         self, send: Callable[[Frame], None], tasks: TaskScope, name: str
     ) -> tuple[Exporter, Importer]:
-        """Make the ends of a link; the master at its other side is no longer registered directly."""
+        """Make the ends of a link; stop registering the master at its other side directly."""
         for remote in self._remotes.values():
             if remote.master.name == name:
                 remote.leave()
@@ -311,7 +311,7 @@ class MasterSync:
     # The own master
 
     async def _watch_master(self) -> None:
-        """Register everything again when another process stands in the master's place."""
+        """Register everything again when another process has replaced the master."""
         known = None
         while True:
             try:

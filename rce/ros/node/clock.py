@@ -1,4 +1,4 @@
-"""ROS time: the machine's clock or, if the parameter ``/use_sim_time`` says so, what ``/clock`` tells.
+"""ROS time: the machine's clock or, if the parameter ``/use_sim_time`` is true, the topic ``/clock``.
 
 Simulated time is zero until the first tick, may run at any speed, stand still, and jump back when a
 simulation or a bag begins anew.
@@ -55,7 +55,7 @@ class Clock:
             _wake(heapq.heappop(self._sleepers)[2])
 
     def end(self) -> None:
-        """Wake all who sleep, now and later: the node stops."""
+        """Wake all sleepers, now and later: the node stops."""
         self._stop.set()
         while self._sleepers:
             _wake(self._sleepers.pop()[2])

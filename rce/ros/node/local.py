@@ -1,8 +1,8 @@
-"""Messages between nodes of one process: handed over as objects, not written and read again.
+"""Messages between nodes of one process: handed over as objects, without serialization.
 
-What is delivered is the very object that was published, to every subscriber of the process. Neither side may
-change it afterwards; who wants another message makes another one. Delivery is as with a connection otherwise:
-in order, not within the call that publishes, and the oldest messages are dropped if they are too many.
+Every subscriber of the process gets the published object itself. Neither side may change it afterwards; to
+publish another message, make a new object. Otherwise delivery works as over a connection: in order, not
+within the call that publishes, and the oldest messages are dropped if too many wait.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rce.ros.types import Message, MessageType
 
 TRANSPORT = "INTRAPROCESS"
-"""What the slave API calls it; roscpp's word."""
+"""Name of this transport in the slave API; roscpp's word."""
 
 _neighbours: dict[str, tuple[asyncio.AbstractEventLoop, Topics]] = {}
 """Topics of all nodes of this process that deliver locally, by their slave APIs."""
@@ -28,7 +28,7 @@ _neighbours: dict[str, tuple[asyncio.AbstractEventLoop, Topics]] = {}
 
 @contextmanager
 def neighbour(uri: str, topics: Topics) -> Iterator[None]:
-    """Let the other nodes of this event loop take a node's messages without a connection."""
+    """Register a node's topics for local delivery to the other nodes of this event loop."""
     _neighbours[uri] = (asyncio.get_running_loop(), topics)
     try:
         yield
@@ -43,7 +43,7 @@ def find_neighbour(uri: str) -> Topics | None:
 
 
 class LocalMessage:
-    """A published message, as an object, as bytes, or both; each is made of the other when asked for."""
+    """A published message, as an object, as bytes, or both; each is made from the other when needed."""
 
     __slots__ = ("_message", "_message_type", "_payload")
 
@@ -75,7 +75,7 @@ class LocalMessage:
 
 
 class LocalListener(Protocol):
-    """What a local link's messages are given to."""
+    """Receives the messages of a local link."""
 
     def deliver_local(self, local_message: LocalMessage, latched: bool, uri: str) -> None:
         """Take a message of the node with this slave API; must neither wait nor raise."""
@@ -125,7 +125,7 @@ class LocalLink:
 
     @property
     def description(self) -> str:
-        """What the slave API says of the connection."""
+        """The connection's description in the slave API."""
         return f"{TRANSPORT} {self.publisher} to {self.subscriber}"
 
     def send(self, local_message: LocalMessage, *, latched: bool) -> None:
@@ -135,7 +135,7 @@ class LocalLink:
         self._queue.put((local_message, latched), len(local_message))
 
     def end(self) -> None:
-        """End the link from the publisher's side; what waits is delivered still."""
+        """End the link from the publisher's side; waiting messages are still delivered."""
         if not self.ended.done():
             self.ended.set_result(None)
 

@@ -59,7 +59,7 @@ class Loggers:
         """Set the level of one logger.
 
         Raises:
-            ServiceFaultError: There is no such logger or level.
+            ServiceFaultError: The logger or the level does not exist.
         """
         logger = self._all().get(request.logger)
         if logger is None:

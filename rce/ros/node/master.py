@@ -24,7 +24,7 @@ class MasterClient:
     """Seconds for each call."""
 
     async def call(self, method: str, *arguments: Any) -> Any:
-        """Call any method; the node's name is put before ``arguments``.
+        """Call any method, with the node's name before ``arguments``.
 
         Returns:
             The value of the answer.
@@ -45,28 +45,28 @@ class MasterClient:
         return value
 
     async def register_publisher(self, topic: str, message_type: str) -> None:
-        """Say that the node publishes ``topic``."""
+        """Register the node as a publisher of ``topic``."""
         await self.call("registerPublisher", topic, message_type, self.slave_uri)
 
     async def unregister_publisher(self, topic: str) -> None:
-        """Say that the node publishes ``topic`` no longer."""
+        """Unregister the node as a publisher of ``topic``."""
         await self.call("unregisterPublisher", topic, self.slave_uri)
 
     async def register_subscriber(self, topic: str, message_type: str) -> list[str]:
-        """Say that the node subscribes to ``topic``; return the slave APIs of its publishers."""
+        """Register the node as a subscriber of ``topic``; return the slave APIs of its publishers."""
         publishers: list[str] = await self.call("registerSubscriber", topic, message_type, self.slave_uri)
         return publishers
 
     async def unregister_subscriber(self, topic: str) -> None:
-        """Say that the node subscribes to ``topic`` no longer."""
+        """Unregister the node as a subscriber of ``topic``."""
         await self.call("unregisterSubscriber", topic, self.slave_uri)
 
     async def register_service(self, name: str, service_uri: str) -> None:
-        """Say that the node provides a service at ``service_uri``."""
+        """Register a service of the node, at ``service_uri``."""
         await self.call("registerService", name, service_uri, self.slave_uri)
 
     async def unregister_service(self, name: str, service_uri: str) -> None:
-        """Say that the node no longer provides a service."""
+        """Unregister a service of the node."""
         await self.call("unregisterService", name, service_uri)
 
     async def lookup_node(self, name: str) -> str | None:

@@ -1,4 +1,4 @@
-"""Being part of a ROS graph: joining it, being told to stop, leaving it."""
+"""Membership in a ROS graph: joining, being told to stop, leaving."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ DEFAULT_QUEUE = 100
 """How many messages wait for a slow peer before the oldest is dropped."""
 
 GOODBYE_TIMEOUT = 3.0
-"""Seconds that the master gets to take a node's registrations back."""
+"""Seconds that the master may take to remove a node's registrations."""
 
 LOG_FORM = "[%(name)s][%(levelname)s] %(asctime)s: %(message)s"
 LOG_BYTES = 50_000_000
@@ -59,7 +59,7 @@ RETRY = 0.2
 
 
 class GraphMember:
-    """The life of a node; :class:`rce.ros.node.Node` adds what a program does with it."""
+    """The life cycle of a node; :class:`rce.ros.node.Node` adds the methods for programs."""
 
     def __init__(
         self,
@@ -75,7 +75,7 @@ class GraphMember:
         self._settings = settings
         self._types = Types(types)
         if self.log.level == logging.NOTSET:
-            self.log.setLevel(logging.INFO)  # what nodes tell, whatever their program's own logging does
+            self.log.setLevel(logging.INFO)  # independent of the logging of the node's program
         self._signals = signals
         self._intra_process = intra_process
         self._rosout = rosout
@@ -155,7 +155,7 @@ class GraphMember:
         A node does so by itself when its master was restarted.
 
         Raises:
-            MasterError: The master cannot be told.
+            MasterError: The registration at the master failed.
         """
         await self._registrar(self._running.master).register_all()
 
@@ -274,7 +274,7 @@ class GraphMember:
                 return
 
     async def _leave_graph(self) -> None:
-        """Unregister everything, as far as there is still a master that listens."""
+        """Unregister everything, as far as the master still answers."""
         for service in self._services.values():
             service.disconnect()
         try:
@@ -297,7 +297,7 @@ class GraphMember:
 
     @property
     def _running(self) -> Runtime:
-        """What the node works with.
+        """The running node's runtime.
 
         Raises:
             NodeClosedError: It is not part of the graph (yet, or any longer).

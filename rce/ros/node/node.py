@@ -1,4 +1,4 @@
-"""The node: a peer of a ROS graph, and all that a program does with it."""
+"""The node: a peer of a ROS graph, and the methods that a program calls on it."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Node(GraphMember):
             anonymous: Make the name unique.
             signals: Stop the node at SIGINT and SIGTERM; ``None`` means: if it is the program's main node,
                 which is the one that takes the program's command line.
-            master_timeout: Seconds to wait for a master that is not up yet; ``None`` indefinitely.
+            master_timeout: Seconds to wait for a master that is not up yet; ``None`` waits without a limit.
             intra_process: Take messages of other nodes of this process as the objects that they published,
                 which then must not be changed; else by a connection, as from any node.
             rosout: Publish the log on ``/rosout``.
@@ -130,8 +130,8 @@ class Node(GraphMember):
 
         Raises:
             TypeMismatchError: This node publishes the topic with another type.
-            UnknownTypeError: There is no such type.
-            MasterError: The master cannot be told.
+            UnknownTypeError: The type does not exist.
+            MasterError: The registration at the master failed.
         """
         runtime = self._running
         known = runtime.types.message(message_type)
@@ -159,8 +159,8 @@ class Node(GraphMember):
 
         Raises:
             TypeMismatchError: This node subscribes to the topic with another type.
-            UnknownTypeError: There is no such type.
-            MasterError: The master cannot be told.
+            UnknownTypeError: The type does not exist.
+            MasterError: The registration at the master failed.
         """
         runtime = self._running
         name = self.resolve(topic)
@@ -189,8 +189,8 @@ class Node(GraphMember):
 
         Raises:
             TypeMismatchError: This node subscribes to the topic with another type.
-            UnknownTypeError: There is no such type.
-            MasterError: The master cannot be told.
+            UnknownTypeError: The type does not exist.
+            MasterError: The registration at the master failed.
         """
         name = self.resolve(topic)
         sink = sink_for(callback, queue_size, name, self._running.tasks)
@@ -210,7 +210,7 @@ class Node(GraphMember):
     async def listen(
         self, topic: str, message_type: str | MessageType | TypeName, listener: TopicListener
     ) -> Subscriber:
-        """Take the messages of a topic as a bridge needs them: as on the wire, and those of others only.
+        """Take the serialized messages of a topic for a bridge, without those of this node itself.
 
         Args:
             topic: The topic.
@@ -231,14 +231,14 @@ class Node(GraphMember):
             name: The service.
             service_type: Its type.
             handler: Called with each request; returns a response or a mapping of its fields. A plain function
-                must not block; coroutine functions run side by side for different clients. What it raises is
-                the caller's answer: :class:`~rce.ros.errors.ServiceFaultError` with its text; anything else
-                is logged too.
+                must not block; coroutine functions run side by side for different clients. Exceptions are
+                sent to the caller: :class:`~rce.ros.errors.ServiceFaultError` with its text; any other is
+                logged too.
 
         Raises:
             TypeMismatchError: This node provides the service already.
-            UnknownTypeError: There is no such type.
-            MasterError: The master cannot be told.
+            UnknownTypeError: The type does not exist.
+            MasterError: The registration at the master failed.
         """
         known = self._running.types.service(service_type)
         return await self._provide(self.resolve(name), known, coding(known, handler))
@@ -250,8 +250,8 @@ class Node(GraphMember):
 
         Raises:
             TypeMismatchError: This node provides the service already.
-            UnknownTypeError: There is no such type.
-            MasterError: The master cannot be told.
+            UnknownTypeError: The type does not exist.
+            MasterError: The registration at the master failed.
         """
         return await self._provide(self.resolve(name), self._running.types.service(service_type), handler)
 
@@ -266,7 +266,7 @@ class Node(GraphMember):
             persistent: Keep connections for later calls; else every call looks the provider up anew.
 
         Raises:
-            UnknownTypeError: There is no such type.
+            UnknownTypeError: The type does not exist.
         """
         runtime = self._running
         client = ServiceClient(
@@ -279,12 +279,12 @@ class Node(GraphMember):
         """Wait until a service has a provider that answers.
 
         Raises:
-            TimeoutError: There was none within ``timeout`` seconds.
+            TimeoutError: No provider answered within ``timeout`` seconds.
             MasterError: The master cannot be asked.
         """
         runtime, service = self._running, self.resolve(name)
         async with asyncio.timeout(timeout):
-            while not await answers(runtime, service):  # noqa: ASYNC110 - a master tells nobody of services
+            while not await answers(runtime, service):  # noqa: ASYNC110 - a master announces no services
                 await asyncio.sleep(SERVICE_POLL)
 
     # Time
@@ -305,7 +305,7 @@ class Node(GraphMember):
         return self._clock.nanoseconds() / NANOSECONDS
 
     def rate(self, hz: float) -> Rate:
-        """Make what keeps a loop at a rate in ROS time: ``async for _ in node.rate(10): ...``."""
+        """Make a rate, which keeps a loop's pace in ROS time: ``async for _ in node.rate(10): ...``."""
         return Rate(self._clock, hz)
 
     def timer(self, period: float, callback: TimerCallback, *, oneshot: bool = False) -> Timer:
@@ -324,16 +324,16 @@ class Node(GraphMember):
         """Return a parameter, or all of a namespace as a dictionary.
 
         Raises:
-            ParameterMissingError: It is not set and there is no ``default``.
+            ParameterMissingError: It is not set, and ``default`` is not given.
             MasterUnreachableError: The master does not answer.
         """
         return await self._parameters.get(self.resolve(name), default)
 
     async def get_param_cached(self, name: str, default: Any = REQUIRED) -> Any:
-        """Return a parameter as the master told it last: the first call asks, later changes are told.
+        """Return a parameter from a cache: the first call asks the master, which then reports changes.
 
         Raises:
-            ParameterMissingError: It is not set, or an empty namespace, and there is no ``default``.
+            ParameterMissingError: It is not set or an empty namespace, and ``default`` is not given.
             MasterUnreachableError: The master does not answer.
         """
         return await self._parameters.get_cached(self.resolve(name), default)

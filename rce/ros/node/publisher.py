@@ -37,12 +37,12 @@ class Link:
 
     @property
     def dropped(self) -> int:
-        """How many messages the subscriber was too slow for."""
+        """How many messages were dropped because the subscriber was too slow."""
         return self._queue.dropped
 
     @property
     def description(self) -> str:
-        """What the slave API says of the connection."""
+        """The connection's description in the slave API."""
         return str(self.connection)
 
     def send(self, chunks: Chunks, size: int) -> None:
@@ -55,18 +55,18 @@ class Link:
         self.connection.write(chunks)
 
     def connection_made(self, connection: Connection) -> None:
-        """A link begins when the header came."""
+        """Do nothing: a link begins when the header came."""
 
     def frame_received(self, connection: Connection, payload: bytes) -> None:
-        """Ignore what a subscriber says: it has nothing to say."""
+        """Ignore a frame: subscribers send none."""
 
     def connection_lost(self, connection: Connection, error: Exception | None) -> None:
         """Forget the subscriber."""
-        del connection, error  # it will come back if it wants to
+        del connection, error  # the subscriber reconnects by itself
         self._output.drop(self)
 
     def writable(self, connection: Connection) -> None:
-        """Send what waits."""
+        """Send waiting frames."""
         while self._queue and not connection.full:
             chunks = self._queue.take()
             self.send(chunks, sum(map(len, chunks)))
@@ -109,7 +109,7 @@ class TopicOutput:
         """Take a subscriber.
 
         Raises:
-            HandshakeRefusedError: It means another type.
+            HandshakeRefusedError: It expects another type.
         """
         require(fields, "md5sum")
         message_type = self.message_type
@@ -137,7 +137,7 @@ class TopicOutput:
         """Take a subscriber of this process.
 
         Raises:
-            HandshakeRefusedError: It means another type.
+            HandshakeRefusedError: It expects another type.
         """
         if md5sum not in (ANY, self.message_type.md5sum):
             raise HandshakeRefusedError(
@@ -194,7 +194,7 @@ class TopicOutput:
 class Publisher:
     """Publishes on one topic. Made by :meth:`rce.ros.node.Node.advertise`.
 
-    Publishing never waits: a subscriber that is too slow loses its own oldest messages and delays nobody.
+    Publishing never waits: a subscriber that is too slow loses its own oldest messages and delays no other.
 
     Attributes:
         latch: Whether the last message is given to later subscribers.
@@ -229,7 +229,7 @@ class Publisher:
 
     @property
     def dropped(self) -> int:
-        """How many messages of the topic subscribers were too slow for, counted once for each subscriber."""
+        """How many messages were dropped for slow subscribers, counted once for each subscriber."""
         return self._output.lost + sum(link.dropped for link in self._output.all_links)
 
     def publish(self, message: Message | Mapping[str, Any] | None = None, /, **fields: Any) -> None:
@@ -260,7 +260,7 @@ class Publisher:
         Args:
             payload: The message's bytes.
             latch: Remember this message for later subscribers, whatever :attr:`latch` says.
-            source: Whose message it is, if this publishes for others: one message of each is remembered.
+            source: The original publisher, if this publishes for others: one message of each is remembered.
 
         Raises:
             NodeClosedError: The publisher was closed.

@@ -1,8 +1,8 @@
-"""Keeps a node registered at its master: one that was restarted, or forgot, is told everything again.
+"""Keeps a node registered at its master: registers everything again after the master lost its state.
 
-A restarted master knows nobody. Nodes notice by a connection that they hold to it for this purpose, and by
-asking now and then whether the master still knows them; parameter ``/run_id`` tells one life of a core from
-the next.
+A restarted master knows no nodes. A node notices a restart by a connection that it keeps open to the master
+for this purpose, and by asking periodically whether the master still knows it; the parameter ``/run_id``
+identifies one run of a core.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ RUN_ID = "/run_id"
 
 @dataclass(slots=True)
 class Registrar:
-    """Does it for one node."""
+    """Keeps one node registered."""
 
     master: MasterClient
     topics: Topics
@@ -48,10 +48,10 @@ class Registrar:
     _run_id: Any = field(default=None, init=False)
 
     async def register_all(self) -> None:
-        """Tell the master of all topics, services and parameters of the node.
+        """Register all topics, services and parameters of the node at the master.
 
         Raises:
-            MasterError: The master cannot be told.
+            MasterError: The registration at the master failed.
         """
         master, topics = self.master, self.topics
         for topic, output in list(topics.outputs.items()):
@@ -71,16 +71,16 @@ class Registrar:
         await self.parameters.renew()
 
     async def keep(self) -> None:
-        """Watch the master for as long as the node lives."""
+        """Watch the master for as long as the node runs."""
         await self._until_reached(self._remember_run)
         while True:
             was_lost = await self._until_in_doubt()
             await self._until_reached(lambda was_lost=was_lost: self._check(was_lost=was_lost))  # type: ignore[misc]
 
     async def _until_in_doubt(self) -> bool:
-        """Wait until there is reason to look; tell whether the connection to the master was lost."""
+        """Wait until the next check is due; return whether the connection to the master was lost."""
         try:
-            async with asyncio.timeout(CHECK_INTERVAL * random.uniform(0.75, 1.25)):  # noqa: S311 - no secret
+            async with asyncio.timeout(CHECK_INTERVAL * random.uniform(0.75, 1.25)):  # noqa: S311 - no key
                 await self.master.rpc.until_lost(self.master.uri)
         except TimeoutError:
             return False

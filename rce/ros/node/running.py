@@ -20,7 +20,7 @@ def run(main: Coroutine[Any, Any, T]) -> T:
     """
     try:
         import uvloop
-    except ImportError:  # it is not made for Windows
+    except ImportError:  # uvloop does not support Windows
         return asyncio.run(main)
     return uvloop.run(main)
 
@@ -30,7 +30,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @contextmanager
 def stop_signals(callback: Callable[[str], None]) -> Iterator[None]:
-    """Call ``callback(reason)`` at the first signal. The second one does what it always does.
+    """Call ``callback(reason)`` at the first signal. The second one has its usual effect.
 
     Without effect outside the main thread, where Python takes no signals.
     """

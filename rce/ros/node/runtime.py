@@ -1,4 +1,4 @@
-"""What all parts of one node share while it runs."""
+"""State that all parts of one node share while it runs."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Types:
 
 @dataclass(slots=True)
 class Runtime:
-    """A running node's means."""
+    """The shared state of a running node."""
 
     name: str
     """The node's global name."""

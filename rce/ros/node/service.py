@@ -74,7 +74,7 @@ class Service:
         """Take a client.
 
         Raises:
-            HandshakeRefusedError: It means another type.
+            HandshakeRefusedError: It expects another type.
         """
         require(fields, "md5sum")
         check_type(fields, md5sum=self.type.md5sum, type_name=self.type.name, subject=f"service {self.name}")
@@ -104,7 +104,7 @@ class Service:
         self.calls += 1
         try:
             response = self._handler(payload)
-        except Exception as error:  # noqa: BLE001 - every failure is the caller's to know
+        except Exception as error:  # noqa: BLE001 - the caller gets every failure
             return self._failure(error)
         return answer_frame(response, ok=True) if isinstance(response, bytes) else self._finish(response)
 
@@ -127,7 +127,7 @@ class Service:
     async def _finish(self, response: Awaitable[bytes]) -> Chunks:
         try:
             return answer_frame(await response, ok=True)
-        except Exception as error:  # noqa: BLE001 - every failure is the caller's to know
+        except Exception as error:  # noqa: BLE001 - the caller gets every failure
             return self._failure(error)
 
     def _failure(self, error: Exception) -> Chunks:
@@ -148,7 +148,7 @@ class Session:
         self._waiting: deque[bytes] = deque()
 
     def connection_made(self, connection: Connection) -> None:
-        """A session begins when the header came."""
+        """Do nothing: a session begins when the header came."""
 
     def frame_received(self, connection: Connection, payload: bytes) -> None:
         """Handle a request, or keep it until those before it have been answered."""
@@ -164,7 +164,7 @@ class Session:
             self._service.in_background(answer, self)
 
     async def finish(self, work: Awaitable[Chunks]) -> None:
-        """Answer a request that takes time, and all that came meanwhile."""
+        """Answer a request that takes time, and the requests that came meanwhile."""
         self._reply(await work)
         while self._waiting:
             answer = self._service.answer(self._waiting.popleft())
@@ -173,13 +173,13 @@ class Session:
         self.connection.resume_reading()
 
     def connection_lost(self, connection: Connection, error: Exception | None) -> None:
-        """Forget the client; what is being handled for it is finished nevertheless."""
+        """Forget the client; the handling of its requests continues to the end."""
         del connection, error  # a client may leave
         self._waiting.clear()
         self._service.drop(self)
 
     def writable(self, connection: Connection) -> None:
-        """Nothing waits: an answer is written whole."""
+        """Do nothing: an answer is written as a whole."""
 
     def _reply(self, chunks: Chunks) -> None:
         self.connection.write(chunks)

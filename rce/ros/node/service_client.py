@@ -28,7 +28,7 @@ MAX_ACTIVE = 64
 """How many calls of one client are under way at once; more wait."""
 
 MAX_IDLE = MAX_ACTIVE
-"""How many idle connections a client keeps: one for each call of a burst, so that the next makes none."""
+"""How many idle connections a client keeps: one for each call of a burst, so that the next opens none."""
 
 
 class ServiceClient:
@@ -53,7 +53,7 @@ class ServiceClient:
         """Call the service with a request, or with its fields; without a time limit.
 
         Raises:
-            ServiceError: There is no response; see its subclasses.
+            ServiceError: The call got no response; the subclasses give the reason.
         """
         return await self.call(self.type.request.new(**fields) if request is None else request)
 
@@ -65,7 +65,7 @@ class ServiceClient:
             timeout: Seconds, of everything.
 
         Raises:
-            ServiceError: There is no response; see its subclasses.
+            ServiceError: The call got no response; the subclasses give the reason.
             SerializationError: The request does not fit its type.
         """
         payload = self.type.request.serialize(request)
@@ -79,10 +79,10 @@ class ServiceClient:
     ) -> bytes:
         """Call the service with a serialized request; return the serialized response.
 
-        A call that is cancelled or times out loses its connection, so its late answer reaches nobody.
+        A call that is cancelled or times out closes its connection, so its late answer is discarded.
 
         Raises:
-            ServiceNotFoundError: Nobody provides the service.
+            ServiceNotFoundError: The service has no provider.
             ServiceLostError: The provider cannot be reached or went away before it answered.
             ServiceFaultError: The provider answered with an error.
             ServiceTimeoutError: No answer within ``timeout`` seconds.
@@ -223,29 +223,29 @@ class _Call:
             self._answer = None
 
     async def close(self) -> None:
-        """Close and wait until it is."""
+        """Close the connection and wait until it is closed."""
         self.connection.abort()
         await self.connection.gone.wait()
 
     def connection_made(self, connection: Connection) -> None:
-        """The header is sent by who connected."""
+        """Do nothing: the connecting side sends the header."""
 
     def frame_received(self, connection: Connection, payload: bytes) -> None:
-        """Give the answer to who waits for it."""
+        """Give the answer to the waiting call."""
         if self._answer is None or self._answer.done():
-            connection.abort()  # nobody asked
+            connection.abort()  # no call waits for an answer
         elif connection.reader.lead:
             self._answer.set_result(payload)
         else:
             self._answer.set_exception(ServiceFaultError(self._service, payload.decode(errors="replace")))
 
     def connection_lost(self, connection: Connection, error: Exception | None) -> None:
-        """Tell who waits for an answer."""
-        del connection  # the only one
+        """Fail the call that waits for an answer."""
+        del connection  # the only connection
         if self._answer is not None and not self._answer.done():
             lost = ServiceLostError(self._service)
             lost.__cause__ = error
             self._answer.set_exception(lost)
 
     def writable(self, connection: Connection) -> None:
-        """Nothing waits to be written."""
+        """Do nothing: nothing waits to be written."""

@@ -1,4 +1,4 @@
-"""The Slave API of a node: what the master and other nodes may ask of it.
+"""The Slave API of a node: the methods that the master and other nodes call.
 
 http://wiki.ros.org/ROS/Slave_API
 """
@@ -29,7 +29,7 @@ NOTHING: dict[str, Any] = {
     "publisherUpdate": -1,
     "paramUpdate": -1,
 }
-"""What these methods' failures carry as value: as rospy's, of the type that is expected."""
+"""The value in a failed answer of each method: of the expected type, as rospy's."""
 
 
 @dataclass(slots=True)
@@ -47,7 +47,7 @@ class SlaveApi:
     on_shutdown: Callable[[str], None]
     """Takes the reason for which the node is told to stop."""
     on_parameter: Callable[[str, Any], bool]
-    """Takes a parameter's name and new value; tells whether the node subscribed to it."""
+    """Takes a parameter's name and new value; returns whether the node subscribed to it."""
 
     def methods(self) -> dict[str, Method]:
         """Return the method table: the specification's, and the two that rospy's nodes have beside."""

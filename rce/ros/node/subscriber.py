@@ -28,11 +28,11 @@ Item = bytes | LocalMessage
 """A message that arrived: over a connection, or from a publisher of this process."""
 
 ItemCallback = Callable[[Any, bool], Awaitable[None] | None]
-"""Takes items, or nothing but bytes if the subscriber does not decode."""
+"""Takes items, or only bytes if the subscriber does not decode."""
 
 
 class Sink(Protocol):
-    """What a topic's messages are given to."""
+    """Receives the messages of a topic."""
 
     @property
     def dropped(self) -> int:
@@ -42,10 +42,10 @@ class Sink(Protocol):
         """Take a message of the publisher with this slave API; must neither wait nor raise."""
 
     def lose(self, source: str) -> None:
-        """Learn that the connection to a publisher ended."""
+        """Take note that the connection to a publisher ended."""
 
     def end(self) -> None:
-        """Learn that no more will come."""
+        """Take note that no more messages will come."""
 
 
 class CallbackSink:
@@ -57,7 +57,7 @@ class CallbackSink:
 
     @property
     def dropped(self) -> int:
-        """Nothing ever is."""
+        """Return 0: nothing is dropped."""
         return 0
 
     def deliver(self, payload: Item, latched: bool, source: str) -> None:
@@ -69,10 +69,10 @@ class CallbackSink:
             _log.exception("the callback of %s failed", self._topic)
 
     def lose(self, source: str) -> None:
-        """Nothing is kept."""
+        """Do nothing: nothing is kept."""
 
     def end(self) -> None:
-        """Nothing is kept."""
+        """Do nothing: nothing is kept."""
 
 
 class TopicListener(Protocol):
@@ -85,7 +85,7 @@ class TopicListener(Protocol):
         """Take a latched message; it replaces the one that the same publisher latched before."""
 
     def source_ended(self, source: str) -> None:
-        """Learn that a publisher ended: nothing of it is latched any more."""
+        """Take note that a publisher ended: its latched messages are void."""
 
 
 class ListenerSink:
@@ -98,7 +98,7 @@ class ListenerSink:
 
     @property
     def dropped(self) -> int:
-        """Nothing ever is."""
+        """Return 0: nothing is dropped."""
         return 0
 
     def deliver(self, payload: Item, latched: bool, source: str) -> None:
@@ -114,13 +114,13 @@ class ListenerSink:
             _log.exception("the listener of %s failed", self._topic)
 
     def lose(self, source: str) -> None:
-        """Tell of the end of a publisher that had latched something."""
+        """Report the end of a publisher that had latched a message."""
         if source in self._sources:
             self._sources.remove(source)
             self._listener.source_ended(source)
 
     def end(self) -> None:
-        """Nothing is kept."""
+        """Do nothing: nothing is kept."""
 
 
 class QueueSink:
@@ -143,10 +143,10 @@ class QueueSink:
         self._arrived.set()
 
     def lose(self, source: str) -> None:
-        """What was kept stays: it may still be wanted."""
+        """Do nothing: kept messages stay, as the program may still want them."""
 
     def end(self) -> None:
-        """Let those who wait go."""
+        """Wake the waiting callers."""
         self._ended = True
         self._arrived.set()
 
@@ -154,7 +154,7 @@ class QueueSink:
         """Wait for the next message.
 
         Raises:
-            EOFError: There is none and none will come.
+            EOFError: The queue is empty and no more messages will come.
         """
         while not self._queue:
             if self._ended:
@@ -180,7 +180,7 @@ async def call_in_order(
 
 
 def sink_for(callback: ItemCallback, queue_size: int, topic: str, tasks: TaskScope) -> Sink:
-    """Make what gives messages to ``callback``, a function or coroutine function."""
+    """Make a sink that gives messages to ``callback``, a function or coroutine function."""
     if not inspect.iscoroutinefunction(callback):
         return CallbackSink(callback, topic)
     sink = QueueSink(queue_size)
@@ -236,9 +236,9 @@ class Subscriber:
         self.sink = sink
         """Takes what arrives."""
         self.decodes = decodes
-        """Whether the sink's messages are read: objects will do."""
+        """Whether the sink decodes its messages: it takes objects too."""
         self.hears_own = hears_own
-        """Whether it takes what its own node publishes."""
+        """Whether it takes the messages of its own node."""
         self._message_type = None if isinstance(message_type, TypeName) else message_type
         self._release = release
         self._connected = connected

@@ -1,4 +1,4 @@
-"""Doing things at a rate, in ROS time: :class:`Rate` in a loop of one's own, :class:`Timer` beside it."""
+"""Rates and timers in ROS time: :class:`Rate` in the program's own loop, :class:`Timer` beside it."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Rate:
 
 
 class TimerEvent(NamedTuple):
-    """What a timer's callback is told; all in seconds."""
+    """The argument of a timer's callback; all times in seconds."""
 
     expected: float
     """When the call was due, in ROS time."""

@@ -46,7 +46,7 @@ class TopicInput:
         """Publishers that a restarted master has not named yet: followed until their connection ends."""
 
     def check(self, message_type_name: str, md5sum: str) -> None:
-        """Check that another subscriber of the node means the same type; the first concrete one counts.
+        """Check that another subscriber of the node expects the same type; the first concrete one counts.
 
         Raises:
             TypeMismatchError: It does not.
@@ -60,7 +60,7 @@ class TopicInput:
         self.message_type_name, self.md5sum = message_type_name, md5sum
 
     def connected(self) -> int:
-        """Tell how many publishers have accepted the subscription."""
+        """Return how many publishers have accepted the subscription."""
         return sum(link.is_greeted for link in self.links)
 
     def deliver(self, payload: bytes, latched: bool, uri: str) -> None:
@@ -100,7 +100,7 @@ class TopicInput:
 
         Args:
             uris: The publishers.
-            of_new_master: The master was restarted and may not know all yet: connections that are there stay.
+            of_new_master: The master was restarted and may not know all yet: existing connections stay.
         """
         self._publishers = set(uris)
         self._follow_publishers(of_new_master=of_new_master)
@@ -120,7 +120,7 @@ class TopicInput:
             )
 
     def close(self) -> None:
-        """Follow nobody any longer."""
+        """Follow no publishers any more."""
         self._orphans.clear()
         self.set_publishers(())
 
@@ -227,7 +227,7 @@ class InputLink:
         self._latched = False
 
     def connection_made(self, connection: Connection) -> None:
-        """The header is sent by who connected."""
+        """Do nothing: the connecting side sends the header."""
 
     def frame_received(self, connection: Connection, payload: bytes) -> None:
         """Take the publisher's header, then messages."""
@@ -249,12 +249,12 @@ class InputLink:
             self._target.changed.set()
 
     def connection_lost(self, connection: Connection, error: Exception | None) -> None:
-        """Let who waits for the end continue."""
-        del connection  # the only one
+        """Wake the task that waits for the end."""
+        del connection  # the only connection
         self._end(error)
 
     def writable(self, connection: Connection) -> None:
-        """Nothing waits to be written."""
+        """Do nothing: nothing waits to be written."""
 
     def _greet(self, fields: Mapping[str, str]) -> None:
         raise_error_field(fields)

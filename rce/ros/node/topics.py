@@ -1,4 +1,4 @@
-"""All topics of a node: which are published and subscribed to, and what flows over their connections."""
+"""All topics of a node, published and subscribed, and the statistics of their connections."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Topics:
 
         Raises:
             TypeMismatchError: The node publishes the topic with another type already.
-            MasterError: The master cannot be told.
+            MasterError: The registration at the master failed.
         """
         name = message_type if isinstance(message_type, str) else message_type.name
         output = self.outputs.get(topic)
@@ -75,16 +75,16 @@ class Topics:
         """Make a subscriber; return once the master knows of it. Publishers are connected to after that.
 
         Args:
-            runtime: The node's means.
+            runtime: The node's shared state.
             topic: The topic.
             message_type: Its type; ``None`` for any. Its name and checksum will do if nothing is decoded.
             sink: Takes the messages.
-            decodes: Whether the messages are read: the objects of publishers of this process will do.
-            hears_own: Whether it takes what this node publishes.
+            decodes: Whether the sink decodes messages: it takes objects of publishers of this process too.
+            hears_own: Whether it takes the messages of this node.
 
         Raises:
             TypeMismatchError: The node subscribes to the topic with another type already.
-            MasterError: The master cannot be told.
+            MasterError: The registration at the master failed.
         """
         name, md5sum = (message_type.name, message_type.md5sum) if message_type is not None else (ANY, ANY)
         source = self.inputs.get(topic)
@@ -132,7 +132,7 @@ class Topics:
             raise HandshakeRefusedError(f"topic {fields['topic']} is not published here")
         output.accept(connection, fields)
 
-    # What the slave API tells
+    # For the slave API
 
     def names(self) -> list[str]:
         """Return the topics that are published or subscribed to."""

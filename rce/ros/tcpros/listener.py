@@ -94,7 +94,7 @@ class _Greeter:
         self._stop_waiting()
 
     def writable(self, connection: Connection) -> None:
-        """Nothing waits to be written."""
+        """Do nothing: nothing waits to be written."""
 
     def _stop_waiting(self) -> None:
         if self._deadline is not None:

@@ -54,7 +54,7 @@ class TypeRegistry:
             name: ``package/Type``.
 
         Raises:
-            UnknownTypeError: There is no definition of it, or of a type that it uses.
+            UnknownTypeError: Its definition, or that of a type it uses, was not found.
             BadDefinitionError: Its definition, or one that it uses, is wrong.
         """
         found = self._messages.get(name)
@@ -71,7 +71,7 @@ class TypeRegistry:
         """Return a service type.
 
         Raises:
-            UnknownTypeError: There is no definition of it, or of a type that it uses.
+            UnknownTypeError: Its definition, or that of a type it uses, was not found.
             BadDefinitionError: Its definition, or one that it uses, is wrong.
         """
         found = self._services.get(name)

@@ -1,4 +1,4 @@
-"""One connection of a relay: frames in, frames out, and little of both until the other side is known."""
+"""One connection of a relay; until the other side has authenticated, it carries few and small frames."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from rce.ros.node.settings import MAX_QUEUED_BYTES
 
 PING_PERIOD = 1.0
 SILENCE = 3.5
-"""Seconds without a frame after which the other side is taken for gone."""
+"""Seconds without a frame after which the other side counts as gone."""
 
 WRITE_HIGH = 2**20
 """Bytes waiting to be sent from which on messages wait, the newest :data:`QUEUE` of them."""
@@ -52,10 +52,10 @@ class RelayConnection(asyncio.Protocol):
         self._lobby = lobby
         self._guest: Guest | None = None
         self._greetings: asyncio.Queue[Greeting | None] = asyncio.Queue()
-        """What came of the handshake; None at the end."""
+        """The received frames of the handshake; None at the end."""
         self._is_known = False
         self._answered = False
-        """Whether the side that was dialed has said its last word of the handshake."""
+        """Whether the side that was dialed has sent its last frame of the handshake."""
         self.ended: asyncio.Future[None] = loop.create_future()
         self.gone = asyncio.Event()
         self._ends: tuple[Callable[[Frame], None], ...] = ()
@@ -102,18 +102,18 @@ class RelayConnection(asyncio.Protocol):
             self._guest.leave()
 
     def start(self, *ends: Callable[[Frame], None]) -> None:
-        """Give the frames to ``ends`` from now on, those that came since the hello first."""
+        """Pass frames to ``ends`` from now on, beginning with those that came since the hello."""
         self._ends = ends
         backlog, self._backlog = self._backlog, []
         for frame in backlog:
             self._take(frame)
 
     def stop(self) -> None:
-        """Ignore what comes from now on."""
+        """Ignore further frames."""
         self._stopped = True
 
     async def ping(self) -> None:
-        """Say now and then that this side is there; end the link when the other does not."""
+        """Send a ping periodically; end the link when the other side is silent."""
         loop = asyncio.get_running_loop()
         while True:
             self.send(Ping())
@@ -188,7 +188,7 @@ class RelayConnection(asyncio.Protocol):
         if self._greetings.qsize() >= MAX_GREETINGS:
             raise LinkBrokenError("the other side says too much before the handshake is done")
         if self._lobby is None and isinstance(frame, Hello):
-            # The listening side's last word of the handshake; what follows may come with it.
+            # The listening side's last frame of the handshake; the next frames may come with it.
             self._answered = True
             self._decoder.most = MAX_FRAME_SIZE
         self._greetings.put_nowait(frame)
@@ -197,6 +197,6 @@ class RelayConnection(asyncio.Protocol):
         self._greetings.put_nowait(None)
         if not self.ended.done():
             self.ended.set_exception(error)
-            self.ended.exception()  # it is not an unseen one: who waits gets it
+            self.ended.exception()  # mark the exception as retrieved: waiting callers get it
         if self._transport is not None:
             self._transport.abort()

@@ -1,4 +1,4 @@
-"""One end of a relay: offers what a graph has, sends what the other end wants."""
+"""The exporting end of a relay: offers the topics and services of a graph, sends what the importer wants."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rce.ros.node.master import MasterClient
 _log = logging.getLogger(__name__)
 
 PERIOD = 1.0
-"""Seconds between looks at the graph."""
+"""Seconds between checks of the graph."""
 
 CALL_TIMEOUT = 60.0
 MAX_CALLS = 256
@@ -49,11 +49,12 @@ class Exporter:
         Args:
             node: Subscribes and calls.
             master: The node's master.
-            chosen: What is offered, by the names that it is offered under.
+            chosen: The filter, by the names that topics and services are offered under.
             send: Takes frames for the other end.
             tasks: Owns the calls.
             rename: Gives the names to offer.
-            foreign: Tells nodes that were registered by a synchronization: what they have is not offered.
+            foreign: Returns the nodes that a synchronization registered; their topics and services are not
+                offered.
         """
         self._node = node
         self._master = master
@@ -75,7 +76,7 @@ class Exporter:
         self._calls = 0
 
     async def run(self) -> None:
-        """Offer what there is, and what is wanted of it, until cancelled."""
+        """Offer topics and services, and send the wanted messages, until cancelled."""
         loop = asyncio.get_running_loop()
         next_look = loop.time()
         try:
@@ -108,7 +109,7 @@ class Exporter:
             self._calls += 1
             self._tasks.spawn(self._call(frame), name="relayed call")
 
-    # What there is
+    # The offer
 
     async def _look(self) -> None:
         snapshot = await self._source.read()
@@ -177,7 +178,7 @@ class Exporter:
     def _offered_name(self, name: str) -> str:
         return self._rename(name) or name
 
-    # What is wanted
+    # Wanted messages and calls
 
     async def _serve_wants(self) -> None:
         for number in self._subscribers.keys() - (self._wanted & self._names.keys()):

@@ -1,7 +1,7 @@
-"""What two ends of a relay tell each other, and its bytes. Sans-I/O.
+"""The frames between the two ends of a relay. Sans-I/O.
 
-A frame on the wire is its length (uint32, little-endian, of all that follows), one byte for its kind, and its
-body: JSON for what is rare, a fixed head and the untouched message for what is many::
+A frame on the wire is its length (uint32, little-endian, of everything after it), one byte for its kind, and
+its body: JSON for rare frames, a fixed header and the untouched message for frequent ones::
 
     H  hello     {"protocol": 2, "name": ..., "nonce": ..., "proof": ...}: see :mod:`.handshake`
     N  challenge {"nonce": ...}
@@ -41,7 +41,7 @@ MAX_GREETING = 4096
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """Who is at this end."""
+    """Names this end and authenticates it."""
 
     CODE: ClassVar[bytes] = b"H"
     name: str
@@ -59,7 +59,7 @@ class Hello:
 
 @dataclass(frozen=True, slots=True)
 class Challenge:
-    """What the side that dials must prove itself with."""
+    """The nonce that the dialing side must use in its proof."""
 
     CODE: ClassVar[bytes] = b"N"
     nonce: str
@@ -157,7 +157,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Ping:
-    """A sign of life."""
+    """Shows that the sender is alive."""
 
     CODE: ClassVar[bytes] = b"P"
 
@@ -192,7 +192,7 @@ class Decoder:
         """Take bytes; return the frames that are complete.
 
         Raises:
-            LinkBrokenError: This is not the protocol.
+            LinkBrokenError: The bytes are not frames of this protocol.
         """
         self._buffer += data
         position = 0

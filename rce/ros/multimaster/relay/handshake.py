@@ -1,6 +1,6 @@
-"""How the two sides of a relay prove to each other that they have the same token. Sans-I/O.
+"""The handshake in which both sides of a relay prove that they have the same token. Sans-I/O.
 
-The token itself never travels. Who dials proves first, so that a stranger who connects learns nothing but a
+The token itself is never sent. The dialing side proves first, so that a stranger who connects learns only a
 random number::
 
     dialing side                                  listening side

@@ -1,4 +1,4 @@
-"""The other end of a relay: has in its graph what was offered, asks for what is used of it."""
+"""The importing end of a relay: advertises the offer in its graph, and asks for the topics in use."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ RETRY = 1.0
 
 
 class Importer:
-    """Publishes and provides in one graph what the other end offers. Messages come while somebody listens."""
+    """Advertises the other end's offer in one graph. A topic's messages come while it has subscribers."""
 
     def __init__(
         self,
@@ -38,7 +38,7 @@ class Importer:
         Args:
             node: Publishes and provides.
             master: The node's master.
-            chosen: What is taken of the offer, by the names that it is offered under.
+            chosen: The filter of the offer, by the names in it.
             send: Takes frames for the other end.
             rename: Gives the names of this graph.
         """
@@ -57,7 +57,7 @@ class Importer:
         self._complained: set[str] = set()
 
     async def run(self) -> None:
-        """Keep the graph as the offers have it, until cancelled."""
+        """Keep the graph in step with the offers, until cancelled."""
         try:
             while True:
                 self._changed.clear()

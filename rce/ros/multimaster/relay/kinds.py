@@ -1,4 +1,4 @@
-"""The types of what is passed on: names and checksums, as connection headers tell them."""
+"""The types of relayed topics and services: names and checksums, from connection headers."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _LENGTH = 4
 
 @dataclass(frozen=True, slots=True)
 class TopicKind:
-    """What a publisher says of its topic's type."""
+    """A topic's type, as its publisher gives it."""
 
     name: str
     md5sum: str
     definition: str
 
     def as_type(self) -> MessageType:
-        """Return this as what nodes publish and subscribe to serialized messages with."""
+        """Return the type for publishing and subscribing to serialized messages."""
         return cast("MessageType", self)
 
 
@@ -42,7 +42,7 @@ class _Named:
 
 @dataclass(frozen=True, slots=True)
 class ServiceKind:
-    """What a provider says of its service's type."""
+    """A service's type, as its provider gives it."""
 
     name: str
     md5sum: str
@@ -60,7 +60,7 @@ class ServiceKind:
         return _Named(self.response_type)
 
     def as_type(self) -> ServiceType:
-        """Return this as what nodes provide and call serialized services with."""
+        """Return the type for providing and calling serialized services."""
         return cast("ServiceType", self)
 
 

@@ -27,7 +27,7 @@ HELLO_TIMEOUT = 5.0
 CONNECT_TIMEOUT = 10.0
 RETRY = Backoff(first=0.2, longest=5.0, jitter=0.5)
 WORKED_AFTER = 5.0
-"""A link that lasted for so many seconds did work: the next pause is a short one."""
+"""After a link that lasted for so many seconds, the next pause is short again."""
 MAX_NEW = STRANGERS = 64
 """How many links may wait to be taken, or have not shown yet that they have the token."""
 
@@ -36,12 +36,12 @@ STRANGERS_PER_ADDRESS = 16
 
 
 MakeEnds = Callable[[Callable[[Frame], None], TaskScope, str], tuple[Exporter, Importer]]
-"""Makes both ends for a link, given what takes frames, what owns tasks, and the other side's name."""
+"""Makes both ends of a link, from the receiver of frames, the owner of tasks, and the other side's name."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkIdentity:
-    """What one side says of itself."""
+    """The identity of one side."""
 
     name: str
     token: str = ""
@@ -49,14 +49,14 @@ class LinkIdentity:
 
 
 def check_listening(host: str, token: str) -> None:
-    """Refuse to listen for everybody.
+    """Refuse to listen for other machines without a token.
 
     Args:
         host: Address to listen on; empty for all.
         token: What other sides must have.
 
     Raises:
-        MultimasterError: Other machines could connect, and there is no token that they must have.
+        MultimasterError: Other machines could connect, and no token is set that they must have.
     """
     if not token and not is_loopback(host):
         raise MultimasterError(
@@ -66,7 +66,7 @@ def check_listening(host: str, token: str) -> None:
 
 
 class RelayLinks:
-    """All links of one synchronization: those it makes and those it takes."""
+    """All links of one synchronization: dialed and accepted ones."""
 
     def __init__(self, identity: LinkIdentity, make_ends: MakeEnds) -> None:
         self.connected: set[str] = set()
@@ -101,8 +101,8 @@ class RelayLinks:
         """Begin to listen for links; :meth:`serve` takes them.
 
         Raises:
-            MultimasterError: Other machines could connect, and there is no token that they must have.
-            OSError: The port cannot be had.
+            MultimasterError: Other machines could connect, and no token is set that they must have.
+            OSError: The port cannot be bound.
         """
         check_listening(host or "", self._identity.token)
         return await asyncio.get_running_loop().create_server(self._accept, host or "0.0.0.0", port)  # noqa: S104

@@ -34,9 +34,9 @@ def strip_namespace(name: str, namespace: str) -> str | None:
 
 
 class NamespaceRemote(Remote):
-    """Has a master's ``/x`` here as ``/NS/x``, and what is published here as ``/NS/y`` there as ``/y``.
+    """Relays a master's ``/x`` to ``/NS/x`` here, and what is published here as ``/NS/y`` to ``/y`` there.
 
-    A node of its own at the remote master takes and gives; here, the synchronization's node does.
+    It uses a node of its own at the remote master, and the synchronization's node here.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class NamespaceRemote(Remote):
         Args:
             master: The remote master.
             namespace: Where its names are here.
-            chosen: What the user wants of it, by the names there.
+            chosen: The user's filter, by the names there.
             node: The synchronization's node.
             local: Its master.
             rpc: Makes calls.

@@ -14,7 +14,7 @@ class Throttle(Protocol):
 
 
 class Everything:
-    """Lets everything pass."""
+    """Passes every message."""
 
     def passes(self, now: float, size: int) -> bool:
         """Let it pass."""

@@ -16,7 +16,7 @@ from rce.ros.xmlrpc import RpcClient
 _log = logging.getLogger(__name__)
 
 LOOK_AGAIN = 0.5
-"""Seconds between looks for a first publisher."""
+"""Seconds between checks for a first publisher."""
 
 QUEUE = 100
 
@@ -25,7 +25,7 @@ class TopicRelay:
     """Publishes under one name what is published under another, of whatever type.
 
     Attributes:
-        passed: How many messages went on.
+        passed: How many messages were passed on.
         held_back: How many the throttle stopped.
     """
 
@@ -44,8 +44,8 @@ class TopicRelay:
             source: The topic to take.
             target: The topic to publish.
             throttle: Decides which messages are passed on; None: all.
-            latch: Keep the last message for later subscribers. Without it, what is latched stays so.
-            lazy: Take messages only while somebody wants them.
+            latch: Keep the last message for later subscribers. Without it, latched messages stay latched.
+            lazy: Take messages only while the target has subscribers.
         """
         self.passed = 0
         self.held_back = 0
