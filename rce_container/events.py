@@ -1,4 +1,4 @@
-"""What can happen to a manager's containers (events), and what it decides to do (instructions)."""
+"""The events of a manager's containers, and the instructions that it decides on."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from rce.control.model import EndpointSpec, EndpointStatus, LinkAddress, SpecPat
 
 @dataclass(frozen=True, slots=True)
 class Put:
-    """The master desires a container like this."""
+    """The master desires a container with this specification."""
 
     spec: EndpointSpec
 
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """What the master desires of a container changed in this."""
+    """The master changed its specification of a container."""
 
     patch: SpecPatch
 
@@ -33,7 +33,7 @@ class Drop:
 
 @dataclass(frozen=True, slots=True)
 class Sync:
-    """The master desires exactly these."""
+    """The master desires exactly these containers."""
 
     specs: tuple[EndpointSpec, ...]
 
@@ -83,7 +83,7 @@ class StatusWanted:
 
 @dataclass(frozen=True, slots=True)
 class Faulted:
-    """An environment has a fault to tell the user of."""
+    """An environment reports a fault for the user."""
 
     id: str
     incarnation_id: str
@@ -101,7 +101,7 @@ class Lost:
 
 @dataclass(frozen=True, slots=True)
 class Removed:
-    """Nothing is left of an incarnation."""
+    """An incarnation has been removed completely."""
 
     id: str
     incarnation_id: str
@@ -156,7 +156,7 @@ class Apply:
 
 @dataclass(frozen=True, slots=True)
 class ApplyPatch:
-    """Give an environment what changed in its specification."""
+    """Give an environment the changes of its specification."""
 
     id: str
     incarnation_id: str
@@ -165,12 +165,12 @@ class ApplyPatch:
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """End an incarnation, nodes first; answered by :class:`Removed` in the end."""
+    """End an incarnation, nodes first; finally answered by :class:`Removed`."""
 
     id: str
     incarnation_id: str
     reason: str = ""
-    """Why, for the record of that incarnation."""
+    """The reason, for the record of that incarnation."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Joins commands in containers with the users who run them, by way of the master."""
+"""Connects commands in containers with the users who run them, through the master."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Start = Callable[[str, Command, socket.socket], None]
 
 
 class Executions:
-    """Carries the frames of runs between the master and environments; looks into none of them.
+    """Carries the frames of runs between the master and environments without reading them.
 
     Args:
         dialer: Connects to the master.
@@ -61,7 +61,7 @@ class Executions:
 
 
 async def _carry(sock: socket.socket, master: ClientConnection) -> None:
-    """Carry frames both ways until either side is gone."""
+    """Carry frames both ways until either side disconnects."""
     loop = asyncio.get_running_loop()
 
     async def upwards() -> None:
@@ -71,10 +71,8 @@ async def _carry(sock: socket.socket, master: ClientConnection) -> None:
     async def downwards() -> None:
         async for frame in master:
             if isinstance(frame, bytes) and frame:
-                with contextlib.suppress(
-                    OSError
-                ):  # the command has ended; what it said last is still carried
+                with contextlib.suppress(OSError):  # the command has ended; its last output is still carried
                     await loop.sock_sendall(sock, frame)
 
-    with contextlib.suppress(ConnectionClosed, OSError):  # either side may go at any time
+    with contextlib.suppress(ConnectionClosed, OSError):  # either side may disconnect at any time
         await run_until_first(upwards(), downwards())

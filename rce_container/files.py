@@ -1,4 +1,4 @@
-"""Files of containers: written whole or not at all; what nodes left is measured and removed. All blocks."""
+"""Files of containers: atomic writes, and measuring and removing what nodes left. All functions block."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from pathlib import Path
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all, by way of ``NAME.new`` beside it.
+    """Write a file atomically, through ``NAME.new`` beside it.
 
     Args:
         path: The file.
         data: All of it.
 
     Raises:
-        OSError: It cannot be written; names a file. What was there before still is.
+        OSError: It cannot be written; the error names a file. A former version stays.
     """
     temporary = path.with_name(f"{path.name}.new")
     try:
@@ -31,7 +31,7 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 def size_of(folder: Path) -> int:
-    """Tell how many bytes the files in a folder take; follows no links."""
+    """Return how many bytes the files in a folder take; does not follow links."""
     total = 0
     waiting = [str(folder)]
     while waiting:
@@ -46,10 +46,10 @@ def size_of(folder: Path) -> int:
 
 
 def remove(folder: Path) -> None:
-    """Remove a folder with all that is in it, as far as that is possible; may be repeated."""
+    """Remove a folder with its contents, as far as possible; may be repeated."""
     try:
         shutil.rmtree(folder, ignore_errors=True)
-    except RecursionError:  # rm goes as deep as it is
+    except RecursionError:  # rm handles any depth
         rm = shutil.which("rm") or "/bin/rm"
         with contextlib.suppress(OSError):
             subprocess.run([rm, "-rf", "--", folder], check=False, capture_output=True)  # noqa: S603

@@ -1,4 +1,4 @@
-"""Where a container task set keeps what it needs on disk.
+"""The folders of a container task set on disk.
 
 ``STATE/name``, one folder per life of a container, ``STATE/containers/MARK`` (record, private home), and its
 logs, which outlive it (:mod:`rce_container.archive`), are in the state directory; the container's sockets are
@@ -32,7 +32,7 @@ _MAX_SOCKET_PATH = 107
 
 
 class Record(Struct, frozen=True, kw_only=True):
-    """What a manager must know of a container that an earlier manager started."""
+    """The record by which a manager adopts a container that an earlier manager started."""
 
     id: str
     incarnation_id: str = field(name="mark")
@@ -40,14 +40,14 @@ class Record(Struct, frozen=True, kw_only=True):
     pid: int
     """The outermost process of the container."""
     start: int
-    """Its start time, so that a reused pid is told apart."""
+    """Its start time, which distinguishes it from a process with a reused pid."""
     namespaces_pid: int = 0
     """See :attr:`rce_container.runtimes.base.Handle.namespaces_pid`."""
     environment: int = 0
     """The environment's pid, if it does not descend from the outermost process; else 0."""
     environment_start: int = 0
     group: str = ""
-    """The group whose private network it is in; empty if it is in none."""
+    """The group whose private network it is in; empty without one."""
     address: str = ""
     """Its address there, with the prefix."""
     revision: int = 0
@@ -87,7 +87,7 @@ class ContainerFolder:
                 path.mkdir(mode=0o700, parents=True)
             self.logs.mkdir(mode=0o700, exist_ok=True)
             self.user_packages.mkdir()
-            self.user_packages.chmod(0o755)  # for whomever the container runs as; nobody else comes by
+            self.user_packages.chmod(0o755)  # readable by the container's user, who alone can reach it
         except OSError as error:
             raise StateError(f"cannot make {error.filename}: {error.strerror}") from error
 
@@ -107,7 +107,7 @@ class ContainerFolder:
         return sock
 
     def write_record(self, record: Record) -> None:
-        """Note who the container is, atomically.
+        """Write the record of the container, atomically.
 
         Raises:
             StateError: It cannot be written.
@@ -118,14 +118,14 @@ class ContainerFolder:
             raise StateError(f"cannot write {error.filename}: {error.strerror}") from error
 
     def read_record(self) -> Record | None:
-        """The record; None if it was never written whole."""
+        """Return the record; None if it was never completely written."""
         try:
             return msgspec.json.decode((self.path / "record.json").read_bytes(), type=Record)
         except (OSError, msgspec.DecodeError):
             return None
 
     def note_revision(self, revision: int) -> None:
-        """Note the newest revision that the environment was given; a later manager believes no other.
+        """Write the newest revision that the environment was given; a later manager trusts only this one.
 
         Raises:
             StateError: It cannot be written.
@@ -135,7 +135,7 @@ class ContainerFolder:
             self.write_record(msgspec.structs.replace(record, revision=revision))
 
     def remove(self) -> None:
-        """Remove everything, also what a node made unreadable. Blocks; may be repeated."""
+        """Remove everything, including files that a node made unreadable. Blocks; may be repeated."""
         for path in (self.run, self.path):
             remove(path)
             if path.exists():
@@ -144,7 +144,7 @@ class ContainerFolder:
 
 
 def _make_accessible(root: Path) -> None:
-    """Undo what a node did to the permissions of its folders. Follows no links."""
+    """Undo a node's changes to the permissions of its folders. Does not follow links."""
     waiting = [str(root)]
     while waiting:
         folder = waiting.pop()
@@ -211,7 +211,7 @@ class StateFolder:
         os.pwrite(self._lock, f"{own.pid} {own.start}\n".encode() if own is not None else b"", 0)
 
     def owner(self) -> proc.Process | None:
-        """Return the process that has the state directory; None if it does not run or did not note itself."""
+        """Return the process that holds the state directory; None if it does not run or left no note."""
         try:
             pid, start = map(int, (self._state / "lock").read_text().split())
         except (OSError, ValueError):
@@ -227,7 +227,7 @@ class StateFolder:
             self._lock = -1
 
     def name(self, requested: str) -> str:
-        """The task set's name: ``requested``, or the one it had before, or a new one. It is kept.
+        """Return the task set's name: ``requested``, or its former one, or a new one. It is kept.
 
         Raises:
             StateError: ``requested`` cannot be a name.
@@ -242,7 +242,7 @@ class StateFolder:
 
     @property
     def token(self) -> str:
-        """Names this state directory on its machine, indefinitely."""
+        """A permanent name of this state directory on its machine."""
         return self._word("run", secrets.token_hex(4))
 
     @property
@@ -252,7 +252,7 @@ class StateFolder:
 
     @property
     def requirements(self) -> Path:
-        """Where is kept what those packages asked for."""
+        """Where the requirements of those packages are kept."""
         return self._state / "requirements"
 
     @property
@@ -278,7 +278,7 @@ class StateFolder:
         return folder
 
     def existing(self) -> list[ContainerFolder]:
-        """All folders of incarnations of containers that are there, by id."""
+        """Return all existing folders of incarnations, by id."""
         incarnation_ids = {path.name for parent in (self._containers, self._run) for path in parent.iterdir()}
         logs = self.archive.folders()
         return [

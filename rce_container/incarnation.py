@@ -57,13 +57,13 @@ from rce_container.settings import ContainerSettings
 _log = logging.getLogger(__name__)
 
 _SHIM_TIMEOUT_S = 5.0
-"""What the shim gets to remove the folders of a container that ended properly."""
+"""Seconds that the shim has to remove the folders of a container that ended properly."""
 _LAST_WORDS_LENGTH = 300
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IncarnationContext:
-    """What all incarnations of all containers share."""
+    """The context shared by all incarnations of all containers."""
 
     settings: ContainerSettings
     acceptor: LinkAcceptor
@@ -80,14 +80,14 @@ class Incarnation:
         id: The container.
         folder: Belongs to this incarnation.
         handle: Its outermost process.
-        enforcer: Looks after its control group.
-        context: What all incarnations share.
+        enforcer: Enforces the limits of its control group.
+        context: Shared by all incarnations.
         isolated: Whether pids that the environment reports are those of a namespace of its own.
     """
 
     def __init__(
         self,
-        id: str,  # noqa: A002 - what it is
+        id: str,  # noqa: A002 - the model's word
         folder: ContainerFolder,
         handle: Handle,
         enforcer: LimitEnforcer,
@@ -100,17 +100,17 @@ class Incarnation:
         self.handle = handle
         self.enforcer = enforcer
         self.counters = m.Counters()
-        """What went through links and interfaces, as the environment said last."""
+        """The traffic of links and interfaces, as last reported by the environment."""
         self._observed: ObservedStatus | None = None
         """What the environment reported last."""
         self.reported = asyncio.Event()
-        """Set by the first report, and by an end without one."""
+        """Set by the first report, or by an end without a report."""
         self._context = context
         self._isolated = isolated
         self._channel: Channel | None = None
         self._links = ContainerLinks(context.acceptor, context.settings)
         self._takes_errands = False
-        """Whether there is an environment for which links and limits are looked after."""
+        """Whether an environment runs for which links and limits are handled."""
         self._desired: DesiredState | None = None
         self._pids: dict[int, int] = {}
         self._deadline: asyncio.Timeout | None = None
@@ -144,7 +144,7 @@ class Incarnation:
         return self._observed.whole if self._observed is not None else None
 
     def apply(self, spec: EndpointSpec) -> None:
-        """Give the environment what is desired."""
+        """Give the environment its desired state."""
         self._desired = DesiredState(spec)
         self._note_revision(spec.revision)
         self._supply.want(spec.packages)
@@ -155,7 +155,7 @@ class Incarnation:
             self._errands.spawn(self._resize(spec.resources), name=f"limits of {self.id}")
 
     def apply_patch(self, patch: SpecPatch) -> None:
-        """Give the environment what changed in what is desired; what it fits was given before."""
+        """Give the environment a patch of its desired state, based on the revision that it has."""
         assert self._desired is not None, "a whole specification comes first"
         self._desired.patch(patch)
         if PATCHES not in self._features:
@@ -186,7 +186,7 @@ class Incarnation:
 
         Args:
             command: The command.
-            sock: What the environment is to talk to; the caller closes its copy.
+            sock: The environment's connection to the user; the caller closes its copy.
 
         Raises:
             ExecutionError: The environment cannot do it.
@@ -200,7 +200,7 @@ class Incarnation:
         self._channel.send(m.encode(m.Execute(command=command)), sock.fileno())
 
     def poll(self) -> None:
-        """Ask for new :attr:`counters`, and tell of limits that struck."""
+        """Ask for new :attr:`counters`, and report limits that were hit."""
         if self._channel is None or self._stopping:
             return
         self._channel.send(m.encode(m.Poll()))
@@ -208,7 +208,7 @@ class Incarnation:
             self._context.feed(events.Faulted(self.id, self.incarnation_id, text))
 
     def stop(self, reason: str = "") -> None:
-        """Tell the environment to end; if it does not, it is killed.
+        """Tell the environment to end; kill it if it does not.
 
         Args:
             reason: For the record of this incarnation.
@@ -225,7 +225,10 @@ class Incarnation:
         self._limit(0.0)
 
     async def run(self) -> None:
-        """Live to the end. A cancelled manager leaves the container to itself: it may be adopted."""
+        """Run until the container has ended.
+
+        A cancelled manager leaves the container running: it may be adopted.
+        """
         try:
             reason = await self._live()
             if not self._stopping:
@@ -242,7 +245,7 @@ class Incarnation:
             self.reported.set()
 
     async def _live(self) -> str:
-        """Talk with the environment until it is gone; returns why."""
+        """Exchange messages with the environment until it has ended; return the reason."""
         try:
             async with asyncio.timeout(self._context.settings.start_timeout) as self._deadline:
                 await self._launch()
@@ -267,11 +270,11 @@ class Incarnation:
         return "its environment died"
 
     async def _launch(self) -> None:
-        """Bring the environment to life, and note who it is for a later manager.
+        """Start the environment, and record it for a later manager.
 
         Raises:
             StartError: It cannot be started.
-            StateError: It cannot be noted.
+            StateError: The record cannot be written.
         """
         handle = self.handle
         before = handle.environment
@@ -334,14 +337,14 @@ class Incarnation:
 
     @property
     def _newest_revision(self) -> int:
-        """The newest revision that the environment was given, by this manager or by one before."""
+        """The newest revision that the environment was given, by this manager or an earlier one."""
         if self._desired is not None:
             return self._desired.revision
         record = self.folder.read_record()
         return record.revision if record is not None else 0
 
     def _apply_again(self, pace: intake.Pace) -> None:
-        """Give the environment all that is desired; it pays for what that costs."""
+        """Give the environment its whole desired state; the cost counts for the environment."""
         pace.pay(intake.PER_FAULT)
         if self._desired is not None:
             pace.pay(intake.PER_PART * (len(self._desired.interfaces) + len(self._desired.connections)))
@@ -363,13 +366,13 @@ class Incarnation:
         self._context.feed(events.Changed(self.id, self.incarnation_id, patch))
 
     def _outside(self, status: EndpointStatus, pace: intake.Pace) -> EndpointStatus:
-        """Return a status as it is seen from outside of the container."""
+        """Return a status as seen from outside the container."""
         if not self._isolated:
             return status
         return msgspec.structs.replace(status, nodes=self._with_outer_pids(status, pace))
 
     def _with_outer_pids(self, status: EndpointStatus, pace: intake.Pace) -> tuple[NodeStatus, ...]:
-        """Replace the nodes' pids inside the container by those outside."""
+        """Replace the nodes' pids inside the container by their pids outside."""
         if any(node.pid and node.pid not in self._pids for node in status.nodes):
             pace.pay(intake.PER_LOOK)
             pids = self.enforcer.control_group.pids() or [
@@ -420,7 +423,7 @@ class Incarnation:
         return f"; its last words: {words}" if words else ""
 
     async def _clean(self, timeout: float) -> None:
-        """Let the shim do its work for ``timeout`` seconds, then kill what is left and remove the folder."""
+        """Wait ``timeout`` seconds for the shim, then kill the remaining processes and remove the folder."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout):
                 await self.handle.wait()

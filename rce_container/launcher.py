@@ -33,7 +33,7 @@ PODMAN = "podman"
 
 
 class Launched(NamedTuple):
-    """What there is of a container whose processes were started."""
+    """The parts of a container whose processes were started."""
 
     handle: Handle
     control_group: ControlGroup
@@ -71,11 +71,11 @@ class Launcher:
         self._networks = networks
 
     def launch(self, id_: str, folder: ContainerFolder, resources: Resources) -> Launched:
-        """Start a container's first process, and note in its folder who it is.
+        """Start a container's first process, and write its record to its folder.
 
         Raises:
-            ContainerError: It cannot be started. What was made of it is removed by :meth:`undo`.
-            OSError: The machine has no more of something.
+            ContainerError: It cannot be started. :meth:`undo` removes what was made of it.
+            OSError: A resource of the machine is exhausted.
         """
         runtime = self._runtime_for(resources)
         control_group = self._limiter.create(folder.incarnation_id, limits_of(resources, self._settings))
@@ -108,12 +108,12 @@ class Launcher:
         try:
             folder.write_record(record)
         except StateError:
-            proc.kill(process)  # all of the container ends with it
+            proc.kill(process)  # all processes of the container end with it
             raise
         return Launched(handle, control_group, runtime.isolated)
 
     async def undo(self, incarnation_id: str) -> None:
-        """Remove a container's cell, with all that is in it, and its place in a network."""
+        """Remove a container's control group with all its processes, and its place in a network."""
         control_group = self._limiter.adopt(incarnation_id)
         try:
             await asyncio.to_thread(control_group.kill)
@@ -123,7 +123,7 @@ class Launcher:
         await self._networks.detach(incarnation_id)
 
     def _runtime_for(self, resources: Resources) -> Runtime:
-        """The runtime that makes a container: an image needs one that can run images.
+        """Return the runtime that makes a container: an image needs one that can run images.
 
         Raises:
             StartError: None here can.
@@ -175,8 +175,8 @@ class Launcher:
 
 
 def _rlimits(control_group: ControlGroup, *, isolated: bool) -> dict[int, int]:
-    """What the container's processes limit themselves."""
+    """Return the limits that the container's processes set for themselves."""
     rlimits = dict(control_group.rlimits)
     if not isolated:
-        rlimits.pop(resource.RLIMIT_NPROC, None)  # would count all processes of this user
+        rlimits.pop(resource.RLIMIT_NPROC, None)  # the kernel would count all processes of this user
     return rlimits

@@ -1,6 +1,6 @@
-"""The life of a container as its manager sees it: phases, what may happen in each, and what follows.
+"""The life cycle of a container in its manager: phases, the events of each, and the transitions.
 
-What the master calls requested, placed and lost is before and between the lives that a manager sees.
+The master's states requested, placed and lost are before and between the incarnations that a manager sees.
 """
 
 from __future__ import annotations

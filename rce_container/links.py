@@ -1,4 +1,4 @@
-"""A container's links, seen from the machine: those that come in for it, and the peers that it may dial."""
+"""A container's links on its machine: accepted links, and the peers that it may dial."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _DIAL_TIMEOUT_S = 5.0
 
 
 class ContainerLinks:
-    """What a machine does for the links of one incarnation of a container.
+    """The machine's side of the links of one incarnation of a container.
 
     Args:
         acceptor: Accepts links by TCP for all containers of the machine.
@@ -39,33 +39,33 @@ class ContainerLinks:
         return theirs
 
     def close(self) -> None:
-        """Hand nothing over any more."""
+        """Stop handing links over."""
         sender, self._sender = self._sender, None
         if sender is not None:
             self._acceptor.forget(sender)
             sender.close()
 
     async def assign(self, spec: EndpointSpec) -> None:
-        """Take the links of a specification and no others."""
+        """Accept exactly the links of a specification."""
         if self._sender is not None:
             await self._acceptor.assign(self._sender, [link.id for link in spec.links if not link.dial])
 
     async def change(self, patch: SpecPatch) -> None:
-        """Take what a patch changes of the links."""
+        """Apply a patch to the links."""
         if self._sender is not None:
             accepted = [link.id for link in patch.links if not link.dial]
             dialed = [link.id for link in patch.links if link.dial]
             await self._acceptor.reassign(self._sender, accepted, [*patch.removed_links, *dialed])
 
     async def dial(self, address: LinkAddress, links: Iterable[LinkSpec]) -> socket.socket:
-        """Connect to a peer of the container, and to nothing else.
+        """Connect to a peer of the container; refuse other addresses.
 
         Args:
             address: Of the peer.
             links: The container's links.
 
         Raises:
-            OSError: The container has no link to there, or nothing answers.
+            OSError: The container has no link to this address, or the peer does not answer.
         """
         if not any(link.address == address for link in links):
             raise ConnectionError("the container has no link to there")
@@ -82,7 +82,7 @@ async def dial(address: LinkAddress, machine: str, *, tls: bool = False) -> sock
         tls: Refuse peers that take links by TCP without TLS.
 
     Raises:
-        OSError: Nobody answers there, or without TLS only.
+        OSError: The peer does not answer, or only without TLS.
     """
     if address.unix and address.machine == machine:
         try:

@@ -1,4 +1,4 @@
-"""Reads logs for the master, beside everything else that the master asks."""
+"""Reads logs for the master, concurrently with its other requests."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MAX_WAITING = 256
 
 
 class LogReads:
-    """Reads for several users at once; who asks much waits for their own turns.
+    """Reads for several users at once; a user with many requests delays only their own.
 
     Args:
         read: Reads a piece of a log. Blocks; runs in a thread.
@@ -32,13 +32,13 @@ class LogReads:
         self._closed = False
 
     def take(self, message: ReadLog) -> None:
-        """Answer a question, some time later."""
+        """Queue a request; the answer follows later."""
         if self._closed:
             return
         self._tasks.spawn(self._answer(message), name=f"read of the log of {message.id}")
 
     async def close(self) -> None:
-        """Answer nothing any more."""
+        """Stop answering."""
         self._closed = True
         await self._tasks.close()
 

@@ -1,4 +1,4 @@
-"""The manager: does what :mod:`rce_container.core` decides, and tells it what happens."""
+"""The manager: carries out the decisions of :mod:`rce_container.core`, and feeds it events."""
 
 from __future__ import annotations
 
@@ -77,20 +77,20 @@ class Manager:
     """All containers of one machine, or of one task set on it.
 
     Args:
-        name: Names the task set; the same after a restart.
+        name: The task set's name; stays the same after a restart.
         info: The machine.
         settings: How containers are run.
         runtimes: All runtimes by name, for containers that an earlier manager started.
         runtime: The one for new containers.
-        state: Where everything is kept.
+        state: The state directory.
         acceptor: Accepts links by TCP.
-        links: Host and port where it does.
+        links: Host and port of the acceptor.
         limiter: Enforces the containers' limits.
-        library: Gives packages that users bring.
-        dialer: Connects to the master for commands that users run; without it there are none.
+        library: Provides packages that users bring.
+        dialer: Connects to the master for commands that users run; without it users cannot run commands.
 
     Attributes:
-        send: Sends a message to the master, or drops it while there is none.
+        send: Sends a message to the master, or drops it while no master is connected.
     """
 
     def __init__(
@@ -138,19 +138,19 @@ class Manager:
         )
         self._executions = Executions(dialer, self._execute) if dialer is not None else None
         self._incarnations: dict[str, Incarnation] = {}
-        """All incarnations of which something may be left, by id."""
+        """All incarnations that may have processes or folders, by id."""
         self._queue: deque[str] = deque()
-        """Containers that are to be started when fewer are starting."""
+        """Containers that wait to be started until fewer are starting."""
         self._starting: set[Incarnation] = set()
         self._tasks: asyncio.TaskGroup
         self._empty = asyncio.Event()
         self._meter = UsageMeter()
         self._log_reads = LogReads(self._read_log, lambda chunk: self.send(chunk))  # noqa: PLW0108 - set later
 
-    # The master's side
+    # Messages of the master
 
     def hello(self) -> Hello:
-        """Say who this is and what is there."""
+        """Return the task set's name, machine and containers."""
         self._master_features = frozenset()
         return Hello(
             version=CONTROL_VERSION,
@@ -162,7 +162,7 @@ class Manager:
         )
 
     async def handle(self, message: ToTaskSet) -> None:
-        """Do what the master says."""
+        """Handle a message of the master."""
         match message:
             case Welcome(features=features):
                 self._master_features = frozenset(features)
@@ -194,18 +194,18 @@ class Manager:
 
     @property
     def statuses(self) -> tuple[EndpointStatus, ...]:
-        """What there is now."""
+        """Return the present status."""
         return self._core.statuses
 
-    # Life
+    # Life cycle
 
     async def run(self, ready: Callable[[], None], quit_: asyncio.Event) -> None:
-        """Adopt what an earlier manager left, then manage until told to quit, and end all containers.
+        """Adopt the containers of an earlier manager, then manage until told to quit, and end all containers.
 
-        A manager that is cancelled leaves its containers to themselves.
+        A manager that is cancelled leaves its containers running.
 
         Args:
-            ready: Called when the past is dealt with.
+            ready: Called when all former containers are adopted or removed.
             quit_: Ends the manager.
         """
         with contextlib.closing(self._networks):
@@ -267,9 +267,9 @@ class Manager:
         self._feed(events.Adopted(incarnation.incarnation_id, incarnation.status, self._address(folder)))
 
     async def _prune(self, folder: ContainerFolder) -> None:
-        """Remove what a dead container left."""
+        """Remove the remains of an ended container."""
         with contextlib.suppress(OSError, ChannelError, TimeoutError):
-            # It may live, if its manager died before it could note who it is; or it may be just dying.
+            # It may still run, if its manager ended before it wrote the record; or it may be ending just now.
             channel = await connect(str(folder.control_socket))
             try:
                 channel.send(m.encode(m.Stop()))
@@ -284,19 +284,19 @@ class Manager:
         await asyncio.to_thread(self._state.archive.settle_one, folder.incarnation_id, time.time())
 
     async def _prune_logs(self) -> None:
-        """Remove the logs of containers that ended long ago, now and then."""
+        """Periodically remove the logs of containers that ended long ago."""
         while True:
             await asyncio.to_thread(self._state.archive.prune, time.time())
             await asyncio.sleep(self._settings.prune_interval)
 
     async def _sweep_control_groups(self, keep: set[str]) -> None:
-        """Remove the control groups of containers of which nothing else is left."""
+        """Remove the control groups of containers that have no other remains."""
         try:
             await asyncio.to_thread(self._limiter.sweep, keep)
         except (ContainerError, OSError) as error:
             _log.error("what earlier containers left cannot be removed: %s", error)
 
-    # What the core decides
+    # Instructions of the core
 
     def _feed(self, event: events.Event) -> None:
         for instruction in self._core.handle(event, asyncio.get_running_loop().time()):
@@ -327,7 +327,7 @@ class Manager:
         self.send(message)
 
     def _start_waiting(self) -> None:
-        """Start the containers that wait for it, as far as there is room, and let go of those not wanted."""
+        """Start waiting containers within the limit, and drop those not desired any more."""
         waiting, self._queue = self._queue, deque()
         for id_ in waiting:
             container = self._core.containers.get(id_)
@@ -346,7 +346,10 @@ class Manager:
             return
         try:
             handle, control_group, isolated = self._launcher.launch(id_, folder, self._core.resources(id_))
-        except (ContainerError, OSError) as error:  # disk, descriptors or memory of this machine ran out
+        except (
+            ContainerError,
+            OSError,
+        ) as error:  # disk, descriptors or memory are exhausted
             self._tasks.create_task(
                 self._launcher.undo(folder.incarnation_id), name=f"what was made of {id_}"
             )

@@ -1,4 +1,4 @@
-"""What this machine can give to containers."""
+"""The features that this machine offers to containers."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ _log = logging.getLogger(__name__)
 
 
 class Offers(NamedTuple):
-    """What containers can have here."""
+    """The features that containers can have here."""
 
     runtimes: tuple[str, ...]
-    """By name, the one of containers without an image first."""
+    """Names; the runtime of containers without an image first."""
     networks: tuple[str, ...]
     """Values of :class:`rce.model.specs.Network`."""
     detail: str
-    """What is missing, in words; empty if nothing is."""
+    """The missing features, as text; empty if none is missing."""
 
 
 def find_offers(runtime: Runtime, others: Iterable[Runtime]) -> Offers:
-    """Find out what works here. Blocks.
+    """Find out which features work here. Blocks.
 
     Args:
-        runtime: The one of containers without an image; it works.
-        others: Those that containers may ask for.
+        runtime: The runtime of containers without an image, which works.
+        others: The other runtimes, which containers may ask for.
     """
     runtimes = [runtime]
     details = []

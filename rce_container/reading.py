@@ -1,4 +1,4 @@
-"""Answers requests to read logs: finds the incarnation of the container that is meant, and the log in it."""
+"""Answers requests to read logs: finds the requested incarnation of the container, and its log."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from rce_container.logs import Chunk, read_log, read_node_log
 
 
 def read_for(archive: LogArchive, message: ReadLog, living: str) -> LogChunk:
-    """Read what a message asks for. Blocks.
+    """Read the log that a message asks for. Blocks.
 
     Args:
         archive: All logs.
-        message: What is asked.
-        living: The mark of the container's life, if it has one now; else empty.
+        message: The request.
+        living: The mark of the container's present incarnation; empty without one.
 
     Raises:
-        OSError: It cannot be read; ``FileNotFoundError`` if there is no such log.
+        OSError: It cannot be read; ``FileNotFoundError`` if the log does not exist.
     """
     if message.node and not is_name(message.node):
         raise FileNotFoundError(f"there is no log of {message.node!r}")
@@ -61,7 +61,7 @@ def _find(archive: LogArchive, message: ReadLog, living: str) -> Kept:
 
 
 def _is_owners(kept: Kept, message: ReadLog) -> bool:
-    """Whether an incarnation is of the user who is meant, and not of one of the same name before."""
+    """Whether an incarnation belongs to the requested user, and not to an earlier one of the same name."""
     return kept.record.began >= message.query.since
 
 

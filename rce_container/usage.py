@@ -1,4 +1,4 @@
-"""What containers and their nodes consume: from their cells' counters, else from ``/proc``."""
+"""The usage of containers and their nodes: from their control groups' counters, else from ``/proc``."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from rce_container.limits import ControlGroup
 from rce_container.runtimes.base import Handle
 
 _PSS_EVERY = 5
-"""A process's share of memory costs time to read, so it is read anew in every fifth measurement only."""
+"""A process's share of memory is slow to read, so only every fifth measurement reads it."""
 
 
 class Subject(NamedTuple):
-    """A container that is to be measured."""
+    """A container to be measured."""
 
     handle: Handle
     control_group: ControlGroup
@@ -26,7 +26,10 @@ class Subject(NamedTuple):
 
 
 class UsageMeter:
-    """Measures containers. The machine's processes are listed only if some container has no counting cell."""
+    """Measures containers.
+
+    Lists the machine's processes only if a container's control group does not count.
+    """
 
     def __init__(self) -> None:
         self._shares: dict[tuple[int, int], int] = {}
@@ -41,8 +44,8 @@ class UsageMeter:
             containers: By id.
 
         Returns:
-            The usage by id. A node's memory is its proportional share (PSS), or the resident size where that
-            may not be read; so is the container's, if its control group does not count.
+            The usage by id. A node's memory is its proportional share (PSS), or the resident size if that
+            cannot be read; so is the container's, if its control group does not count.
         """
         self._round += 1
         self._table, self._fresh = None, {}
@@ -100,7 +103,7 @@ class UsageMeter:
         }
 
     def _share(self, process: proc.Process) -> int:
-        """A process's proportional share of memory, not always of this round."""
+        """Return a process's proportional share of memory, possibly of an earlier measurement."""
         key = process.pid, process.start
         if key not in self._fresh:
             share = self._shares.get(key)
@@ -111,10 +114,10 @@ class UsageMeter:
 
 
 def sort_out(nodes: Mapping[str, int], processes: Iterable[proc.Process]) -> dict[int, str]:
-    """Find out which processes belong to which node.
+    """Assign processes to nodes.
 
-    A node is a session of its own; what it started belongs to it even if that made another session, as long
-    as a process that belongs to the node is its parent.
+    A node has its own session. Its child processes belong to it even in another session, as long as their
+    parent belongs to the node.
 
     Args:
         nodes: The pid of each node's first process, by tag.

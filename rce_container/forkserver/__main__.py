@@ -1,7 +1,7 @@
 """``python -m rce_container.forkserver PADDING``: forks environments on the orders of one manager.
 
 Its standard input is a socket for the orders; it ends when the other end is closed. It has one thread and no
-event loop, and knows no secret: all that it ever held is in every environment's memory.
+event loop. It holds no secret, because every environment inherits its memory.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ from rce_container.forkserver.mounts import HOME
 from rce_container.forkserver.nodes import serve
 
 for _module in ("encodings.idna", "importlib.metadata", "uvloop", "yaml", "xml.etree.ElementTree"):
-    with contextlib.suppress(ImportError):  # what environments and nodes would import when they need it
+    with contextlib.suppress(ImportError):  # modules that environments and nodes would import later
         importlib.import_module(_module)
 
 _DESCRIPTORS = len(Descriptors._fields)
 
 
 def main() -> None:
-    """Serve a manager; in a forked child, be what was ordered."""
+    """Serve a manager; in a forked child, run the ordered process."""
     set_oom_score(OF_ENVIRONMENT)
     set_title((sys.executable, "-m", "rce_container.forkserver"), "rce-fork server")
     orders = socket.socket(fileno=os.dup(0))
@@ -55,7 +55,7 @@ def main() -> None:
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
     kernel.become_subreaper()
     gc.collect()
-    gc.freeze()  # no collection touches, and so copies, what the children share
+    gc.freeze()  # no garbage collection touches, and so copies, the pages that the children share
     found = _wait(orders)
     if found is not None:
         orders.close()
@@ -63,7 +63,10 @@ def main() -> None:
 
 
 def _wait(orders: socket.socket) -> tuple[SpawnRequest, Descriptors] | None:
-    """Fork a child for each order. Returns in the children, and with nothing when the manager is gone."""
+    """Fork a child for each order.
+
+    Return in the children, and with None when the manager has disconnected.
+    """
     packet = bytearray(MAX_PACKET)
     while True:
         size, fds = _receive(orders, packet)
@@ -72,7 +75,7 @@ def _wait(orders: socket.socket) -> tuple[SpawnRequest, Descriptors] | None:
         child = os.fork() if len(fds) == _DESCRIPTORS else -1
         if child == 0:
             return decode_request(memoryview(packet)[:size]), Descriptors(*fds)
-        packet[:size] = bytes(size)  # the next container shall not find who came before
+        packet[:size] = bytes(size)  # the next container must not find the data of the one before
         for fd in fds:
             os.close(fd)
 
@@ -96,7 +99,7 @@ def _live(request: SpawnRequest, descriptors: Descriptors, program: bytes) -> No
         logs = confine(request, descriptors, program)
         boot = _settle(request, descriptors, logs)
         _check(request.check)
-    except Exception as error:  # noqa: BLE001 - whatever it is, the manager is told
+    except Exception as error:  # noqa: BLE001 - every error is reported to the manager
         answer.send(encode(Answer(error=f"{type(error).__name__}: {error}")))
         os._exit(1)
     node_server = _fork_node_server(answer)
@@ -111,7 +114,7 @@ def _live(request: SpawnRequest, descriptors: Descriptors, program: bytes) -> No
 
 
 def _fork_node_server(answer: socket.socket) -> socket.socket | None:
-    """Fork the node fork server, while nothing is known that nodes must not know.
+    """Fork the node fork server, before this process knows anything that nodes must not know.
 
     Returns:
         In the environment its end of a socket that leads to the node fork server; None in that server, and in
@@ -130,7 +133,7 @@ def _fork_node_server(answer: socket.socket) -> socket.socket | None:
 
 
 def _settle(request: SpawnRequest, descriptors: Descriptors, logs: int) -> Boot:
-    """Arrange descriptors, variables and signals as a new program finds them."""
+    """Set descriptors, variables and signals as for a new program."""
     nothing = os.open(os.devnull, os.O_RDWR)
     for fd, number in ((nothing, 0), (descriptors.log, 1), (descriptors.log, 2)):
         os.dup2(fd, number)

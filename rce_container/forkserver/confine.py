@@ -1,9 +1,9 @@
-"""Turning a child of the fork server into a process of a container that has no rights at all.
+"""Turns a child of the fork server into an unprivileged process of a container.
 
-Two processes do it. The first one enters the container's namespaces with all the rights it needs there; its
-child, the first of the two to be inside the pid namespace, makes a user namespace below the one that all the
-others belong to. So no capability that a process of the container could ever gain has power over its mounts,
-its network or its pids.
+Two processes do it. The first one enters the container's namespaces with the privileges it needs there; its
+child, the first of the two inside the pid namespace, makes a user namespace below the one that owns all the
+others. So no capability that a process of the container could gain applies to its mounts, its network or its
+pids.
 """
 
 from __future__ import annotations
@@ -24,24 +24,26 @@ USER_ID = 1000
 
 _JOINED = Namespaces.MOUNT | Namespaces.PID | Namespaces.IPC | Namespaces.UTS | Namespaces.CGROUP
 _COUNTED = {"max_user_namespaces": 0, "max_inotify_instances": 32, "max_inotify_watches": 8192}
-"""What the kernel counts in a user namespace, and how much of it is to be had: of the machine's user who made
-the namespace it is taken too."""
+"""Limits of each user namespace. What the namespace uses counts for the user who made it too."""
 _RLIMITS = {
     resource.RLIMIT_RTPRIO: 0,
     resource.RLIMIT_NICE: 0,
     resource.RLIMIT_SIGPENDING: 4096,
     resource.RLIMIT_MSGQUEUE: 1 << 18,
 }
-"""What the engine's user may have, and containers not, or not as much: priority over all others, and what is
-counted for each user of the machine. Numbers are those of ``setrlimit(2)``."""
+"""Limits that are stricter for containers than for the engine: priority, and resources that the kernel counts
+for each user of the machine.
+
+Numbers are those of ``setrlimit(2)``.
+"""
 _FILES = 4096
-"""How many files a process may have open if it does not ask for more, which it may."""
+"""The soft limit of open files; a process may raise it."""
 _NO_CORE = 1
-"""The one size by which the kernel gives a core neither to a file nor to a program of the machine."""
+"""The only size at which the kernel writes a core neither to a file nor to a program of the machine."""
 
 
 def confine(request: SpawnRequest, descriptors: Descriptors, program: bytes) -> int:
-    """Enter the container and give up all rights. Returns in a new process: the others are gone.
+    """Enter the container and drop all privileges. Return in a new process: the others have ended.
 
     Args:
         request: What the container is like.
@@ -52,7 +54,7 @@ def confine(request: SpawnRequest, descriptors: Descriptors, program: bytes) -> 
         A descriptor of the folder for logs.
 
     Raises:
-        OSError: The kernel refuses; not all rights may be given up.
+        OSError: The kernel refuses; some privileges may remain.
     """
     for file in request.join:
         Path(file).write_text(str(os.getpid()))
@@ -95,13 +97,13 @@ def _pid_of(pidfd: int) -> int:
 
 
 def _check_alive(pidfd: int) -> None:
-    """Make sure that what was found by a process's pid was the process's, and not a later one's."""
+    """Verify that what was found by a pid belongs to the process and not to a later one."""
     if select.select((pidfd,), (), (), 0)[0]:
         raise ProcessLookupError("the holder of the namespaces is gone")
 
 
 def _become_user(procfs: int, owner: int) -> None:
-    """Go on as a child that is :data:`USER_ID` in a user namespace of its own, and ``owner`` outside."""
+    """Continue as a child that is :data:`USER_ID` in its own user namespace, and ``owner`` outside."""
     made, make = os.pipe()
     mapped, map_ = os.pipe()
     child = os.fork()
@@ -115,7 +117,8 @@ def _become_user(procfs: int, owner: int) -> None:
         os._exit(0)
     os.close(made)
     os.close(map_)
-    # Whoever makes the namespace pays for what is counted in it: not root, who would pay for all containers.
+    # The namespace's objects count for its creator. Root must not be the creator: it would pay for all
+    # containers.
     kernel.keep_rights_as_another_user()
     os.setegid(owner)
     os.seteuid(owner)
@@ -126,7 +129,7 @@ def _become_user(procfs: int, owner: int) -> None:
     os.close(make)
     os.close(mapped)
     for name, count in _COUNTED.items():
-        with contextlib.suppress(FileNotFoundError):  # a kernel without that setting has no such thing
+        with contextlib.suppress(FileNotFoundError):  # this kernel lacks the feature
             _write(procfs, f"sys/user/{name}", str(count))
     os.setresgid(USER_ID, USER_ID, USER_ID)
     os.setresuid(USER_ID, USER_ID, USER_ID)
@@ -148,8 +151,8 @@ def _give_up(program: bytes) -> None:
 def _leave_files_to_others() -> None:
     """Allow half as many open files as the engine has.
 
-    Descriptors that wait in sockets are counted for a user of the machine. Where that is the engine's own,
-    containers must come to the end of theirs before it does.
+    The kernel counts descriptors that wait in sockets per user of the machine. If that is the engine's user,
+    containers must reach their limit before the engine does.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     half = hard // 2 if hard != resource.RLIM_INFINITY else hard

@@ -1,4 +1,4 @@
-"""What is asked of the kernel to confine a process: namespaces, mounts, capabilities, filters. Linux only.
+"""System calls that confine a process: namespaces, mounts, capabilities, filters. Linux only.
 
 Each function raises :class:`OSError` if the kernel refuses.
 """
@@ -67,7 +67,7 @@ class _Program(ctypes.Structure):
 
 
 def join(fd: int, kinds: Namespaces) -> None:
-    """Join namespaces: those of a process (a pidfd), or one that is open.
+    """Join namespaces: those of a process (a pidfd), or an open one.
 
     A pid namespace is joined by the children that are forked afterwards.
     """
@@ -75,12 +75,12 @@ def join(fd: int, kinds: Namespaces) -> None:
 
 
 def unshare(kinds: Namespaces) -> None:
-    """Leave namespaces for new ones."""
+    """Move to new namespaces."""
     _check(_libc.unshare, int(kinds))
 
 
 def owner(namespace: int) -> int:
-    """Open the user namespace that an open namespace belongs to; returns the descriptor."""
+    """Open the user namespace that an open namespace belongs to; return the descriptor."""
     return fcntl.ioctl(namespace, _NS_GET_USERNS)
 
 
@@ -95,17 +95,17 @@ def unmount(target: str) -> None:
 
 
 def set_dumpable(dumpable: bool) -> None:
-    """Let other processes of the same user look into this one, or not; then it leaves no core either."""
+    """Set whether other processes of the same user may inspect this one, and whether it may dump core."""
     _prctl(_Prctl.SET_DUMPABLE, int(dumpable))
 
 
 def become_subreaper() -> None:
-    """Become the parent of what descendants leave behind."""
+    """Adopt the orphans of descendants."""
     _prctl(_Prctl.SET_CHILD_SUBREAPER, 1)
 
 
 def keep_rights_as_another_user() -> None:
-    """Change users from now on without a loss of capabilities; a new user namespace ends that."""
+    """Keep capabilities across changes of the user, until a new user namespace."""
     _prctl(_Prctl.SET_SECUREBITS, _SECBIT_NO_SETUID_FIXUP)
 
 
@@ -121,7 +121,7 @@ def give_up_capabilities() -> None:
 
 
 def filter_calls(program: bytes) -> None:
-    """Load a filter of system calls for this process and all that descends from it.
+    """Load a filter of system calls for this process and all its descendants.
 
     Args:
         program: Instructions of the kernel's classic BPF, as libseccomp exports them.

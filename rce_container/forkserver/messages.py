@@ -1,4 +1,4 @@
-"""What the manager tells the fork server and what comes back: JSON packets with descriptors.
+"""The messages between the manager and the fork server: JSON packets with descriptors.
 
 The first packet holds the filter of system calls; each one after it is a :class:`SpawnRequest`.
 """
@@ -32,7 +32,7 @@ class SpawnRequest(Struct, frozen=True, kw_only=True, omit_defaults=True):
     join: tuple[str, ...] = ()
     """See :attr:`rce_container.runtimes.base.Order.join`."""
     check: tuple[str, ...] = ()
-    """A command that must succeed in the container before the answer says that all is well."""
+    """A command that must succeed in the container before the answer reports success."""
 
 
 class Descriptors(NamedTuple):
@@ -41,7 +41,7 @@ class Descriptors(NamedTuple):
     holder: int
     """A pidfd of the process that holds the namespaces."""
     answer: int
-    """A socket on which the environment sends its :class:`Answer`, and by that who it is."""
+    """A socket on which the environment sends its :class:`Answer`; identifies the sender."""
     lifeline: int
     """The holder's other end: the container lives as long as the environment keeps it open."""
     control: int
@@ -51,14 +51,14 @@ class Descriptors(NamedTuple):
 
 
 class Answer(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """How a request went."""
+    """The result of a request."""
 
     error: str = ""
     """Empty if the environment is about to run."""
 
 
 FAREWELL = b"done\n"
-"""Written to the lifeline by an environment that ended properly, for the holder to do likewise."""
+"""Written to the lifeline by an environment that ended properly, so that the holder ends properly too."""
 
 encode = msgspec.json.Encoder().encode
 decode_request = msgspec.json.Decoder(SpawnRequest).decode

@@ -1,6 +1,6 @@
-"""The last touches to a container's mounts, from inside of it and before anything of it runs.
+"""The last changes to a container's mounts, made inside it before any of its programs run.
 
-Whoever does it may still mount; what runs later may not, and cannot take any of it back.
+This process may still mount; later ones may not, and cannot undo the changes.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ LOGS = "/var/log/rce"
 TEMPORARY = ("/tmp", "/dev/shm")  # noqa: S108 - the container's own
 
 _BYTES_PER_FILE = 4096
-"""A folder of so many bytes may hold a file for each such piece: empty files take memory too."""
+"""Bytes of a folder per file that it may hold: empty files take memory too."""
 _FLAGS = Mount.NO_SUID | Mount.NO_DEV
 _TERMINALS = 32
-"""The machine has some thousands, for all."""
+"""Per container; the machine has some thousands for all of them."""
 _READ_ONLY_FROM_NOW_ON = Mount.REMOUNT | Mount.BIND | Mount.READ_ONLY | Mount.NO_SUID | Mount.NO_EXEC
 _HIDDEN = (
     "/proc/acpi",
@@ -70,7 +70,7 @@ def limit(path: str, size: int, owner: int, mode: int) -> None:
 
 
 def take_away_logs(owner: int) -> int:
-    """Leave no path to the container's logs; returns their folder's descriptor, which leads nowhere else."""
+    """Remove every path to the container's logs; return a descriptor of their folder, and of nothing else."""
     logs = os.open(LOGS, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     os.fchown(logs, owner, owner)
     unmount(LOGS)
@@ -78,7 +78,7 @@ def take_away_logs(owner: int) -> int:
 
 
 def mask_machine() -> None:
-    """Hide what ``/proc`` and ``/sys`` tell of the machine; let nothing of it or of ``/dev`` be changed."""
+    """Hide the machine's data in ``/proc`` and ``/sys``; make them and ``/dev`` read-only."""
     while os.path.ismount("/sys"):
         unmount("/sys")
     for path in filter(os.path.exists, _HIDDEN):
@@ -94,7 +94,7 @@ def mask_machine() -> None:
 
 
 def _fasten(path: str) -> None:
-    """Let nobody rename a folder that leads to mounts, or put anything beside them."""
+    """Prevent renames of folders that lead to mounts, and new files beside the mounts."""
     if not os.path.ismount(path):
         mount(path, Mount.BIND | Mount.RECURSIVE, source=path)
         mount(path, _READ_ONLY_FROM_NOW_ON | Mount.NO_DEV)

@@ -1,7 +1,7 @@
 """The node fork server: a confined child of the environment that forks nodes which are Python scripts.
 
-It was forked before the environment knew anything, holds nothing but its socket, and has all imported that
-nodes of the engine need: such a node starts without an interpreter's start and without imports.
+It is forked before the environment knows any data, holds only its socket, and has imported the modules that
+nodes of the engine need: such a node starts without a new interpreter and without imports.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _PAUSE_S = 0.0002
 
 
 class Script(Struct, frozen=True, kw_only=True):
-    """A node that is to be started. Answered by its pid."""
+    """A request to start a node. Answered by its pid."""
 
     path: str
     arguments: tuple[str, ...]
@@ -42,7 +42,7 @@ decode_script = msgspec.json.Decoder(Script).decode
 
 
 def serve(orders: socket.socket) -> None:
-    """Fork a node for each order. Returns in each node when it ends, else when the environment is gone."""
+    """Fork a node for each order. Return in each node when it ends, else when the environment has ended."""
     while True:
         packet, fds, _, _ = socket.recv_fds(orders, MAX_PACKET, STREAMS)
         if not packet:
@@ -59,13 +59,13 @@ def serve(orders: socket.socket) -> None:
 
 
 def _leave_to_environment(orders: socket.socket) -> None:
-    """Go on as a child whose parent ends at once: the environment takes in orphans."""
+    """Continue as a child whose parent ends at once: the environment adopts orphans."""
     between = os.getpid()
     child = os.fork()
     if child:
         orders.send(b"%d" % child)
         os._exit(0)
-    while os.getppid() == between:  # or a node that asks to die with its parent would die with this one
+    while os.getppid() == between:  # a node may ask to end with its parent
         time.sleep(_PAUSE_S)
 
 

@@ -1,4 +1,4 @@
-"""The manager's side of the fork server: starts it, starts it again when it died, and gives it orders."""
+"""The manager's side of the fork server: starts it, restarts it after its end, and gives it orders."""
 
 from __future__ import annotations
 
@@ -47,15 +47,15 @@ class ForkServer:
 
     @property
     def pid(self) -> int:
-        """The process that orders go to now; 0 while there is none."""
+        """The current process of the fork server; 0 while none runs."""
         return self._process.pid if self._process is not None else 0
 
     async def spawn(self, request: SpawnRequest, descriptors: Descriptors) -> int:
         """Make an environment; returns its pid.
 
         Args:
-            request: What it is like.
-            descriptors: What it gets; :attr:`Descriptors.answer` is put in here.
+            request: The environment.
+            descriptors: Its descriptors; :attr:`Descriptors.answer` is filled in here.
 
         Raises:
             StartError: It cannot be made.
@@ -78,7 +78,7 @@ class ForkServer:
         )
 
     def start(self) -> None:
-        """Start the process if it is not there, to be ready for the first order. Does not wait for it.
+        """Start the process if it does not run, to be ready for the first order. Does not wait for it.
 
         Raises:
             StartError: It cannot be started.
@@ -135,7 +135,7 @@ class ForkServer:
 
 
 async def hear_credentials(sock: socket.socket, size: int) -> tuple[bytes, int]:
-    """Wait for data on a socket with ``SO_PASSCRED``; returns it and its sender's pid, as seen from here.
+    """Wait for data on a socket with ``SO_PASSCRED``; return it and its sender's pid, as seen from here.
 
     At the end of the stream both are empty.
     """

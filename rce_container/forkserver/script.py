@@ -1,4 +1,4 @@
-"""Running a Python script in a forked process, as ``python SCRIPT`` runs it in a new one."""
+"""Runs a Python script in a forked process, as ``python SCRIPT`` runs it in a new one."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _CANNOT_OPEN = 2
 
 
 def open_streams(*, unbuffered: bool) -> None:
-    """Make the standard streams anew, on the descriptors 0, 1 and 2."""
+    """Recreate the standard streams, on the descriptors 0, 1 and 2."""
 
     def text(fd: int, **how: Any) -> io.TextIOWrapper:
         raw = io.FileIO(fd, "w", closefd=False)
@@ -37,7 +37,7 @@ def open_streams(*, unbuffered: bool) -> None:
 
 
 def run_script(path: str, arguments: Sequence[str]) -> None:
-    """Be a Python that was started with a script. Returns when the script ends, for the process to end.
+    """Run a script as Python's main program. Return when the script ends, for the process to end.
 
     Raises:
         SystemExit: The script says how to end, or fails.
@@ -74,7 +74,7 @@ def run_script(path: str, arguments: Sequence[str]) -> None:
 
 
 def _die_interrupted() -> None:
-    """End by SIGINT after all that an ending Python does, so that the parent sees why."""
+    """End by SIGINT after Python's normal shutdown, so that the parent sees the reason."""
     threading._shutdown()  # type: ignore[attr-defined]  # noqa: SLF001 - what the interpreter calls itself
     atexit._run_exitfuncs()  # noqa: SLF001
     for stream in (sys.stdout, sys.stderr):

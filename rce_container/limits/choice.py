@@ -18,10 +18,10 @@ _ESSENTIAL = frozenset({"cpu", "memory", "processes"})
 
 
 def choose_limiter(token: str, ledger: Path, proc: Path = PROC) -> Limiter:
-    """Find the best way that works: cgroups of the version that can do more, else limits of each process.
+    """Find the best way that works: cgroups of the more capable version, else limits of each process.
 
     Args:
-        token: Names the task set on this machine, indefinitely.
+        token: A permanent name of the task set on this machine.
         ledger: A file of the task set, for where its cgroups are.
         proc: This process in ``/proc``.
     """

@@ -1,4 +1,4 @@
-"""Keeps the limits of one incarnation of one container, and tells of deaths in its control group."""
+"""Enforces the limits of one incarnation of a container, and reports killed processes."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from rce_container.exceptions import LimitError
 from rce_container.limits.base import ControlGroup, SlotSettings, in_megabytes, limits_of
 
 _REACHED = 0.9
-"""A container whose memory never came near its limit did not die of that limit."""
+"""Memory that never reached this share of its limit means: the limit did not cause the kill."""
 
 
 class LimitEnforcer:
     """Enforces the limits of one control group.
 
-    The kernel counts the processes that it kills for want of memory before it kills them, and says no more.
-    So whoever finds a process killed asks :meth:`claim`, and kills that nobody claims come out of
-    :meth:`review` a while later: processes that nodes had started.
+    The kernel only counts the processes that it kills for lack of memory, before it kills them. The caller
+    that finds a killed process asks :meth:`claim`. :meth:`review` reports unclaimed kills later: processes
+    that nodes had started.
 
     Args:
         tag: The container's tag, for texts.
@@ -38,11 +38,11 @@ class LimitEnforcer:
         self._applying = asyncio.Lock()
 
     async def apply(self, resources: Resources) -> str:
-        """Put the limits in force that follow from what the container asks for.
+        """Apply the limits that follow from the container's request.
 
         Returns:
-            Why that cannot be, in words for the user; the old limits stay then. Empty if all is well, or if
-            the same was said before.
+            Why they cannot be applied, as text for the user; the old limits stay then. Empty on success, or
+            if the same was reported before.
         """
         async with self._applying:
             self._size = max(1, resources.size)
@@ -56,7 +56,7 @@ class LimitEnforcer:
             return text
 
     def claim(self) -> str:
-        """Say why the kernel killed a process, if the reason is memory; each kill is claimed once."""
+        """Return why the kernel killed a process, if the reason is memory; each kill is claimed once."""
         if self.control_group.troubles().oom_kills <= self._claimed:
             return ""
         self._claimed += 1
@@ -64,13 +64,13 @@ class LimitEnforcer:
         return self._out_of_memory()
 
     def claim_all(self) -> str:
-        """Say why the whole container died, if a reason is memory."""
+        """Return why the whole container ended, if a reason is memory."""
         text = self.claim()
         self._claimed = max(self._claimed, self.control_group.troubles().oom_kills)
         return text
 
     def review(self) -> list[str]:
-        """Look for troubles since the last time.
+        """Look for problems since the last call.
 
         Returns:
             Texts for the user.
@@ -90,10 +90,10 @@ class LimitEnforcer:
         return texts
 
     async def end(self) -> None:
-        """Kill all that is in the control group.
+        """Kill all processes of the control group.
 
         Raises:
-            KillError: Something does not die.
+            KillError: A process does not end.
         """
         await asyncio.to_thread(self.control_group.kill)
 
@@ -101,7 +101,7 @@ class LimitEnforcer:
         """Remove the control group.
 
         Raises:
-            LimitError: Something is left in it.
+            LimitError: It is not empty.
         """
         await asyncio.to_thread(self.control_group.remove)
 

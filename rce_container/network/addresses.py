@@ -1,4 +1,4 @@
-"""Which address a container gets in its group. Pure."""
+"""Chooses the address of a container in its group. Pure."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from ipaddress import AddressValueError, IPv4Interface, IPv4Network, NetmaskValu
 from rce_container.exceptions import NetworkError
 
 DEFAULT_NETWORK = IPv4Network("10.77.0.0/24")
-"""Of groups whose containers name no addresses. Every group may have the same: they never meet."""
+"""The network of groups whose containers name no addresses. All groups may use it: they are separate."""
 _DEFAULT_PREFIX = 24
 _LONGEST_PREFIX = 30
 _SHORTEST_PREFIX = 8
@@ -18,7 +18,7 @@ def parse_address(text: str) -> IPv4Interface:
     """Read a ``groupIp``: an IPv4 address, with ``/24`` understood if it names no prefix.
 
     Raises:
-        NetworkError: It is none that a container can have.
+        NetworkError: It is not an address that a container can have.
     """
     whole = text if "/" in text else f"{text}/{_DEFAULT_PREFIX}"
     try:
@@ -42,7 +42,7 @@ def choose(requested: str, taken: Mapping[IPv4Interface, str]) -> IPv4Interface:
 
     Args:
         requested: Its ``groupIp``; if empty, a free one is found.
-        taken: The group's addresses, and which container has each.
+        taken: The group's addresses, and the container of each.
 
     Raises:
         NetworkError: The request cannot be granted; the text says what to do.

@@ -33,7 +33,10 @@ class Membership(NamedTuple):
 
     address: IPv4Interface
     switch: int
-    """Descriptor of the switch's namespace. What lives as long as the container must open it too."""
+    """Descriptor of the switch's namespace.
+
+    A process that lives as long as the container must open it too.
+    """
 
     @property
     def path(self) -> str:
@@ -52,7 +55,7 @@ class _Member:
 
 @dataclass(slots=True)
 class _Group:
-    """The containers of one group, by id; never empty. The one who changes the switch has the lock."""
+    """The containers of one group, by id; never empty. Changing the switch requires the lock."""
 
     switch: int
     has_bridge: bool
@@ -63,20 +66,20 @@ class _Group:
 class Networks:
     """All groups of one container task set. Containers of two task sets, or two users, never meet.
 
-    A container is *enrolled* before it is started, *attached* when its namespaces are there and *detached*
-    when its processes have ended.
+    A container is *enrolled* before it is started, *attached* when its namespaces exist and *detached* when
+    its processes have ended.
     """
 
     def __init__(self) -> None:
         self._groups: dict[tuple[str, str], _Group] = {}
         self._of: dict[str, tuple[str, str]] = {}
-        """The group that a container is in, by id."""
+        """The group of each container, by id."""
 
     def probe(self) -> None:
         """Find out whether groups work on this machine. Blocks.
 
         Raises:
-            NetworkError: They do not; the text says why.
+            NetworkError: They do not work; the text says why.
         """
         with contextlib.ExitStack() as stack:
             switch, inside = make_namespace(), make_namespace()
@@ -87,17 +90,17 @@ class Networks:
     def enroll(
         self, container: EndpointId, group: str, group_ip: str, incarnation_id: str, hosts: Path
     ) -> Membership:
-        """Give a container that is to be started its place.
+        """Give a container that is to be started its place in its group.
 
         Args:
             container: Who it is.
             group: Its group.
-            group_ip: The address that it is to have there; empty for any.
-            incarnation_id: Names this incarnation of it.
+            group_ip: Its requested address there; empty for any.
+            incarnation_id: The id of its incarnation.
             hosts: Its ``/etc/hosts``, which is kept up to date from now on.
 
         Raises:
-            NetworkError: There is no such place.
+            NetworkError: The place cannot be given.
         """
         key = container.user, group
         if not group:
@@ -116,7 +119,7 @@ class Networks:
 
         Args:
             container: Who it is.
-            record: What that manager noted of it.
+            record: That manager's record of it.
             hosts: Its ``/etc/hosts``.
 
         Raises:
@@ -131,14 +134,14 @@ class Networks:
         self._of[record.incarnation_id] = key
 
     async def attach(self, incarnation_id: str, pid: int) -> None:
-        """Plug a container in that is enrolled, and tell all members' ``/etc/hosts`` of it.
+        """Connect an enrolled container to its switch, and add it to all members' ``/etc/hosts``.
 
         Args:
             incarnation_id: The incarnation of the container.
             pid: A process in its network namespace.
 
         Raises:
-            NetworkError: It cannot be done.
+            NetworkError: The container cannot be connected.
         """
         key = self._of.get(incarnation_id)
         if key is None:
@@ -158,7 +161,7 @@ class Networks:
             await asyncio.to_thread(_write_hosts, list(group.members.values()))
 
     async def detach(self, incarnation_id: str) -> None:
-        """Take a container whose processes have ended out of its group, if it is in one."""
+        """Remove a container whose processes have ended from its group, if it has one."""
         key = self._of.pop(incarnation_id, None)
         if key is None:
             return
@@ -178,7 +181,7 @@ class Networks:
             os.close(group.switch)
 
     def close(self) -> None:
-        """Let go of all switches; those of containers that live on stay."""
+        """Close all switches; those of running containers stay."""
         for group in self._groups.values():
             os.close(group.switch)
         self._groups.clear()
@@ -186,12 +189,12 @@ class Networks:
 
 
 def _port(incarnation_id: str) -> str:
-    """The interface in the switch that a container is plugged into; at most 15 characters."""
+    """Return the switch's interface for a container; at most 15 characters."""
     return f"v{incarnation_id}"
 
 
 def _plug_in(switch: int, inside: int, port: str, address: IPv4Interface, *, bridge: bool) -> None:
-    """Make the cable between a container and its switch, and with ``bridge`` the switch first."""
+    """Make the veth pair between a container and its switch; with ``bridge``, make the switch first."""
     if bridge:
         configure(switch, [f"link add name {_BRIDGE} type bridge mcast_snooping 0", f"link set {_BRIDGE} up"])
     cable = f"link add name {INTERFACE} type veth peer name {port} netns /proc/self/fd/{switch}"
@@ -210,7 +213,7 @@ def _plug_in(switch: int, inside: int, port: str, address: IPv4Interface, *, bri
 
 
 def _held_by(pid: int) -> int:
-    """A copy of the switch's descriptor that a process holds."""
+    """Return a copy of the switch's descriptor that a process holds."""
     folder = Path(f"/proc/{pid}/fd")
     try:
         for entry in folder.iterdir():
@@ -222,7 +225,7 @@ def _held_by(pid: int) -> int:
 
 
 def _write_hosts(members: Iterable[_Member]) -> None:
-    """Write the members' files anew, in place: containers may see the file itself, not its folder."""
+    """Rewrite the members' files in place: containers may see the file itself, not its folder."""
     rows = [(member.tag, str(member.address.ip)) for member in members]
     for member in members:
         text = hosts_text(member.tag, rows)

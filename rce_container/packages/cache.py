@@ -1,6 +1,6 @@
-"""Packages on this machine, each once: ``FOLDER/SHA256/NAME``, shared by all containers that need them.
+"""One copy of each package on this machine, ``FOLDER/SHA256/NAME``, shared by the containers that need it.
 
-A package is fetched, verified and unpacked in a scratch folder, and appears whole by one rename.
+A package is fetched, verified and unpacked in a scratch folder, and appears complete by one rename.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from rce_container.packages.exceptions import FetchError, NoSpaceError, PackageT
 from rce_container.packages.locks import Locks
 
 Fetch = Callable[[str, int], Awaitable[Piece]]
-"""Fetches the piece of a content, by its hash, that begins at an offset; raises :class:`ContentError`."""
+"""Fetches a piece of a content by its hash and an offset; raises :class:`ContentError`."""
 
 _HASH = re.compile(r"[0-9a-f]{64}")
 _SCRATCH = "incoming"
@@ -44,7 +44,7 @@ class PackageCache:
     Args:
         folder: Belongs to this cache.
         fetch: Fetches from the master.
-        space: Bytes; beyond it, those that no container holds and that were used longest ago are removed.
+        space: Bytes; beyond it, the least recently used packages that no container holds are removed.
         limits: How large each may be.
     """
 
@@ -56,13 +56,13 @@ class PackageCache:
         self._space = space
         self._limits = limits
         self._sizes: dict[str, int] = {}
-        """Bytes of those that are there, the one that was used longest ago first."""
+        """Bytes of each kept package, the least recently used first."""
         self._holders: defaultdict[str, set[str]] = defaultdict(set)
         self._locks = Locks()
         self._turns = Turns(_AT_ONCE, waiting=_MAX_WAITING, each=_OF_ONE_USER)
 
     def open(self) -> None:
-        """Look at what is there, and remove what was begun and not finished. Blocks.
+        """Find the kept packages, and remove unfinished ones. Blocks.
 
         Raises:
             OSError: The folder cannot be used.
@@ -83,24 +83,25 @@ class PackageCache:
             self._holders[sha256].add(holder)
 
     async def ensure(self, user: str, package: PackageSpec) -> Path:
-        """Have a package here. Several callers at once cause one fetch.
+        """Provide a package. Concurrent callers cause one fetch.
 
         Args:
-            user: Who brought it.
-            package: What it is to be.
+            user: The user who brought it.
+            package: The package.
 
         Returns:
             The folder that holds the package's folder.
 
         Raises:
-            PackageTroubleError: It cannot be had now.
-            OSError: Somebody else changed the folder.
+            PackageTroubleError: It is not available now.
+            OSError: Another program changed the folder.
         """
         _check_signature(user, package)
         path = self._folder / package.sha256
         async with contextlib.AsyncExitStack() as stack:
             if not self._has(package, path):
-                # The turn first: two users may want the same, and neither waits for the other's turn.
+                # Take the user's turn first: two users may want the same package, and neither waits for the
+                # other's turn.
                 await stack.enter_async_context(self._turn(user))
             await stack.enter_async_context(self._locks.of(package.sha256))
             if not self._has(package, path):
@@ -167,7 +168,7 @@ class PackageCache:
         return found.size
 
     async def _make_room(self) -> None:
-        """Remove what was used longest ago and nobody holds, until the rest fits."""
+        """Remove the least recently used packages that no container holds, until the rest fits."""
         for sha256 in list(self._sizes):
             if sum(self._sizes.values()) <= self._space:
                 return
@@ -177,7 +178,7 @@ class PackageCache:
 
 
 def trouble_of(error: OSError) -> PackageTroubleError:
-    """Say in words for the owner what a disk's error means."""
+    """Return a text for the owner about a disk error."""
     if error.errno in _FULL:
         return NoSpaceError("the disk of the container's machine is full; tell its operator")
     return NoSpaceError(

@@ -1,4 +1,4 @@
-"""Folders that only ever appear whole. What is not asynchronous blocks."""
+"""Folders that appear atomically. Functions that are not asynchronous block."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _READ_ONLY_FOLDER = 0o755
 
 @contextlib.contextmanager
 def scratch(parent: Path) -> Iterator[Path]:
-    """Give a folder of one's own, and remove what is left of it."""
+    """Make a private folder, and remove it in the end."""
     folder = _make_scratch(parent)
     try:
         yield folder
@@ -36,9 +36,9 @@ def _make_scratch(parent: Path) -> Path:
 
 
 async def in_thread(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
-    """Run something that blocks; who is cancelled meanwhile waits for its end all the same.
+    """Run a blocking function; a cancelled caller still waits for its end.
 
-    So nobody removes a folder into which a thread still writes.
+    So no caller removes a folder into which a thread still writes.
     """
     work = asyncio.ensure_future(asyncio.to_thread(function, *args, **kwargs))
     try:
@@ -50,7 +50,7 @@ async def in_thread(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs)
 
 @contextlib.asynccontextmanager
 async def scratch_aside(parent: Path) -> AsyncIterator[Path]:
-    """Do what :func:`scratch` does, in a thread."""
+    """Do the same as :func:`scratch`, in a thread."""
     folder = await in_thread(_make_scratch, parent)
     try:
         yield folder
@@ -61,7 +61,7 @@ async def scratch_aside(parent: Path) -> AsyncIterator[Path]:
 def forget_before_boot(folder: Path) -> None:
     """Empty a folder that was filled before the machine was started.
 
-    What is in it was never forced to the disk one by one, so it may not be whole after a power cut.
+    Its files were not synced to the disk, so it may be incomplete after a power failure.
     """
     note = folder / "boot"
     try:
@@ -78,15 +78,15 @@ def forget_before_boot(folder: Path) -> None:
 
 
 def replicate(source: Path, target: Path, *, link: bool) -> None:
-    """Make a tree once more, out of hard links where that works, else of copies.
+    """Copy a tree, with hard links where possible.
 
     Args:
         source: A tree of folders, files and links.
         target: Is made.
-        link: Whether hard links may be used: whoever gets the tree cannot write to its files.
+        link: Whether hard links may be used, because the receiver cannot write to the files.
 
     Raises:
-        OSError: It cannot be made.
+        OSError: The tree cannot be made.
     """
     target.mkdir()
     target.chmod(_READ_ONLY_FOLDER)

@@ -1,4 +1,4 @@
-"""What keeps a package from coming into a container.
+"""The errors that keep a package out of a container.
 
 PackageTroubleError              told to the owner as it is; it is tried again
 ├── FetchError                   the master is away, or does not have it
@@ -13,7 +13,7 @@ from typing import ClassVar
 
 
 class PackageTroubleError(Exception):
-    """A package cannot come into a container now; the text says why and what to do.
+    """A package cannot be given to a container now; the text says why and what to do.
 
     Attributes:
         delay_factor: How much longer than usual to wait before the next attempt.
@@ -37,4 +37,4 @@ class NoSpaceError(PackageTroubleError):
 class RequirementsTroubleError(PackageTroubleError):
     """What it needs of Python cannot be installed."""
 
-    delay_factor = 10.0  # each attempt costs the machine, and whoever serves the distributions, a lot
+    delay_factor = 10.0  # each attempt is expensive for the machine and for the package index

@@ -1,4 +1,4 @@
-"""Locks by key, which are there only while somebody holds or wants them."""
+"""Locks by key, which exist only while a task holds or waits for them."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class Locks:
     def __init__(self) -> None:
         self._locks: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
         self._busy: Counter[str] = Counter()
-        """How many hold or wait for each of the locks."""
+        """How many tasks hold or wait for each lock."""
 
     def __contains__(self, key: str) -> bool:
-        """Return whether somebody holds or wants a lock."""
+        """Return whether a task holds or waits for a lock."""
         return key in self._busy
 
     @contextlib.asynccontextmanager

@@ -1,8 +1,8 @@
 """Installs what packages ask for in their ``requirements.txt``; only where the machine's operator allows it.
 
-pip runs in a sandbox of bubblewrap, as nobody, with the network and nothing of the machine but its programs;
-and it installs wheels only, so that no code of what it installs runs. What came of it is kept under the hash
-of what was asked for, and of the Python that it is for.
+pip runs in a sandbox of bubblewrap, as user ``nobody``, with the network and, of the machine, only its
+programs. It installs wheels only, so that no code of the installed packages runs. The result is kept under
+the hash of the requirements and of the Python that they are for.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SITE = "site"
 NOBODY = 65534
 
 INSTALLS_AT_ONCE = 8
-"""Of different users; each runs a pip, which waits for the network most of the time."""
+"""Concurrent installations, of different users; each runs pip, which mostly waits for the network."""
 MAX_WAITING = 1024
 _SCRATCH = "incoming"
 _SYSTEM_PATH = "/usr/local/bin:/usr/bin:/bin"
@@ -51,13 +51,13 @@ class InstallerSettings:
     """How requirements are installed."""
 
     pip_args: tuple[str, ...] = ()
-    """More arguments for ``pip install``, such as another index; files that they name are seen inside."""
+    """More arguments for ``pip install``, such as another index; the sandbox shows files that they name."""
     timeout: float = 600.0
     """Seconds."""
     size: int = 1 << 30
     """Bytes that one package's requirements may take."""
     space: int = 4 << 30
-    """Bytes of all; beyond it, those that were used longest ago are removed."""
+    """Bytes in total; beyond it, the least recently used are removed."""
 
 
 class Installer:
@@ -65,7 +65,7 @@ class Installer:
 
     Args:
         folder: Belongs to this installer.
-        settings: How it is done.
+        settings: How requirements are installed.
         environ: Where pip's own settings and the proxies are read from.
     """
 
@@ -80,10 +80,10 @@ class Installer:
         self._tidying = asyncio.Lock()
 
     def open(self) -> None:
-        """Look whether it works here, and remove what was begun and not finished. Blocks.
+        """Find out whether it works here, and remove unfinished installations. Blocks.
 
         Raises:
-            RuntimeUnavailableError: A program is missing that it needs.
+            RuntimeUnavailableError: A program that it needs is missing.
             OSError: The folder cannot be used.
         """
         for program in ("bwrap", *(("setpriv",) if os.geteuid() == 0 else ())):
@@ -93,7 +93,7 @@ class Installer:
         remove(self._folder / _SCRATCH)
 
     async def install(self, user: str, package: Path) -> Path:
-        """Have a package's requirements here. A user's are installed one after the other, beside others'.
+        """Provide a package's requirements. Those of one user are installed one after the other.
 
         Args:
             user: Whose package it is.
@@ -104,7 +104,7 @@ class Installer:
 
         Raises:
             RequirementsTroubleError: They cannot be installed.
-            OSError: They cannot be kept.
+            OSError: They cannot be written.
         """
         wanted = read_requirements((package / FILE_NAME).read_text("utf-8", "replace"))
         if wanted.faults:
@@ -126,7 +126,7 @@ class Installer:
         return path
 
     async def _have(self, path: Path, text: str, python: str) -> None:
-        """Build what is not there; two who want the same at once wait for one build of it."""
+        """Build missing requirements; concurrent callers wait for one build."""
         async with self._locks.of(path.name):
             if not await in_thread(path.is_dir):
                 await self._build(path, text, python)
@@ -169,7 +169,7 @@ class Installer:
                 return await self._watch(process, build)
         finally:
             if process.returncode is None:
-                process.kill()  # all of the sandbox ends with it
+                process.kill()  # all processes of the sandbox end with it
                 await process.wait()
 
     async def _watch(self, process: asyncio.subprocess.Process, build: Path) -> int:
@@ -251,7 +251,7 @@ def _python_of(package: Path) -> str:
 
 
 async def _tag_of(python: str) -> str:
-    """What a Python can run: its implementation, version and platform."""
+    """Return the compatibility of a Python: its implementation, version and platform."""
     code = "import sys, sysconfig; print(sys.implementation.cache_tag, sysconfig.get_platform())"
     process = await asyncio.create_subprocess_exec(
         python, "-I", "-c", code, stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE
@@ -266,7 +266,7 @@ async def _tag_of(python: str) -> str:
 
 
 def _seal(site: Path) -> None:
-    """Make everything readable by everybody, writable by nobody, and of the engine's own user."""
+    """Make all files world-readable, read-only, and owned by the engine's user."""
     own = os.geteuid(), os.getegid()
     for parent, _, files in os.walk(site):
         for path in (Path(parent), *(Path(parent, name) for name in files)):

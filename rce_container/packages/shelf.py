@@ -1,4 +1,4 @@
-"""A container's folder of packages: seen from inside, read-only, from its start; filled while it runs."""
+"""A container's folder of packages: visible inside, read-only, from its start; filled while it runs."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from rce_container.files import remove
 from rce_container.packages.disk import replicate, scratch
 
 KEPT = 8
-"""How many packages that no node names any more stay: a node that still runs may read from them."""
+"""How many packages stay that no node names any more: a running node may still read from them."""
 _STAGING = "bundles.new"
 
 
 class Shelf:
-    """One container's packages. What is in it is whole: it appears by one rename.
+    """One container's packages. Each appears complete, by one rename.
 
     Args:
-        folder: The folder that the container sees; there while the container is.
-        link: Whether the container cannot write to it, so that its files may be those of the cache.
+        folder: The folder that the container sees; exists as long as the container.
+        link: Whether its files may be hard links to the cache, because the container cannot write to it.
     """
 
     def __init__(self, folder: Path, *, link: bool) -> None:
@@ -28,23 +28,23 @@ class Shelf:
 
     @property
     def is_there(self) -> bool:
-        """Whether the container still is."""
+        """Whether the container still exists."""
         return self._folder.is_dir()
 
     def has(self, sha256: str) -> bool:
-        """Tell whether a package is there."""
+        """Return whether it contains a package."""
         return (self._folder / sha256).is_dir()
 
     def place(self, sha256: str, tree: Path, requirements: Path | None) -> None:
-        """Put a package in. Blocks.
+        """Add a package. Blocks.
 
         Args:
-            sha256: Names it.
-            tree: What it holds.
-            requirements: What its ``requirements.txt`` asked for, installed; None for nothing.
+            sha256: Its hash.
+            tree: Its contents.
+            requirements: Its installed requirements; None without requirements.
 
         Raises:
-            OSError: It cannot be put in; the container may just have ended.
+            OSError: It cannot be added; the container may just have ended.
         """
         if self.has(sha256):
             return
@@ -58,7 +58,7 @@ class Shelf:
             made.rename(self._folder / sha256)
 
     def tidy(self, wanted: Collection[str]) -> None:
-        """Take out what nobody names any more, beyond the newest few. Blocks."""
+        """Remove packages that no node names any more, except the newest few. Blocks."""
         left = [path for path in self._folder.iterdir() if path.name not in wanted]
         left.sort(key=lambda path: path.stat().st_mtime)
         for path in left[:-KEPT]:

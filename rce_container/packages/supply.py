@@ -1,4 +1,4 @@
-"""Gets into one container what its nodes need, and tells its owner what keeps it from coming."""
+"""Supplies one container with the packages of its nodes, and reports problems to its owner."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from rce_container.packages.shelf import Shelf
 _log = logging.getLogger(__name__)
 
 RETRY = Backoff(first=0.5, longest=30.0)
-"""Pauses before it is tried again."""
+"""Delays before another attempt."""
 
 _NOT_INSTALLED = (
     "it has a requirements.txt, which this machine does not install (its operator may allow it:"
@@ -31,15 +31,15 @@ _NOT_INSTALLED = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Library:
-    """Where all containers of a machine get packages from."""
+    """The source of packages for all containers of a machine."""
 
     cache: PackageCache
     installer: Installer | None = None
-    """Installs what packages ask for in their ``requirements.txt``; None: that is not allowed here."""
+    """Installs what packages ask for in their ``requirements.txt``; None: not allowed here."""
     retry: Backoff = RETRY
 
     def open(self) -> None:
-        """Look at what is there. Blocks.
+        """Find the kept packages. Blocks.
 
         Raises:
             OSError: The folders cannot be used.
@@ -50,15 +50,15 @@ class Library:
 
 
 class Supply:
-    """The packages of one incarnation of a container. Several come at once; one that fails holds up no other.
+    """The packages of one incarnation of a container. Several are fetched at once; a failure delays no other.
 
     Args:
-        holder: Names this incarnation.
-        user: Whose container it is.
-        library: Where packages come from.
-        shelf: Where they go.
+        holder: The id of this incarnation.
+        user: The container's user.
+        library: The source of packages.
+        shelf: The container's folder of packages.
         tell: Takes a text for the owner.
-        on_arrival: Called when something was put on the shelf.
+        on_arrival: Called when a package was added to the shelf.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Supply:
         self._closed = False
 
     def want(self, packages: Iterable[PackageSpec]) -> None:
-        """Get these, and no others."""
+        """Supply exactly these packages."""
         wanted = set(packages)
         if self._closed or wanted == self._coming.keys():
             return
@@ -94,13 +94,13 @@ class Supply:
             self._coming[package] = self._tasks.spawn(self._get(package), name=name)
 
     async def close(self) -> None:
-        """Stop, and need nothing any more."""
+        """Stop, and release all packages."""
         self._closed = True
         await self._tasks.close()
         self._library.cache.hold(self._holder, set())
 
     async def _get(self, package: PackageSpec) -> None:
-        """Get one package, however often it takes."""
+        """Get one package; retry until it succeeds."""
         told = ""
         pauses = self._library.retry.start()
         while True:

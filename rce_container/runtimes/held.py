@@ -1,4 +1,4 @@
-"""Containers whose namespaces a holder keeps, and whose environment is a child of the fork server."""
+"""Containers with a holder for their namespaces and an environment forked by the fork server."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from rce_container.runtimes.base import Handle, Order, Prepare
 from rce_container.runtimes.shim import SHELL, spawn_shim
 
 HOLDER = (SHELL, "-c", f'echo && read -r word && [ "$word" = {FAREWELL.decode().strip()} ]')
-"""Says that the namespaces and mounts are there, then waits for the environment's farewell."""
+"""Reports that the namespaces and mounts exist, then waits for the environment's last message."""
 
 _GENERATIONS = 4
-"""How far the holder is from the shim, at most: podman takes three processes between them."""
+"""Maximum number of generations between the shim and the holder: podman starts three processes in between."""
 
 
 class HeldHandle(Handle):
@@ -37,11 +37,11 @@ class HeldHandle(Handle):
     ) -> None:
         super().__init__(process, "", popen)
         self.complaint = "its namespaces cannot be made"
-        """What is said when there is no holder."""
+        """The error text without a holder."""
         self._request = request
         self._fork_server = fork_server
         self._fds: dict[str, int] = {}
-        """What the environment will get; ours until then."""
+        """The environment's descriptors; owned by this object until they are sent."""
 
     @classmethod
     def start(
@@ -80,7 +80,7 @@ class HeldHandle(Handle):
         return handle
 
     async def launch(self, prepare: Prepare | None = None) -> None:
-        """Wait for the namespaces, ready them, and let the fork server make the environment."""
+        """Wait for the namespaces, prepare them, and let the fork server make the environment."""
         try:
             self.namespaces_pid = await self._holder()
             holder = self._fds["holder"] = self._open_holder(self.namespaces_pid)
@@ -93,7 +93,7 @@ class HeldHandle(Handle):
             self._close()
 
     def abandon(self) -> None:
-        """Leave the container to itself; one without an environment ends then."""
+        """Leave the container running; without an environment it ends."""
         self._close()
         super().abandon()
 
@@ -105,7 +105,7 @@ class HeldHandle(Handle):
         return pid
 
     def _open_holder(self, pid: int) -> int:
-        """Open the process, and make sure that it is the holder and not one that took over its pid."""
+        """Open the process, and verify that it is the holder and not a process that reused its pid."""
         try:
             holder = os.pidfd_open(pid)
         except OSError as error:

@@ -1,10 +1,10 @@
-"""The runtime of Linux namespaces: bubblewrap makes them, the fork server's children live in them.
+"""The runtime of Linux namespaces: bubblewrap makes them, the fork server's children run in them.
 
 A container has its own user, pid, mount, network, ipc, uts and cgroup namespaces. Its root is read-only and
 holds the system's programs, the engine's Python and the packages; its home and /tmp live in memory and are
-limited. Process 1 is the *holder*, a shell that waits for the environment's farewell: when the environment
-dies, however that happens, the holder ends, and the kernel kills every other process of the container. Shim,
-bubblewrap and holder are tied to each other, so that none outlives the one outside of it.
+limited. Process 1 is the *holder*, a shell that waits for the environment's last message: when the
+environment ends for any reason, the holder ends, and the kernel kills every other process of the container.
+Shim, bubblewrap and holder are linked to each other, so that none outlives the one outside of it.
 """
 
 from __future__ import annotations
@@ -64,11 +64,11 @@ _READ_BY_OTHERS = stat.S_IROTH | stat.S_IXOTH
 class NamespaceRuntime(Runtime):
     """Isolation by namespaces, as root and as any user who may make user namespaces.
 
-    As root each container runs as a user of the machine of its own; else all run as the engine's user.
+    As root each container runs as a separate user of the machine; else all run as the engine's user.
 
     Args:
         home_bytes: Size of a container's home.
-        uids: The users for containers, if this is root; None takes the default ones.
+        uids: The users for containers, as root; None takes the default ones.
     """
 
     name = "namespace"
@@ -92,7 +92,7 @@ class NamespaceRuntime(Runtime):
         self.detail = "; ".join(filter(None, (missing, self._claimed())))
         self._fork_server = ForkServer(program, clean_environ(HOME))
         failures: list[Exception] = []
-        trying = threading.Thread(target=self._try, args=(failures,))  # there may be a loop in this one
+        trying = threading.Thread(target=self._try, args=(failures,))  # this thread may run an event loop
         trying.start()
         trying.join()
         if failures:
@@ -103,7 +103,7 @@ class NamespaceRuntime(Runtime):
         """Look for the programs that are needed. Blocks.
 
         Raises:
-            RuntimeUnavailableError: One is missing.
+            RuntimeUnavailableError: A program is missing.
         """
         if not self._bwrap:
             raise RuntimeUnavailableError(
@@ -119,25 +119,25 @@ class NamespaceRuntime(Runtime):
         return not record.environment
 
     def review(self, packages: Iterable[Path]) -> str:
-        """As root, containers are users to whom a private folder is closed."""
+        """As root, containers run as users who cannot read a private folder."""
         closed = [str(path) for path in packages if self._root and _is_closed(path)]
         if not closed:
             return ""
         return f"containers cannot read {', '.join(closed)}: make it readable by all users (chmod -R o+rX)"
 
     def _claimed(self) -> str:
-        """Say whose the containers' users are; empty if nobody's."""
+        """Return a text about the owners of the containers' users; empty if they have none."""
         owners = self._uids.owners() if self._root else []
         if not owners:
             return ""
         return f"users for containers belong to {', '.join(owners)} too: choose others by --first-uid"
 
     def close(self) -> None:
-        """End the fork server; the containers live on."""
+        """End the fork server; the containers keep running."""
         self._fork_server.close()
 
     def start(self, order: Order) -> HeldHandle:
-        """Make the container's namespaces; the environment comes to life by the handle's ``launch``."""
+        """Make the container's namespaces; the handle's ``launch`` starts the environment."""
         return self._start(order)
 
     def _start(self, order: Order, check: tuple[str, ...] = ()) -> HeldHandle:
@@ -172,7 +172,7 @@ class NamespaceRuntime(Runtime):
             failures.append(error)
 
     async def _try_once(self) -> None:
-        """Make a container in which Python looks whether it finds the engine.
+        """Make a container in which Python checks whether it can import the engine.
 
         Raises:
             ContainerError: It did not work; the text says why.
@@ -220,7 +220,7 @@ class NamespaceRuntime(Runtime):
 
 
 def _make_filter() -> tuple[bytes, str]:
-    """Make the filter of system calls; returns it, or what to say if there is none."""
+    """Make the filter of system calls; return it, or a text about why it cannot be made."""
     try:
         return make_filter(), ""
     except FilterUnavailableError as error:
@@ -228,26 +228,26 @@ def _make_filter() -> tuple[bytes, str]:
 
 
 def interpreter_paths() -> list[Path]:
-    """All that the engine's Python needs to be seen inside, as paths of the machine."""
+    """Return the machine's paths that the engine's Python needs inside."""
     wanted = [Path(sys.prefix), Path(sys.base_prefix), Path(sys.base_exec_prefix)]
     wanted.append(Path(sys.executable).resolve().parents[1])
     return [*wanted, *(path.resolve() for path in wanted), *_python_packages()]
 
 
 def _compile() -> None:
-    """Have the modules compiled here: inside nothing can be written, and every container would do it anew."""
+    """Compile the modules here: inside they are read-only, and every container would compile them again."""
     for folder in _python_packages():
         compileall.compile_dir(folder, quiet=2)
 
 
 def _python_packages() -> list[Path]:
-    """The engine's and those that hold nodes; in a checkout they are outside of the interpreter's folders."""
+    """Return the engine's packages and those with nodes; a checkout is outside the interpreter's folders."""
     root = source_root()
     return [root / "rce", root / "rce_container", *distributed_folders()]
 
 
 def _mounts(order: Order) -> list[str]:
-    """The container's files; the rest is mounted from inside (:mod:`rce_container.forkserver.mounts`)."""
+    """Return the mounts of the container's files; :mod:`rce_container.forkserver.mounts` mounts the rest."""
     folder = order.folder
     return [
         *system_mounts(),
@@ -265,7 +265,7 @@ def _mounts(order: Order) -> list[str]:
 
 
 def system_mounts() -> list[str]:
-    """The machine's programs and libraries."""
+    """Return the mounts of the machine's programs and libraries."""
     options = ["--ro-bind", "/usr", "/usr"]
     for path in map(Path, _SYSTEM):
         if path.is_symlink():
@@ -276,7 +276,7 @@ def system_mounts() -> list[str]:
 
 
 def read_only_mounts(paths: Iterable[Path]) -> list[str]:
-    """Bind paths where they are, leaving out what lies inside the system's."""
+    """Bind paths at the same place, except those inside the system's folders."""
     options: list[str] = []
     for path in outermost(paths, Path("/usr")):
         for parent in reversed(path.parents[:-1]):
@@ -286,7 +286,7 @@ def read_only_mounts(paths: Iterable[Path]) -> list[str]:
 
 
 def _is_closed(folder: Path) -> bool:
-    """Whether a folder is there that not everybody may read."""
+    """Whether a folder exists that is not world-readable."""
     try:
         mode = folder.stat().st_mode
     except OSError:
@@ -295,7 +295,7 @@ def _is_closed(folder: Path) -> bool:
 
 
 def outermost(paths: Iterable[Path], *bound: Path) -> list[Path]:
-    """Leave out paths that lie inside another one or inside one that is ``bound``, or that do not exist."""
+    """Leave out paths inside another one or inside a ``bound`` one, and paths that do not exist."""
     found: list[Path] = []
     for path in sorted({path.absolute() for path in paths}, key=lambda path: len(path.parts)):
         if path == Path("/") or any(map(path.is_relative_to, (*bound, *found))) or not path.exists():
@@ -305,12 +305,12 @@ def outermost(paths: Iterable[Path], *bound: Path) -> list[Path]:
 
 
 def _etc(order: Order) -> tuple[str, ...]:
-    """What is the machine's in ``/etc``: with its network also its name servers."""
+    """Return the machine's files in ``/etc``: with its network also its name servers."""
     return (*_ETC, "resolv.conf") if order.host_network else _ETC
 
 
 def write_etc(order: Order) -> None:
-    """Write the container's own ``/etc``, for its user to read. Its hosts may be known already."""
+    """Write the container's own ``/etc``, readable by its user. Its hosts may be known already."""
     etc, host = order.folder.etc, hostname(order.tag)
     etc.chmod(0o755)
     for name, text in (
