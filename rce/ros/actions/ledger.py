@@ -114,7 +114,7 @@ class GoalLedger:
                 or (request.stamp and entry.goal_id.stamp <= request.stamp)
                 or request == GoalId()
             )
-            if is_meant and GOAL_LIFE.allows(entry.state, GoalEvent.REQUEST_CANCEL):
+            if is_meant and entry.has_come and GOAL_LIFE.allows(entry.state, GoalEvent.REQUEST_CANCEL):
                 self.apply(entry.goal_id.id, GoalEvent.REQUEST_CANCEL, now, entry.text)
                 asked.append(entry.goal_id.id)
         if request.id and request.id not in self._entries:
@@ -132,10 +132,12 @@ class GoalLedger:
         """Apply an event to a goal.
 
         Raises:
-            UnknownGoalError: The server does not know the goal.
+            UnknownGoalError: The goal has not come, or is forgotten.
             IllegalTransitionError: It is not possible in the goal's state; nothing was changed.
         """
         entry = self[goal_id]
+        if not entry.has_come:
+            raise UnknownGoalError(goal_id)
         state = GOAL_LIFE.advance(entry.state, event, goal_id, entry.recent)
         entry.state, entry.text, entry.recent = state, text, remember(entry.recent, event)
         if state.is_over:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 CLASSES = (Connection, Publisher, Subscriber, ServiceClient, ServiceProvider)
 INSIDE = {  # what an interface takes from its connection, not from the program
+    "call_of",
     "deliver",
     "fits",
     "on_active",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rce.ros.actions import GoalEvent, GoalId, GoalState, IllegalTransitionError, UnknownGoalError
@@ -99,6 +99,7 @@ events = st.tuples(
 
 
 @given(st.lists(events))
+@example([("cancel", 1, 0, 0.0), (GoalEvent.REJECT, 1, 0, 0.0), ("goal", 1, 0, 0.0)])
 def test_the_ledger_is_always_sound(story: list[tuple[object, int, int, float]]) -> None:
     ledger, now = GoalLedger(), 0.0
     seen: dict[str, GoalState] = {}
