@@ -1,9 +1,9 @@
-"""Connecting to a host by its name.
+"""Connections to a host by its name.
 
-An event loop's own ``create_connection`` is not used with names. uvloop's looks a name up in a future of its
-own; when the call is cancelled meanwhile (a timeout is enough), the lookup's failure is reported on stderr as
-an exception that was never retrieved. And a program whose event loop looks a name up cannot end until the
-name server has answered (:mod:`rce.lookups`).
+An event loop's own ``create_connection`` is not used with names, for two reasons. uvloop looks a name up in a
+future of its own; if the call is cancelled meanwhile (a timeout is enough), the lookup's failure is reported
+on stderr as an exception that was never retrieved. And a program whose event loop looks a name up cannot end
+until the name server has answered (:mod:`rce.lookups`).
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ async def connect_first(addresses: list[Address]) -> socket.socket:
     """Connect to the first of some addresses that answers, as :func:`open_socket` does.
 
     Raises:
-        OSError: Nobody answers, with the reason of each address.
+        OSError: No address answers; the text has the reason of each.
     """
     errors: list[OSError] = []
     for family, address in addresses:

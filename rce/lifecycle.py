@@ -1,7 +1,7 @@
-"""Life cycles as data: states, what may happen in each, and the state that follows. Pure.
+"""Life cycles as data: states, the events of each, and the state that follows. Pure.
 
-A life cycle is a literal table. Where a table is the only place that leads from state to state, every test,
-every diagram and every ``match`` can be made or checked from it.
+A life cycle is a literal table. As the table is the only definition of its transitions, tests, diagrams and
+``match`` statements can be made or checked from it.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ REMEMBERED = 8
 """How many of the last events are remembered, for the error that an impossible one raises."""
 
 Table: TypeAlias = Mapping[S, Mapping[E, S]]
-"""State to what may happen in it, to the state that follows."""
+"""State to event to the state that follows."""
 
 
 class InvalidTransitionError(Exception):
     """An event came that its life cycle does not allow in the present state. Nothing was changed.
 
     Attributes:
-        subject: What it happened to, for example ``container alice/c1``.
+        subject: The object of the event, for example ``container alice/c1``.
         state: The present state.
-        event: What happened.
-        possible: What can happen in that state.
+        event: The event.
+        possible: The events that are allowed in that state.
         recent: The events before, the newest last.
     """
 
@@ -50,10 +50,10 @@ class InvalidTransitionError(Exception):
 
 
 class LifeCycle(Generic[S, E]):
-    """A life cycle: its table, and how to go through it.
+    """A life cycle: its table and its transitions.
 
     Args:
-        subject: What lives it, for errors and diagrams: ``container``, ``node``.
+        subject: The kind of object, for errors and diagrams: ``container``, ``node``.
         table: A row for every state; one without events is an end.
         error: What :meth:`advance` raises.
 
@@ -91,9 +91,9 @@ class LifeCycle(Generic[S, E]):
 
         Args:
             state: The present state.
-            event: What happens.
-            name: To whom, for the error.
-            recent: What happened before, for the error.
+            event: The event.
+            name: The object's name, for the error.
+            recent: The events before, for the error.
 
         Raises:
             InvalidTransitionError: The event cannot happen in that state. (Or the cycle's own error.)
@@ -106,15 +106,15 @@ class LifeCycle(Generic[S, E]):
         return after
 
     def start(self, state: S, name: str = "") -> StateMachine[S, E]:
-        """Return something that goes through this life cycle, from ``state`` on."""
+        """Return a state machine of this life cycle, which begins in ``state``."""
         return StateMachine(self, state, name)
 
 
 class StateMachine(Generic[S, E]):
-    """Where something is in its life cycle. The state changes by :meth:`advance` and in no other way.
+    """The state of an object in its life cycle. The state changes only by :meth:`advance`.
 
     Attributes:
-        name: What it is called, for the error.
+        name: The object's name, for the error.
         recent: Its last events, the newest last; one that came several times in a row is there once.
     """
 
@@ -139,7 +139,7 @@ class StateMachine(Generic[S, E]):
         return self._cycle.allows(self._state, event)
 
     def advance(self, event: E) -> S:
-        """Let an event happen; return the state that follows.
+        """Apply an event; return the state that follows.
 
         Raises:
             InvalidTransitionError: It cannot happen now. Nothing was changed. (Or the cycle's own error.)

@@ -1,4 +1,4 @@
-"""Where the masters of one engine are: one address or several, of which one is in use at a time. Pure."""
+"""The addresses of an engine's masters: one or several, of which one is in use at a time. Pure."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ def split_addresses(text: str) -> tuple[str, ...]:
 
 
 class Masters:
-    """Addresses that are used in turn: one that fails makes way for the next.
+    """Addresses that are used in turn: after a failure the next one is used.
 
     Args:
         addresses: One or several; in a text they are separated by commas.
 
     Raises:
-        ValueError: There is none.
+        ValueError: No address was given.
 
     Example:
         ```python
@@ -46,6 +46,6 @@ class Masters:
         return self.all[self._index]
 
     def failed(self, address: str) -> None:
-        """Go on to the next address, if it is still ``address`` that is in use."""
+        """Switch to the next address, if ``address`` is still in use."""
         if address == self.current:
             self._index = (self._index + 1) % len(self.all)

@@ -1,1 +1,1 @@
-"""What asyncio leaves to its users, written once: backoff, owners of tasks, bounded queues."""
+"""Additions to asyncio: backoff, owners of tasks, bounded queues."""

@@ -1,4 +1,4 @@
-"""How long to wait before the next attempt: pauses that double, with jitter or without."""
+"""Pauses between attempts, which double, with jitter or without."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Backoff:
     longest: float
     """Longest pause, in seconds."""
     jitter: float = 0.0
-    """Which part of a pause is left to chance: 0 none, 0.5 its second half, 1 all of it (*full jitter*).
+    """Which part of a pause is random: 0 none, 0.5 its second half, 1 all of it (*full jitter*).
 
     Peers that lost the same server at the same moment come back spread out in time.
     """
@@ -62,13 +62,13 @@ class Backoff:
         """Begin to count failures.
 
         Args:
-            source: What the jitter is drawn from.
+            source: Random source of the jitter.
         """
         return Pauses(self, source)
 
 
 class Pauses:
-    """Counts the failures of one loop, and says how long each of its pauses is. See :class:`Backoff`."""
+    """Counts the failures of one loop, and returns the length of each pause. See :class:`Backoff`."""
 
     def __init__(self, backoff: Backoff, source: UniformSource) -> None:
         self._backoff = backoff
@@ -82,5 +82,5 @@ class Pauses:
         return pause - pause * self._source.uniform(0.0, self._backoff.jitter)
 
     def reset(self) -> None:
-        """Count from nothing again: an attempt succeeded."""
+        """Reset the count to 0: an attempt succeeded."""
         self._failures = 0

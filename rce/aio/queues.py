@@ -1,4 +1,4 @@
-"""Queues that never grow too long, and what a full one does. Pure: no event loop, no clock."""
+"""Bounded queues with an overflow policy. Pure: no event loop, no clock."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ T = TypeVar("T")
 
 
 class OverflowPolicy(Enum):
-    """What a full queue does with a new item."""
+    """How a full queue handles a new item."""
 
     DROP_OLDEST = "drop oldest"
     """Drop the oldest items, and count them. For topics, where the newest is worth most."""
@@ -29,7 +29,7 @@ class BoundedQueue(Generic[T]):
     Args:
         max_items: Most items, without those that are kept.
         max_bytes: Most bytes, without those that are kept.
-        policy: What a full queue does with a new item.
+        policy: How a full queue handles a new item.
         on_drop: Called with each item that is dropped to make room.
 
     Attributes:
@@ -126,7 +126,7 @@ class BoundedQueue(Generic[T]):
         return entry[2] if self._is_kept(entry) else None
 
     def peek(self) -> T | None:
-        """Return the oldest item, None if there is none."""
+        """Return the oldest item, None if the queue is empty."""
         return self._entries[0][0] if self._entries else None
 
     def has_kept(self, key: Hashable) -> bool:
@@ -188,7 +188,7 @@ class BoundedQueue(Generic[T]):
         return entry[0]
 
     def drop_oldest(self) -> bool:
-        """Drop the oldest item that is not kept; return False if there is none."""
+        """Drop the oldest item that is not kept; return False if all are kept."""
         for index, entry in enumerate(self._entries):
             if not self._is_kept(entry):
                 del self._entries[index]
@@ -208,7 +208,7 @@ class BoundedQueue(Generic[T]):
                 self.kept_bytes = 0
 
     def remove(self, matches: Callable[[T], bool]) -> bool:
-        """Remove the oldest item that matches, which does not count as dropped; False if there is none."""
+        """Remove the oldest item that matches, which does not count as dropped; return False if none does."""
         for index, entry in enumerate(self._entries):
             if matches(entry[0]):
                 del self._entries[index]
@@ -217,7 +217,7 @@ class BoundedQueue(Generic[T]):
         return False
 
     def remove_kept(self, key: Hashable) -> bool:
-        """Remove the item that is kept for a key, which does not count as dropped; False if there is none."""
+        """Remove the item kept for a key, which does not count as dropped; return False if none is kept."""
         kept = self._kept.get(key)
         if kept is None:
             return False
@@ -236,14 +236,14 @@ class BoundedQueue(Generic[T]):
         return entry[2] is not None and self._kept.get(entry[2]) is entry
 
     def _forget(self, entry: tuple[T, int, Hashable]) -> None:
-        """Count an entry out that was removed."""
+        """Subtract a removed entry from the counters."""
         self.bytes -= entry[1]
         if self._is_kept(entry):
             del self._kept[entry[2]]
             self.kept_bytes -= entry[1]
 
     def _is_full(self, size: int) -> bool:
-        """Tell whether something must go before ``size`` more bytes may come."""
+        """Return whether items must be dropped before ``size`` more bytes fit."""
         droppable = len(self._entries) - len(self._kept)
         return droppable > 0 and (
             droppable >= self.max_items or self.bytes - self.kept_bytes + size > self.max_bytes

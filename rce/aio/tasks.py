@@ -1,6 +1,6 @@
 """Owners of tasks: a block (:class:`TaskScope`), or an object that is closed (:class:`BackgroundTasks`).
 
-:class:`asyncio.TaskGroup` waits for its tasks when its block ends; what is here cancels them. Use the task
+:class:`asyncio.TaskGroup` waits for its tasks when its block ends; these classes cancel them. Use the task
 group where the block is done when its tasks are.
 """
 
@@ -19,9 +19,9 @@ T = TypeVar("T")
 class TaskScope:
     """A task group whose end means "stop", not "wait": for the background work of a server or client.
 
-    Leaving the block cancels what still runs and waits for it. As with :class:`asyncio.TaskGroup`, a task
-    that fails cancels the block and its error comes out of it in an exception group; an error of the block
-    itself passes unchanged. Cancelling the block cancels the tasks too.
+    Leaving the block cancels the running tasks and waits for them. As with :class:`asyncio.TaskGroup`, a task
+    that fails cancels the block, which raises its error in an exception group; an error of the block itself
+    passes unchanged. Cancelling the block cancels the tasks too.
 
     Example:
         >>> async with TaskScope() as tasks:
@@ -47,7 +47,7 @@ class TaskScope:
         await self._group.__aexit__(None, None, None)
 
     def spawn(self, work: Coroutine[Any, Any, T], *, name: str) -> asyncio.Task[T]:
-        """Run ``work`` as a task of this scope; what is spawned while the block is left is cancelled at once.
+        """Run ``work`` as a task of this scope; a task spawned while the block is left is cancelled at once.
 
         Raises:
             RuntimeError: The scope has not begun or has ended.
@@ -63,8 +63,8 @@ class TaskScope:
 class BackgroundTasks:
     """Owns the tasks of an object that is closed explicitly; its length is how many run.
 
-    A task that fails is reported to the event loop's exception handler; the others go on. :meth:`close` ends
-    them all.
+    A task that fails is reported to the event loop's exception handler; the others continue. :meth:`close`
+    ends them all.
 
     Example:
         >>> tasks = BackgroundTasks()
@@ -117,7 +117,7 @@ class BackgroundTasks:
 
 
 async def cancel_and_wait(*tasks: asyncio.Future[Any]) -> None:
-    """Cancel tasks and wait until they have ended; what they return or raise is dropped.
+    """Cancel tasks and wait until they have ended; their results and exceptions are dropped.
 
     For helpers of the caller whose outcome it has seen, or does not need any more.
     """
@@ -129,10 +129,10 @@ async def cancel_and_wait(*tasks: asyncio.Future[Any]) -> None:
 async def run_until_first(*works: Coroutine[Any, Any, object]) -> None:
     """Run coroutines side by side until one ends; then cancel the others and wait until they have ended.
 
-    For both directions of a conversation, which is over when either is. Cancellation cancels all.
+    For the two directions of a connection, which ends when either ends. Cancellation cancels all.
 
     Raises:
-        Exception: What the one that ended raised; what the others raise as they are cancelled is dropped.
+        Exception: From the one that ended; exceptions of the others, as they are cancelled, are dropped.
     """
     tasks = [asyncio.create_task(work) for work in works]
     try:

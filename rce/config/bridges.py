@@ -1,4 +1,4 @@
-"""The short form of a robot's wiring: ``bridges``, of which interfaces and connections are made.
+"""The short form of a robot's wiring: ``bridges``, which expand to interfaces and connections.
 
 ::
 
@@ -109,15 +109,15 @@ class Bridge(Strict):
     type: MessageTypeName | None = None
     """Of the messages, the service or the action; None: as the robot's graph has it."""
     source: EndText | None = Field(default=None, alias="from")
-    """Where a topic's messages come from."""
+    """The end that a topic's messages come from."""
     to: EndTexts | None = None
-    """Where they go to."""
+    """The ends that they go to."""
     server: EndText | None = None
-    """Where a service's or an action's server is."""
+    """The end with the server of a service or an action."""
     clients: EndTexts | None = None
-    """Where it is used."""
+    """The ends with its clients."""
     form: Literal["forwarder", "converter"] = "forwarder"
-    """How messages look at the robot's end: serialized, or as JSON."""
+    """The form of messages at the robot's end: serialized, or JSON."""
 
     @model_validator(mode="after")
     def _check_keys(self) -> Self:
@@ -138,7 +138,7 @@ class Bridge(Strict):
 
     @property
     def kind(self) -> Kind:
-        """What it carries."""
+        """The kind of the bridge: topic, service or action."""
         return "topic" if self.topic is not None else "service" if self.service is not None else "action"
 
     @property
@@ -154,11 +154,11 @@ class Bridge(Strict):
 
     @property
     def robot_name(self) -> str | None:
-        """What it is called in the robot's graph; None if no end is the robot's."""
+        """Its name in the robot's graph; None if no end is the robot's."""
         return next((end.name or self.name for end in self.ends if end.endpoint == ROBOT), None)
 
     def parts(self, type_: str) -> Iterator[Part]:
-        """Take it to pieces.
+        """Return the topics and services of the bridge.
 
         Args:
             type_: The type of the messages, the service or the action.
@@ -204,11 +204,11 @@ class Wiring:
     interfaces: list[AddInterface]
     connections: list[Connection]
     origins: dict[tuple[str, int], str] = field(default_factory=dict)
-    """Key and index of what was made, and the bridge that it was made for, as a place in the file."""
+    """Key and index of each made item, and the bridge that it was made for, as a place in the file."""
     faults: list[Fault] = field(default_factory=list)
 
     def add(self, index: int, bridge: Bridge, type_: str) -> None:
-        """Make what a bridge needs and is not there yet.
+        """Make the interfaces and connections that a bridge needs and that do not exist yet.
 
         Args:
             index: Of the bridge in the file.

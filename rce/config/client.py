@@ -1,4 +1,4 @@
-"""The config file of ``rce-ros``: which robot this is, and what it wants in the cloud.
+"""The config file of ``rce-ros``: the robot, and its containers, nodes and connections in the cloud.
 
 Keys are those of the RoboEarth Cloud Engine's files (``docs/protocol.md``).
 """
@@ -65,7 +65,7 @@ def _check_authority(text: str) -> str:
 
 
 class ClientConfig(Strict):
-    """All that one robot's file says."""
+    """The contents of one robot's file."""
 
     url: Annotated[str, BeforeValidator(_check_urls)]
     """The master's address; several, which are separated by commas here and may be a list in the file, are
@@ -145,7 +145,7 @@ def load(path: Path) -> ClientConfig:
     """Read a config file, JSON or YAML.
 
     Raises:
-        ConfigError: It cannot be read, or something is wrong in it; every fault is listed.
+        ConfigError: It cannot be read, or has faults; every fault is listed.
     """
     return loads(read_file(path), str(path))
 
@@ -162,7 +162,7 @@ def loads(
         draft: Leave bridges out whose type is not known, instead of refusing the file.
 
     Raises:
-        ConfigError: Something is wrong in it; every fault is listed.
+        ConfigError: It has faults; every fault is listed.
     """
     data = parse(text, source)
     if not isinstance(data, dict):

@@ -1,7 +1,7 @@
-"""What must fit together in a client's config file.
+"""Checks of references within a client's config file.
 
-A file may refer to containers and interfaces that it does not make itself: other robots of the same user make
-them. So a reference is only wrong if the file itself says that it cannot work.
+A file may refer to containers and interfaces that other robots of the same user make. So a reference is wrong
+only if the file itself shows that it cannot work.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Parts:
-    """The items of a file that are right in themselves, each with its index."""
+    """The valid items of a file, each with its index."""
 
     robot: str | None
     complete: bool = True
@@ -42,13 +42,13 @@ class Parts:
     """Where the file asks for items that it does not list itself, by key and index."""
 
     def place(self, key: str, index: int, field_: str = "") -> str:
-        """Say where in the file an item, or one of its fields, is."""
+        """Return the place of an item, or of one of its fields, in the file."""
         origin = self.origins.get((key, index))
         return origin or (f"{key}[{index}].{field_}" if field_ else f"{key}[{index}]")
 
     @classmethod
     def salvage(cls, data: Mapping[str, Any], kinds: Mapping[str, ItemOf[Any]]) -> Self:
-        """Take the valid items out of a document of which others may be wrong."""
+        """Return the valid items of a document; others may be wrong."""
         robot = data.get("robotID")
         parts = cls(robot if isinstance(robot, str) and is_name(robot) else None)
         for key, kind in kinds.items():
@@ -77,7 +77,7 @@ def credential_faults(data: Mapping[str, Any]) -> list[Fault]:
 
 
 def check(parts: Parts) -> list[Fault]:
-    """Find everything that does not fit together."""
+    """Find every conflict between items."""
     return [
         *_check_tags(parts),
         *_check_containers(parts),
@@ -138,7 +138,7 @@ def _check_containers(parts: Parts) -> Iterator[Fault]:
 
 
 def _check_order(parts: Parts) -> Iterator[Fault]:
-    """Find nodes that wait for one another, in a circle."""
+    """Find nodes that wait for one another in a cycle."""
     after: dict[str, dict[str, tuple[str, ...]]] = {}
     for _, node in parts.nodes:
         after.setdefault(node.container, {})[node.node.tag] = node.node.after

@@ -1,4 +1,4 @@
-"""Reads JSON or YAML text into plain values, and finds what a parser would let pass: keys that come twice."""
+"""Reads JSON or YAML text into plain values, and finds duplicate keys, which a parser would accept."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MAX_SIZE = 4 * 2**20
 
 
 def read_file(path: Path) -> str:
-    """Read a text file of bearable size.
+    """Read a text file, up to a limit of size.
 
     Raises:
         ConfigError: It cannot be read.
@@ -40,7 +40,7 @@ def parse(text: str, source: str) -> Any:
         source: Its file's name, for errors.
 
     Raises:
-        ConfigError: It is not JSON or YAML, or has keys that come twice.
+        ConfigError: It is not JSON or YAML, or has duplicate keys.
     """
     if source.endswith(".json") or (
         text.lstrip().startswith(("{", "[")) and not source.endswith((".yaml", ".yml"))
@@ -52,7 +52,7 @@ def parse(text: str, source: str) -> Any:
 
 
 class _Object(dict[str, Any]):
-    """A JSON object that knows which of its keys came twice."""
+    """A JSON object that knows its duplicate keys."""
 
     repeated: tuple[str, ...] = ()
 

@@ -1,7 +1,7 @@
 """The items that a robot's file lists: containers, nodes, parameters, interfaces and connections.
 
 Each is a request of :mod:`rce.model.requests`, spelled with the keys of the RoboEarth Cloud Engine's files
-(``docs/protocol.md``). What pydantic reads them with is made of their fields.
+(``docs/protocol.md``). The pydantic models that read them are made from their fields.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ SPELLING = Spelling(
         (InterfaceSpec, "message_type"): "iCls",
     },
 )
-"""What config files call the fields."""
+"""The names of the fields in config files."""
 
 
 class ItemOf(Generic[T]):
@@ -62,14 +62,14 @@ class ItemOf(Generic[T]):
 
     @property
     def model(self) -> type[Strict]:
-        """What reads its keys."""
+        """The pydantic model of its keys."""
         return model_of(self._cls)
 
     def read(self, data: object) -> T:
         """Read an item.
 
         Raises:
-            ValidationError: Something is wrong in it.
+            ValidationError: The item has a fault.
         """
         return self._make(self.model.model_validate(data))
 
@@ -98,11 +98,11 @@ _MODELS: dict[type[Any], type[Strict]] = {}
 
 
 def model_of(cls: type[Any]) -> type[Strict]:
-    """Make what reads the keys of an item, of its fields."""
+    """Make the pydantic model of an item from its fields."""
     if cls not in _MODELS:
         options: dict[str, Any] = {}
         for field in fields_of(cls):
-            # What is not given is left out of what is read, so that the default here is of no matter.
+            # Fields that are not given are left out of the result, so the default here has no effect.
             default = ... if field.required else None
             options[field.name] = (_annotation(field), Option(default, alias=SPELLING.key(field)))
         _MODELS[cls] = create_model(cls.__name__, __base__=Strict, **options)
@@ -110,7 +110,7 @@ def model_of(cls: type[Any]) -> type[Strict]:
 
 
 def _annotation(field: Field) -> Any:
-    """Tell pydantic what users may write in a field."""
+    """Return pydantic's annotation of the values that users may write in a field."""
     rule = field.rule
     if field.choices:
         return Annotated[Any, BeforeValidator(_one_of(field.choices))]
@@ -125,7 +125,7 @@ def _annotation(field: Field) -> Any:
 
 
 def _text_or_number(kind: Any) -> Any:
-    """Tell pydantic what msgspec knows of a type of one value."""
+    """Return pydantic's annotation of a type of one value, from msgspec's."""
     if kind is bool:
         return bool
     plain, meta = get_args(kind)
@@ -157,7 +157,7 @@ def _one_of(choices: tuple[str, ...]) -> Callable[[Any], Any]:
 
 
 def _checked(read: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Check a value with what reads it; it stays as it was written."""
+    """Check a value with its reader; the value stays as it was written."""
 
     def check(value: Any) -> Any:
         read(value)

@@ -148,29 +148,29 @@ class EngineSettings(Section, frozen=True, kw_only=True):
 
     @property
     def master_state(self) -> Path:
-        """Where the master keeps its state."""
+        """The folder of the master's state."""
         return self.master.state_dir or self.state_dir / "master"
 
     @property
     def container_state(self) -> Path:
-        """Where a container task set keeps its state."""
+        """The folder of a container task set's state."""
         return self.container.state_dir or self.state_dir / "container"
 
     @property
     def certificates(self) -> Path:
-        """The folder with the authority and what it issued."""
+        """The folder with the authority and its certificates."""
         return self.tls.certificates or self.state_dir / "certificates"
 
     @property
     def control_url(self) -> str:
-        """Where task sets dial the master, the first of several."""
+        """The URL at which task sets dial the master, the first of several."""
         host = (*split_addresses(self.master_host), LOOPBACK)[0]
         scheme = "wss" if self.tls.enabled else "ws"
         return f"{scheme}://{f'[{host}]' if ':' in host else host}:{self.master.control_port}"
 
     @property
     def http_url(self) -> str:
-        """Where clients on this machine find the master."""
+        """The URL of the master for clients on this machine."""
         host = self.master.bind or LOOPBACK
         with contextlib.suppress(ValueError):
             if ipaddress.ip_address(host).is_unspecified:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _HANDSHAKE_RECORD = 0x16
-"""First byte of a TLS client, and of no HTTP request."""
+"""First byte that a TLS client sends; an HTTP request never begins with it."""
 _TEXT = b"This port does not speak TLS: use http:// or ws://\n"
 _ANSWER = (
     b"HTTP/1.1 400 Bad Request\r\nContent-Type: text/plain\r\nConnection: close\r\n"
@@ -26,7 +26,7 @@ class PlainPort:
     """Refuses TLS clients of a server without TLS.
 
     Args:
-        name: What is served, for the log.
+        name: The service on the port, for the log.
     """
 
     def __init__(self, name: str) -> None:

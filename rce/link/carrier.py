@@ -166,7 +166,7 @@ class LocalCarrier(Carrier):
     def control(self, frame: Frame) -> None:
         """Send a frame."""
         if self._peer is not None:
-            self._peer._take(frame)  # noqa: SLF001 - two halves of one thing
+            self._peer._take(frame)  # noqa: SLF001 - same module
 
     def send(self, queue: OutgoingQueue, frame: Frame) -> None:
         """Send a message; nothing ever waits here."""
@@ -186,7 +186,7 @@ class LocalCarrier(Carrier):
         """End both halves; the peer's handler learns it in a later step of the event loop."""
         peer = self._end()
         if peer is not None:
-            self._loop.call_soon(peer._lose)  # noqa: SLF001 - two halves of one thing
+            self._loop.call_soon(peer._lose)  # noqa: SLF001 - same module
 
     async def wait_closed(self) -> None:
         """Wait until this half has ended."""
