@@ -1,1 +1,1 @@
-"""The vocabulary: names, amounts, and what users ask for. It does no I/O."""
+"""The vocabulary: names, amounts, specs and requests of users. It does no I/O."""

@@ -1,4 +1,4 @@
-"""What can be wrong with a request beyond the form of its fields. Pure."""
+"""Checks of a request beyond the form of its fields. Pure."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-# A folder of the machine, or an image's name as registries know it: no spaces, no option of a command line.
+# A folder of the machine, or an image's name as in registries: no spaces, no option of a command line.
 _IMAGE = re.compile(r"(/[^\x00-\x1f]*|[A-Za-z0-9][A-Za-z0-9._:/@+-]*)")
 _MAX_IMAGE = 255
 
 DEFAULT_PREFIX = 24
-"""Of a group's address that has none."""
+"""Prefix of a group's address without one."""
 _SHORTEST_PREFIX, _LONGEST_PREFIX = 8, 30
 
 
@@ -42,14 +42,14 @@ def read_group_address(text: str) -> str:
 
 
 def find_circle(start: str, after: Mapping[str, Sequence[str]]) -> list[str]:
-    """Find a way on which a node comes after itself.
+    """Find a cycle on which a node comes after itself.
 
     Args:
         start: The node's tag.
         after: The tags of the nodes that each node comes after.
 
     Returns:
-        The tags on the way, ``start`` first and last; empty if there is none.
+        The tags on the cycle, ``start`` first and last; empty without a cycle.
     """
     ways = [[start, tag] for tag in after.get(start, ())]
     seen: set[str] = set()

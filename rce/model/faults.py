@@ -1,4 +1,4 @@
-"""What is wrong with something that a user wrote, as data: where, which kind of fault, and in which words.
+"""Faults in user input, as data: place, code and text.
 
 Each surface (client protocol, config file, REST API) makes one text of it, by ``str``.
 """
@@ -18,10 +18,10 @@ Path: TypeAlias = tuple[str | int, ...]
 
 
 class FaultCode(Enum):
-    """Which kind of fault."""
+    """The kind of a fault."""
 
     MISSING = "missing"
-    """Something that must be there is not."""
+    """A required field or item is missing."""
     INVALID = "invalid"
     """A value that the field cannot have."""
     LIMIT = "limit"
@@ -29,20 +29,20 @@ class FaultCode(Enum):
 
 
 class FieldFault(Struct, frozen=True):
-    """One thing that is wrong."""
+    """One fault."""
 
     path: Path
     """Where; empty for the whole."""
     code: FaultCode
     problem: str
-    """What is wrong there, and what would be right."""
+    """The fault, and what is valid."""
 
     def __str__(self) -> str:
         place = join_path(self.path)
         return f"{place}: {self.problem}" if place else self.problem
 
     def at(self, path: Path) -> FieldFault:
-        """Return the same fault of another place."""
+        """Return the same fault at another place."""
         return FieldFault(path, self.code, self.problem)
 
     def below(self, *place: str | int) -> FieldFault:
@@ -51,10 +51,10 @@ class FieldFault(Struct, frozen=True):
 
 
 class SpecError(ValueError):
-    """Something that a user wrote is refused.
+    """User input is refused.
 
     Attributes:
-        faults: What is wrong; never empty.
+        faults: The faults; never empty.
     """
 
     def __init__(self, faults: Sequence[FieldFault]) -> None:

@@ -1,4 +1,4 @@
-"""The words of the protocol: names, interface types, endpoint ids.
+"""The names of the protocol: tags, interface types, endpoint ids.
 
 Wire source: the RoboEarth Cloud Engine's client protocol (``docs/protocol.md``).
 """
@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from enum import Enum
 
 NAME_PATTERN = r"[A-Za-z][A-Za-z0-9_]*"
-"""What a user, robot, container, node, interface or parameter segment may be called."""
+"""Valid names of users, robots, containers, nodes, interfaces and parameter segments."""
 
 MESSAGE_TYPE_PATTERN = rf"{NAME_PATTERN}/{NAME_PATTERN}"
-"""What a message or service type may be called: ``package/Type``."""
+"""Valid names of message and service types: ``package/Type``."""
 
 VERSION_PATTERN = r"[0-9]{1,9}(\.[0-9]{1,9}){0,3}(-[0-9A-Za-z]+(\.[0-9A-Za-z]+)*)?"
-"""What a package's version looks like: up to four numbers, and a label of what comes before a release."""
+"""Valid versions of packages: up to four numbers, and a label for pre-releases."""
 
 MAX_NAME_LENGTH = 128
 MAX_VERSION_LENGTH = 64
@@ -42,14 +42,14 @@ def is_version(text: str) -> bool:
 
 
 class Role(Enum):
-    """What an interface does, seen from the engine."""
+    """The role of an interface, seen from the engine."""
 
     SERVICE_CLIENT = "ServiceClient"
     """The engine calls a service on this side: requests come from the peer, this side answers them."""
     SERVICE_PROVIDER = "ServiceProvider"
     """The engine offers a service on this side: this side asks, the peer answers. Takes one connection."""
     PUBLISHER = "Publisher"
-    """The engine publishes on this side what the peers send."""
+    """The engine publishes the peers' messages on this side."""
     SUBSCRIBER = "Subscriber"
     """The engine takes messages on this side and sends them to the peers."""
 
@@ -73,7 +73,7 @@ _COMPLEMENT = {
 
 
 class Form(Enum):
-    """Where an interface ends and how its messages look there."""
+    """The end of an interface, and the form of its messages there."""
 
     INTERFACE = "Interface"
     """Container end: a ROS topic or service at ``addr``."""

@@ -1,4 +1,4 @@
-"""How people write amounts of processor time, memory and bandwidth.
+"""Amounts of processor time, memory and bandwidth, as users write them.
 
 ==========  ==============================  ==================================================
 amount      a plain number means            as text
@@ -8,8 +8,8 @@ memory      MB of 2^20 bytes: ``256``       ``"256M"``, ``"1G"``, ``"512MiB"``, 
 bandwidth   bytes per second: ``5000000``   ``"5M"``, ``"2.5MB/s"``, ``"10Mbit"``, ``"1Gbit/s"``
 ==========  ==============================  ==================================================
 
-The prefixes of memory are powers of 1024, with and without the ``i``, as memory is built and limited; those
-of bandwidth are powers of 1000, as networks count, and of 1024 with the ``i``. Zero: not requested.
+The prefixes of memory are powers of 1024, with and without the ``i``; those of bandwidth are powers of 1000,
+and of 1024 with the ``i``. Zero: not requested.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MAX_BANDWIDTH = 2**50
 _NUMBER = r"(?P<number>[0-9]{1,20}(?:\.[0-9]{1,20})?)"
 _CORES = re.compile(rf"{_NUMBER}\s*(?P<percent>%)?")
 _MEMORY = re.compile(rf"{_NUMBER}\s*(?:(?P<prefix>[KMGT])(?:i?B)?|(?P<byte>B))?", re.IGNORECASE)
-# The case of b counts here: it tells bits from bytes where networks are spoken of.
+# The case of b counts here: for networks, it distinguishes bits from bytes.
 _BANDWIDTH = re.compile(rf"{_NUMBER}\s*(?P<prefix>[kKMGT]i?)?(?P<unit>B|bit)?(?:/s|ps)?")
 
 _POWERS = {"": 0, "k": 1, "m": 2, "g": 3, "t": 4}
@@ -136,7 +136,7 @@ def write_bandwidth(rate: int) -> str:
 
 def about(count: float, unit: str = "B") -> str:
     """Write an amount for people: three digits and a prefix of 1024, such as ``1.21 GiB``."""
-    if count < 999.5:  # noqa: PLR2004 - beyond it, three digits do not hold it
+    if count < 999.5:  # noqa: PLR2004 - larger amounts need more than three digits
         return f"{count:.0f} {unit}"
     for prefix in ("Ki", "Mi", "Gi"):
         count /= 1024
@@ -160,7 +160,7 @@ def _plain(value: object, wanted: str) -> Decimal:
         if number.is_finite() and number >= 0:
             return number
     except (InvalidOperation, ValueError):
-        pass  # an integer of thousands of digits has no text; it is none that anybody means
+        pass  # Python does not convert integers of thousands of digits to text; none is a valid amount
     raise ValueError(f"must be {wanted}, and not below zero or endless")
 
 

@@ -1,7 +1,7 @@
-"""What users ask the engine to do: typed, and the same from the client's library to the master's state.
+"""Requests of users: typed, and the same from the client's library to the master's state.
 
-A request is read once (:mod:`rce.model.spelling`), where a user's text comes in. From there on it is one of
-these, also on the control channel.
+A request is parsed once (:mod:`rce.model.spelling`), where a user's text comes in. From there on it is one of
+these types, also on the control channel.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ class CreateContainer(Struct, frozen=True, kw_only=True, omit_defaults=True, tag
 
 
 class ResizeContainer(Struct, frozen=True, kw_only=True, omit_defaults=True, tag=True, tag_field="t"):
-    """Change what a container may use, while it runs."""
+    """Change the resources of a container while it runs."""
 
     tag: Annotated[str, _NAME]
     changes: ResourceChanges
 
 
 class DestroyContainer(Struct, frozen=True, kw_only=True, omit_defaults=True, tag=True, tag_field="t"):
-    """Remove a container and all that is in it."""
+    """Remove a container and everything in it."""
 
     tag: Annotated[str, _NAME]
 
@@ -100,7 +100,7 @@ class Connection(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class ConfigureComponents(Struct, frozen=True, kw_only=True, omit_defaults=True, tag=True, tag_field="t"):
-    """Add and remove nodes, interfaces and parameters. Removals are meant to be done first."""
+    """Add and remove nodes, interfaces and parameters. Removals come first."""
 
     add_nodes: tuple[AddNode, ...] = ()
     remove_nodes: tuple[RemoveNode, ...] = ()
@@ -122,17 +122,17 @@ class ConfigureConnections(Struct, frozen=True, kw_only=True, omit_defaults=True
 
 
 Component: TypeAlias = AddNode | RemoveNode | AddInterface | RemoveInterface | SetParameter | DeleteParameter
-"""What a container or a robot is made of."""
+"""A part of a container or a robot."""
 Item: TypeAlias = Component | Connection
-"""A part of a request that is done, or refused, by itself."""
+"""A part of a request that is carried out, or refused, by itself."""
 Request: TypeAlias = (
     CreateContainer | ResizeContainer | DestroyContainer | ConfigureComponents | ConfigureConnections
 )
-"""What a user may ask of the master."""
+"""A request of a user to the master."""
 
 
 def faults_of(item: Request | Item) -> Iterator[FieldFault]:
-    """Find what does not fit together in a request whose fields are right. Paths name attributes."""
+    """Return the conflicts between valid fields of a request. Paths name attributes."""
     if isinstance(item, CreateContainer):
         if item.resources.network is Network.GROUP and not item.resources.group:
             problem = "is missing; a container in a network of containers names its group"

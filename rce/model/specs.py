@@ -1,8 +1,9 @@
-"""What users ask for: containers, nodes, parameters and interfaces.
+"""Specs of containers, nodes, parameters and interfaces.
 
-The one place where their fields stand. A field's annotation says what the engine keeps, stores and sends over
-the control channel, and by :class:`rce.model.written.AsWritten` how users write it: in messages of the client
-protocol, in config files and in bodies of the REST API (:mod:`rce.model.spelling`).
+This is the only definition of their fields. A field's annotation has the type that the engine keeps, stores
+and sends over the control channel, and by :class:`rce.model.written.AsWritten` the form in which users write
+it: in messages of the client protocol, in config files and in bodies of the REST API
+(:mod:`rce.model.spelling`).
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ ParameterValue = bool | int | float | str | list[bool | int | float | str]
 
 
 class Network(Enum):
-    """What a container sees of the network, beside its own loopback and its links."""
+    """A container's access to the network, beside its own loopback and its links."""
 
     NONE = "none"
     GROUP = "group"
@@ -42,7 +43,7 @@ class RestartPolicy(Enum):
 
     NEVER = "never"
     ON_FAILURE = "on-failure"
-    """After any end but exit code 0."""
+    """After any end except with exit code 0."""
     ALWAYS = "always"
 
 
@@ -79,7 +80,7 @@ _TIMEOUT = AsWritten(Annotated[float, Meta(ge=0.1, le=86400.0)])
 
 
 class Resources(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What a container asks for. Zero or empty means: not requested."""
+    """The resources that a container requests. Zero or empty means: not requested."""
 
     size: Annotated[int, _SLOTS] = 1
     """Slots of the machine that it takes; the limits it does not set itself are so many times a slot's."""
@@ -100,7 +101,7 @@ class Resources(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class ResourceChanges(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What is to change of a container's resources. None leaves one as it is, zero withdraws it."""
+    """Changes of a container's resources. None leaves one as it is, zero withdraws it."""
 
     size: Annotated[int | None, _GIVEN_SLOTS] = None
     cpu: Annotated[float | None, _CORES] = None
@@ -108,7 +109,7 @@ class ResourceChanges(Struct, frozen=True, kw_only=True, omit_defaults=True):
     bandwidth: Annotated[int | None, _RATE] = None
 
     def given(self) -> dict[str, float]:
-        """The new values of what is to change, by field."""
+        """The new values, by field."""
         values = {name: getattr(self, name) for name in self.__struct_fields__}
         return {name: value for name, value in values.items() if value is not None}
 
@@ -126,13 +127,13 @@ class NodeSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
     restart: Annotated[RestartPolicy, _RESTART] = RestartPolicy.NEVER
     """When it is started again after it ended."""
     max_restarts: Annotated[int, _TIMES] = 5
-    """How often in a row it is started again; one that ran well for a while counts anew. 0: no limit."""
+    """How often in a row it is started again; the count restarts after it ran well. 0: no limit."""
     after: Annotated[tuple[str, ...], _TAGS] = ()
     """Tags of nodes that must be ready before this one starts."""
     heartbeat: Annotated[str, _ROS_NAME] = ""
-    """A topic that the node publishes as long as it is well; empty for none."""
+    """A topic that the node publishes as long as it works; empty for none."""
     heartbeat_timeout: Annotated[float, _TIMEOUT] = 5.0
-    """Seconds without a message on the heartbeat topic after which the node is taken for stuck."""
+    """Seconds without a message on the heartbeat topic after which the node counts as stuck."""
 
 
 class ParameterSpec(Struct, frozen=True, kw_only=True):
@@ -161,6 +162,6 @@ class InterfaceSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
         """The interface type, in its parts.
 
         Raises:
-            ValueError: There is no such type; the text lists those that there are.
+            ValueError: The type does not exist; the text lists the valid ones.
         """
         return InterfaceType.parse(self.type)

@@ -1,8 +1,8 @@
-"""How a surface spells the fields of requests: what it calls them, and what belongs below which key.
+"""The spelling of requests on a surface: the names of the fields, and their nesting.
 
 Client protocol, config files and REST API have one :class:`Spelling` each. Its names are made from those of
-the attributes by a style; the few that differ are listed. So a field that is new in :mod:`rce.model.specs` is
-read and written everywhere.
+the attributes by a style; the few that differ are listed. So a new field in :mod:`rce.model.specs` is read
+and written everywhere.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ class Field(NamedTuple):
     path: tuple[str, ...]
     """The attributes that lead to it, from the request on."""
     kept: Any
-    """The type of what the engine keeps."""
+    """The type of the value that the engine keeps."""
     rule: AsWritten
     default: Any
-    """Of what is kept; :data:`msgspec.NODEFAULT` if it must be given."""
+    """Default of the kept value; :data:`msgspec.NODEFAULT` if it must be given."""
 
     @property
     def name(self) -> str:
@@ -72,20 +72,20 @@ class Field(NamedTuple):
 
     @property
     def written(self) -> Any:
-        """The type of what users write."""
+        """The type of the value that users write."""
         return self.rule.type | None if self.default is None else self.rule.type
 
     @property
     def choices(self) -> tuple[str, ...]:
-        """The texts of which it must be one; empty if it is not such a field."""
+        """The valid texts of a field with a choice; empty for other fields."""
         return tuple(filter(None, get_args(self.rule.type))) if get_origin(self.rule.type) is Literal else ()
 
     def is_blank(self, value: Any) -> bool:
-        """Tell whether a value says "not given"."""
+        """Return whether a value means "not given"."""
         return value is UNSET or (value is None and self.default is None) or value == self.rule.blank
 
     def get(self, item: Any) -> Any:
-        """Return what a request has here."""
+        """Return this field's value in a request."""
         for name in self.path:
             item = getattr(item, name)
         return item
@@ -103,7 +103,7 @@ def fields_of(cls: type[Struct]) -> tuple[Field, ...]:
 
 
 def _specs_in(cls: type[Struct]) -> dict[str, type[Struct]]:
-    """Tell which attributes of a request are specs."""
+    """Return the attributes of a request that are specs."""
     if cls not in _SPECS:
         hints = get_type_hints(cls).items()
         specs = {name: kind for name, kind in hints if isinstance(kind, type) and issubclass(kind, Struct)}
@@ -126,12 +126,12 @@ def _find_fields(cls: type[Struct]) -> Iterator[Field]:
 
 
 class _Layout(NamedTuple):
-    """How a request looks when it is written."""
+    """The written form of a request."""
 
     keys: dict[tuple[str, ...], tuple[str, ...]]
     """The keys that lead to a field, by its path."""
     checker: Any
-    """What msgspec checks the written form with: an attribute for each field, in their order."""
+    """Type with which msgspec checks the written form: an attribute for each field, in their order."""
 
 
 class Spelling:
@@ -155,19 +155,19 @@ class Spelling:
         self._layouts: dict[type[Struct], _Layout] = {}
 
     def key(self, field: Field) -> str:
-        """Tell what a field is called here."""
+        """Return the name of a field on this surface."""
         return self._names.get((field.owner, field.name)) or self._style(field.name)
 
     def read(self, cls: type[T], data: Any, place: Path = ()) -> T:
         """Read a request.
 
         Args:
-            cls: What it is.
+            cls: Its class.
             data: A JSON object.
             place: Where it stands, for the paths of faults.
 
         Raises:
-            SpecError: Something is wrong in it.
+            SpecError: The request has faults.
         """
         item, faults = self.try_read(cls, data)
         if item is not None:
@@ -177,7 +177,7 @@ class Spelling:
         return item
 
     def try_read(self, cls: type[T], data: Any) -> tuple[T | None, list[FieldFault]]:
-        """Read a request, without a look at what does not fit together; return it, or what is wrong in it."""
+        """Read a request without checks between fields; return it, or its faults."""
         layout = self._layout(cls)
         below = self._below.get(cls)
         if below and isinstance(data, dict) and data.get(below, ...) is None:
@@ -202,7 +202,7 @@ class Spelling:
         return (None, faults) if faults else (_build(cls, kept), [])
 
     def write(self, item: Request | Item) -> dict[str, Any]:
-        """Write a request; what is as it would be anyway is left out."""
+        """Write a request, without the fields that have their default."""
         layout = self._layout(type(item))
         data: dict[str, Any] = {}
         for field in fields_of(type(item)):
@@ -215,7 +215,7 @@ class Spelling:
         return data
 
     def path(self, cls: type[Struct], attributes: Path) -> Path:
-        """Tell where, as it is spelled here, a field or a spec of a request stands."""
+        """Return the path of a field or a spec of a request, as it is spelled here."""
         keys = self._layout(cls).keys
         if attributes in keys:
             return keys[attributes]  # type: ignore[index]  # in the table, so it is all of names
@@ -246,7 +246,7 @@ class Spelling:
     def _checker(
         self, name: str, fields: Iterable[Field], last: tuple[tuple[Any, ...], str] | None = None
     ) -> Any:
-        """Make what msgspec checks written fields with."""
+        """Make the type with which msgspec checks written fields."""
         members: list[Any] = []
         names: dict[str, str] = {}
         for number, field in enumerate(fields):
@@ -269,7 +269,7 @@ def camel(name: str) -> str:
 
 
 def _build(cls: type[S], kept: dict[tuple[str, ...], Any]) -> S:
-    """Make a request, and the specs in it, of its fields."""
+    """Make a request, and the specs in it, from its fields."""
     own: dict[str, Any] = {path[0]: value for path, value in kept.items() if len(path) == 1}
     for name, spec in _specs_in(cls).items():
         own[name] = _build(spec, {path[1:]: value for path, value in kept.items() if path[0] == name})
@@ -283,13 +283,13 @@ PLAIN = Spelling(str)
 
 
 def short(value: Any) -> str:
-    """Quote a value of which only the beginning matters."""
+    """Quote the beginning of a value."""
     text = repr(value)
     return text if len(text) <= _MAX_QUOTED else f"{text[:_MAX_QUOTED]}..."
 
 
 def fault_of(text: str, value: Any, choices: Mapping[str, tuple[str, ...]] = _NO_CHOICES) -> FieldFault:
-    """Give a complaint of msgspec our words."""
+    """Turn an error of msgspec into a fault with this project's text."""
     found = _PLACE.fullmatch(text)
     problem, inner = found.groups() if found else (text, "")
     path = tuple(int(index) if index else key for key, index in _STEP.findall(inner))

@@ -1,4 +1,4 @@
-"""How users write the fields of specs: what text is valid, and in which words a wrong one is refused.
+"""The form in which users write the fields of specs: valid texts, and messages for wrong ones.
 
 The types are checked when messages of users are decoded. The engine's own specs (:mod:`rce.model.specs`) name
 them by :class:`AsWritten`, which does not bind what the engine stores and sends between its own programs.
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 ROS_NAME_PATTERN = r"[~/]?[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*"
-"""What a ROS topic, service, parameter or namespace may be called."""
+"""Valid names of ROS topics, services, parameters and namespaces."""
 
 _TYPE_PATTERN = f"({'|'.join(r.value for r in Role)})({'|'.join(f.value for f in Form)})"
-# Grouped, so that it is another text than MESSAGE_TYPE_PATTERN and has words of its own in HUMAN_PATTERNS.
+# Grouped, so that it differs from MESSAGE_TYPE_PATTERN and has its own text in HUMAN_PATTERNS.
 _INTERFACE_PATH_PATTERN = rf"({NAME_PATTERN})/({NAME_PATTERN})"
 _EXECUTABLE_PATTERN = r"(?!/)(?!(.*/)?\.\.(/|\Z))[^\x00-\x1f\x7f]+"
 
@@ -58,11 +58,11 @@ Executable = Annotated[str, Meta(pattern=rf"^{_EXECUTABLE_PATTERN}\Z", max_lengt
 InterfacePath = Annotated[str, Meta(pattern=rf"^{_INTERFACE_PATH_PATTERN}\Z", max_length=2 * MAX_NAME_LENGTH)]
 """An interface of an endpoint, ``ENDPOINT/INTERFACE``."""
 Text = Annotated[str, Meta(max_length=65536, pattern=r"^[^\x00]*\Z")]
-"""Free text without a NUL, which no argument and no file name may hold."""
+"""Free text without a NUL, which arguments and file names must not hold."""
 Quantity: TypeAlias = int | float | Text
 """An amount, as :mod:`rce.model.quantities` reads it."""
 NetworkName: TypeAlias = Literal["", "none", "group", "host"]
-"""What a container sees of the network; empty for the default."""
+"""A container's access to the network; empty for the default."""
 RestartName: TypeAlias = Literal["never", "on-failure", "always"]
 """When a node that ended is started again."""
 Scalar: TypeAlias = bool | int | float | str
@@ -88,7 +88,7 @@ HUMAN_PATTERNS: dict[str, str] = {
     rf"^{_INTERFACE_PATH_PATTERN}\Z": "must have the form ENDPOINT/INTERFACE",
     r"^[^\x00]*\Z": "must not hold a NUL character",
 }
-"""What to tell a user instead of a regular expression."""
+"""Text for users in place of a regular expression."""
 
 
 def _same(value: Any) -> Any:
@@ -96,16 +96,16 @@ def _same(value: Any) -> Any:
 
 
 class AsWritten:
-    """How users write a field: names a type for what they write, and how it becomes what the engine keeps.
+    """The form in which users write a field: its type, and the conversion to the value that the engine keeps.
 
-    It stands in the annotation of the field: ``cpu: Annotated[float, AsWritten(Quantity, read_cores)]``.
+    Put it in the annotation of the field: ``cpu: Annotated[float, AsWritten(Quantity, read_cores)]``.
 
     Args:
-        type: What users write; msgspec checks it.
-        read: Makes what is kept of what is written; raises :class:`ValueError` with words for the user.
-        write: Makes what is written of what is kept, so that ``read`` gives the same again.
+        type: Type of the written value; msgspec checks it.
+        read: Converts the written value to the kept one; raises :class:`ValueError` with a text for the user.
+        write: Converts the kept value to a written one, so that ``read`` returns the same again.
         blank: What users may write for "not given".
-        words: Says what is valid, where neither ``read`` nor the type's pattern does.
+        words: Text on what is valid, where neither ``read`` nor the type's pattern has one.
     """
 
     def __init__(

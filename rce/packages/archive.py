@@ -1,8 +1,8 @@
-"""The form of an archive: ustar in gzip, of one tree exactly one way to write it.
+"""The format of archives: ustar in gzip, with exactly one form for each tree.
 
-An entry has no owner, no time and no more of its mode than whether it may be executed, so equal folders
-make equal archives. Whatever is not of this form is refused. The headers are read one by one, and not by
-:class:`tarfile.TarFile`, which would believe the sizes in an archive's extended headers.
+An entry has no owner and no time, and of its mode only whether it may be executed, so equal folders make
+equal archives. Any other archive is refused. The headers are read one by one, and not by
+:class:`tarfile.TarFile`, which would trust the sizes in an archive's extended headers.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _LEVEL = 6
 
 
 class ArchiveWriter:
-    """Writes an archive. A context manager: closed in good order, the archive is whole."""
+    """Writes an archive. A context manager: the archive is complete when the block ends without an error."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._gzip = gzip.GzipFile(filename="", mode="wb", compresslevel=_LEVEL, fileobj=file, mtime=0)
@@ -87,7 +87,7 @@ def read_archive(
     Args:
         file: A real file.
         visit: Called with each entry, in order, after the rules that can be checked so far, and with a
-            file's data. What it does not take is passed over.
+            file's data. Data that it does not read is skipped.
         limits: How large it may be.
 
     Returns:
@@ -95,7 +95,7 @@ def read_archive(
         trees have the same one.
 
     Raises:
-        BadArchiveError: It is not of the form, breaks a rule, or is too large; the text names the place.
+        BadArchiveError: It has another format, breaks a rule, or is too large; the text names the place.
     """
     stream = _Inflated(file, limits)
     tree = Tree(limits)
@@ -143,7 +143,7 @@ def _mode(entry: Entry) -> int:
 
 
 class _Inflated:
-    """What a compressed file holds, never more of it than the limits allow."""
+    """The contents of a compressed file, never more than the limits allow."""
 
     def __init__(self, file: BinaryIO, limits: ArchiveLimits) -> None:
         packed = os.fstat(file.fileno()).st_size

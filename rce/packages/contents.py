@@ -1,4 +1,4 @@
-"""What a package holds: its manifest, and what nodes can be made of it."""
+"""The contents of a package: its manifest, and its executables."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ _MAX_DESCRIPTION = 1000
 
 
 class Contents(Struct, frozen=True, kw_only=True):
-    """What a package holds."""
+    """The contents of a package."""
 
     name: str
     version: str = ""
-    """As the manifest says it; empty if it does not."""
+    """As in the manifest; empty if it has none."""
     description: str = ""
     python: str = "system"
     """See :class:`rce.ros.packages.Package`."""
     executables: tuple[str, ...] = ()
-    """What a node can name as ``exe``; the first hundred."""
+    """The executables that a node can name as ``exe``; the first hundred."""
     requirements: bool = False
     """Whether it has a ``requirements.txt``."""
     files: int = 0
@@ -42,11 +42,11 @@ class Contents(Struct, frozen=True, kw_only=True):
     digest: str = ""
     """SHA-256, in hex, of what the archive unpacks to."""
     warnings: tuple[str, ...] = ()
-    """What is probably not meant so."""
+    """Probable mistakes."""
 
 
 def inspect(file: BinaryIO, limits: ArchiveLimits = DEFAULT_LIMITS) -> Contents:
-    """Read an archive and tell what it holds. Blocks; unpacks nothing to a disk.
+    """Read an archive and return its contents. Blocks; unpacks nothing to a disk.
 
     Raises:
         BadArchiveError: It is not a package's archive.
@@ -68,7 +68,7 @@ _TEXTS = (*MANIFESTS, requirements.FILE_NAME)
 
 
 def describe(tree: Tree, texts: dict[str, bytes], digest: str = "") -> Contents:
-    """Tell what a tree holds.
+    """Return the contents of a tree.
 
     Args:
         tree: All entries.
@@ -76,7 +76,7 @@ def describe(tree: Tree, texts: dict[str, bytes], digest: str = "") -> Contents:
         digest: See :attr:`Contents.digest`.
 
     Raises:
-        BadArchiveError: There is no manifest, it cannot be read, or it names another package.
+        BadArchiveError: The manifest is missing, cannot be read, or names another package.
     """
     package = _package(tree, texts)
     executables = tuple(_executables(tree, package))

@@ -1,4 +1,4 @@
-"""What can be wrong with a package.
+"""Errors of packages.
 
 ::
 
@@ -16,14 +16,14 @@ _SHOWN = 20
 
 
 class ArchiveError(Exception):
-    """Base of all that can be wrong with a package."""
+    """Base of all errors of packages."""
 
 
 class BadArchiveError(ArchiveError):
     """A folder or an archive cannot be a package.
 
     Attributes:
-        faults: All that is wrong with it, each with its place and what to do.
+        faults: Its faults, each with its place and what to do.
     """
 
     def __init__(self, faults: str | Iterable[str]) -> None:

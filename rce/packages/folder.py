@@ -1,4 +1,4 @@
-"""A package's folder on its owner's machine: what goes into the package, and what keeps it from being one."""
+"""A package's folder on its owner's machine: the files to pack, and the faults that prevent packing."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Source(NamedTuple):
 
 
 def look_into(folder: Path, version: str = "", limits: ArchiveLimits = DEFAULT_LIMITS) -> Source:
-    """Find out what a package's folder makes. Blocks.
+    """Inspect a package's folder. Blocks.
 
     Args:
         folder: Holds the manifest.
@@ -59,7 +59,7 @@ def look_into(folder: Path, version: str = "", limits: ArchiveLimits = DEFAULT_L
         limits: How large a package may be.
 
     Raises:
-        BadArchiveError: It cannot be one; all faults are told.
+        BadArchiveError: The folder cannot be packed; the error has all faults.
     """
     folder = folder.absolute()
     texts = _texts(folder, limits)

@@ -1,7 +1,7 @@
-"""What stays at home: a ``.rceignore`` in a package's folder, a pattern on each line.
+"""Files that are not packed: a ``.rceignore`` in a package's folder, with a pattern on each line.
 
 ``*.bag`` is any file or folder of such a name, ``/data`` one at the top only, ``maps/*.png`` a path from
-the top, ``build/`` a folder. Empty lines and lines that begin with ``#`` say nothing.
+the top, ``build/`` a folder. Empty lines and lines that begin with ``#`` are skipped.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Ignore:
         """Read a ``.rceignore``.
 
         Raises:
-            BadArchiveError: A line says something that is not understood.
+            BadArchiveError: A line is not a valid pattern.
         """
         patterns = [_Pattern((name,), anchored=False, folders_only=False) for name in ALWAYS]
         faults = []
@@ -59,10 +59,10 @@ class Ignore:
         return cls(patterns)
 
     def matches(self, parts: tuple[str, ...], *, is_folder: bool) -> bool:
-        """Tell whether a path stays at home.
+        """Return whether a path is ignored.
 
         Args:
             parts: From the package's folder.
-            is_folder: Whether it is a folder; what is in one that stays at home stays with it.
+            is_folder: Whether it is a folder; the contents of an ignored folder are ignored too.
         """
         return any(pattern.matches(parts, is_folder=is_folder) for pattern in self._patterns)

@@ -1,4 +1,4 @@
-"""How large a package may be; checked where it is packed, where it is kept and where it is unpacked."""
+"""Limits on the size of packages; checked where a package is packed, stored and unpacked."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What a package's ``requirements.txt`` may ask for.
+"""Rules for a package's ``requirements.txt``.
 
-Only distributions by name, from the index that the machine's operator chose: options, addresses and paths
-would have the machine fetch, or run, whatever somebody likes.
+It may name distributions only, from the index that the machine's operator chose: with options, addresses and
+paths, a user could have the machine fetch, or run, anything.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class Requirements(NamedTuple):
     """A ``requirements.txt`` that was read."""
 
     lines: tuple[str, ...]
-    """What may be installed, one distribution each."""
+    """The valid lines, one distribution each."""
     faults: tuple[str, ...]
-    """What may not, with the line's number."""
+    """The faults, with the number of the line."""
 
 
 def read_requirements(text: str) -> Requirements:

@@ -1,6 +1,6 @@
 """Keys and signatures: Ed25519, written in hex.
 
-``cryptography`` takes 4 MB: it is loaded by what first makes, reads or checks a key.
+``cryptography`` takes 4 MB: it is loaded when a key is first made, read or checked.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _ID_LENGTH = 16
 
 
 class SigningKey:
-    """A user's private key; does not show in logs."""
+    """A user's private key; hidden in logs."""
 
     def __init__(self, key: Ed25519PrivateKey) -> None:
         self._key = key
@@ -72,7 +72,7 @@ class SigningKey:
 
 
 def statement(user: str, name: str, version: str, sha256: str) -> bytes:
-    """What is signed of a package: whose it is, what it is, and the archive's SHA-256 in hex.
+    """Return the text to sign for a package: its owner, name and version, and the archive's SHA-256 in hex.
 
     None of them can hold a newline, so no two packages have the same statement.
     """
@@ -102,7 +102,7 @@ def verify(key: str, signature: str, signed: bytes) -> None:
 
 
 def key_id(key: str) -> str:
-    """Tell the short name of a public key.
+    """Return the short name of a public key.
 
     Raises:
         BadKeyError: It is not a public key.

@@ -1,4 +1,4 @@
-"""The files of a package, and the rules they keep: the same where it is packed and where it is unpacked."""
+"""The files of a package, and their rules: the same where it is packed and where it is unpacked."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _MAX_HOPS = 8
 
 
 class Kind(Enum):
-    """What an entry is."""
+    """The kind of an entry."""
 
     FILE = "file"
     FOLDER = "folder"
@@ -43,7 +43,7 @@ class Entry:
 
 
 class Tree:
-    """All entries of a package. They come in the order of their paths, folders before what is in them."""
+    """All entries of a package, in the order of their paths, folders before their contents."""
 
     def __init__(self, limits: ArchiveLimits = DEFAULT_LIMITS) -> None:
         self.entries: dict[str, Entry] = {}
@@ -80,7 +80,7 @@ class Tree:
             raise BadArchiveError(f"its files have more than {self._limits.unpacked} bytes")
 
     def finish(self) -> None:
-        """Check what can only be checked of the whole.
+        """Check the rules on the whole tree.
 
         Raises:
             BadArchiveError: It is empty, or a link leads nowhere or out of it.
@@ -123,7 +123,7 @@ class Tree:
         return ""
 
     def _follow(self, link: Entry) -> Entry | str:
-        """Find what a link leads to, step by step: a folder on the way may not be a link itself."""
+        """Find the target of a link, step by step: a folder on the way may not be a link itself."""
         if not link.target or posixpath.isabs(link.target):
             return f"it is a link to {link.target!r}; links must be relative and stay in the package"
         at = link.parts[:-1]
@@ -144,7 +144,7 @@ class Tree:
 
 
 def path_fault(path: str) -> str:
-    """Say what is wrong with a path; empty if nothing is."""
+    """Return the fault of a path; empty for a valid one."""
     for part in path.split("/"):
         if part in ("", ".", ".."):
             return "its path must be plain: no '..', nothing absolute"

@@ -1,4 +1,4 @@
-"""Lays a package out on a disk."""
+"""Unpacks a package to a disk."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ _FOLDER, _FILE, _EXECUTABLE = 0o755, 0o444, 0o555
 def unpack(file: BinaryIO, into: Path, limits: ArchiveLimits = DEFAULT_LIMITS) -> tuple[Tree, str]:
     """Unpack an archive. Blocks.
 
-    Files come out read-only and readable by everybody, never with another right: who may reach them is
-    up to the folder that they are in.
+    Files are always readable by all users and read-only: the permissions of the folder around them control
+    who may reach them.
 
     Args:
         file: The archive.
-        into: An empty folder that nobody else can change.
+        into: An empty folder that no other user can change.
         limits: How large it may be.
 
     Returns:
         As :func:`rce.packages.archive.read_archive`.
 
     Raises:
-        BadArchiveError: It is not a package's archive. What was unpacked until then is left behind.
+        BadArchiveError: It is not a package's archive. Files that were unpacked until then stay.
         OSError: It cannot be written.
     """
 
-    # A folder that an entry lies in is a folder that was made here, and not a link: Tree sees to that.
+    # The parent folder of an entry was made here and is not a link: Tree checks that.
     def write(entry: Entry, data: Iterator[bytes]) -> None:
         path = into / entry.path
         match entry.kind:

@@ -1,4 +1,4 @@
-"""Which version is the newest, and what a node means by the package it names."""
+"""Order of versions, and the parts of a package's name."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ VersionKey = tuple[bool, tuple[int, ...], bool, _Label, str]
 
 
 def split_package(text: str) -> tuple[str, str]:
-    """Split what a node names, ``NAME`` or ``NAME@VERSION``; without a version the second is empty."""
+    """Split a node's package, ``NAME`` or ``NAME@VERSION``; without a version the second part is empty."""
     name, _, version = text.partition("@")
     return name, version
 
 
 def version_key(version: str) -> VersionKey:
-    """Make a sort key: numbers count as numbers, and whatever has a label comes before all that have none.
+    """Make a sort key: numbers count as numbers, and versions with a label come before those without.
 
     Args:
         version: As :func:`rce.model.names.is_version` allows it.
@@ -34,5 +34,5 @@ def version_key(version: str) -> VersionKey:
 
 
 def newest(items: Iterable[T], version: Callable[[T], str]) -> T | None:
-    """Choose the newest: of releases the highest; of those with a label only if there is nothing else."""
+    """Return the newest version: the highest release; one with a label only if there are no releases."""
     return max(items, key=lambda item: version_key(version(item)), default=None)

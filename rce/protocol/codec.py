@@ -1,9 +1,8 @@
 """Writes messages as frames: a text frame, then a binary frame for each binary value in it.
 
-A binary frame is made as one ``bytes`` by a single ``join``. The other way, to give a WebSocket library the
-id and the payload as two fragments, saves that copy but costs a second frame header, a second write and a
-drain, and there are clients that do not put fragments together; copying 10 MB takes a small part of the time
-that sending it takes.
+A binary frame is made as one ``bytes`` by a single ``join``. Passing the id and the payload as two fragments
+to a WebSocket library would save that copy, but cost a second frame header, a second write and a drain, and
+some clients do not join fragments. Copying 10 MB takes a small part of the time that sending it takes.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ _encode = msgspec.json.Encoder().encode
 
 
 def _ids() -> Iterator[str]:
-    """Yield ids that no other process yields: 64 random bits and a count."""
+    """Yield ids that are unique among processes: 64 random bits and a count."""
     prefix = os.urandom(8).hex()
     return (f"{prefix}{number:016x}" for number in itertools.count(1))
 
@@ -56,7 +55,7 @@ def encode(message: ClientMessage) -> list[Frame]:
     """Write a message.
 
     Raises:
-        TypeError: It holds something that JSON cannot express.
+        TypeError: It holds a value that JSON cannot express.
     """
     if isinstance(message, DataMessage):
         return encode_data(message.i_tag, message.message_type, message.msg, message.msg_id, message.latch)
@@ -77,11 +76,11 @@ def encode_data(
         message_type: Message or service type.
         msg: The message as a JSON object that may hold binary values, or as binary as a whole.
         msg_id: Echoed in the answer to a service request.
-        latch: The source whose latched message it is; for peers that know of such only.
-        single: Write a message that is binary as a whole as one frame; for peers that agreed on it only.
+        latch: The source whose latched message it is; only for peers with that feature.
+        single: Write a message that is binary as a whole as one frame; only for peers with that feature.
 
     Raises:
-        TypeError: ``msg`` holds something that JSON cannot express.
+        TypeError: ``msg`` holds a value that JSON cannot express.
     """
     if isinstance(msg, _BINARY):
         if single and len(msg) <= MAX_PAYLOAD:
@@ -109,7 +108,7 @@ def encode_message(type_: str, data: Any) -> list[Frame]:
             word for them.
 
     Raises:
-        TypeError: It holds something that JSON cannot express, or a list of which only a part is binary.
+        TypeError: It holds a value that JSON cannot express, or a list of which only a part is binary.
     """
     binaries: list[Frame] = []
     data = _extract(data, binaries)

@@ -1,9 +1,9 @@
-"""What can be wrong with what a peer sent.
+"""Errors in messages of a peer.
 
 ::
 
     ProtocolError
-    +-- MessageError      a text frame is not a message, or a message holds something wrong
+    +-- MessageError      a text frame is not a message, or a message has a fault
     +-- AssemblyError     a binary frame, or a reference to one, is wrong
     +-- HandshakeError    an HTTP request or a WebSocket handshake is refused
 """
@@ -28,11 +28,11 @@ class MessageError(ProtocolError):
 
     Args:
         place: The key that is wrong; empty for the message as a whole.
-        problem: What is wrong there.
-        code: Which kind of fault that is.
+        problem: The fault.
+        code: The kind of the fault.
 
     Attributes:
-        faults: All that is wrong; never empty.
+        faults: The faults; never empty.
     """
 
     def __init__(self, place: str, problem: str, code: FaultCode = FaultCode.INVALID) -> None:
@@ -41,7 +41,7 @@ class MessageError(ProtocolError):
 
     @classmethod
     def of(cls, faults: Sequence[FieldFault]) -> Self:
-        """Make the error of what was found to be wrong."""
+        """Make the error from faults."""
         error = cls("", "; ".join(map(str, faults)))
         error.faults = tuple(faults)
         return error
@@ -63,7 +63,7 @@ class HandshakeError(ProtocolError):
     """
 
     def __init__(self, status: int, reason: str) -> None:
-        # It may quote bytes of the request that are not text, which could not be sent back.
+        # It may quote bytes of the request that are not text and cannot be sent back.
         reason = reason.encode("utf-8", "backslashreplace").decode()
         super().__init__(status, reason)
         self.status = status

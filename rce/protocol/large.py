@@ -1,4 +1,4 @@
-"""Reads data messages that :class:`~rce.protocol.stream.ProtocolStream` left to others; takes long."""
+"""Reads large data messages, which :class:`~rce.protocol.stream.ProtocolStream` does not parse; slow."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ def read_large(
     Args:
         text: The text frame.
         binaries: The binary values that came for it, by id.
-        address: Where it was taken to go.
+        address: The address that was found in it.
         limits: How much it may hold.
 
     Returns:
         The message, or the ids of the binary values that it refers to if none were given.
 
     Raises:
-        ProtocolError: It is not a data message, or goes somewhere else.
+        ProtocolError: It is not a data message, or has another address.
     """
     check_elements(text, max_elements=limits.max_elements, max_values=limits.max_values)
     value = parse_json(text)

@@ -1,6 +1,6 @@
 """The messages between a client and its robot endpoint, as types.
 
-What a client asks for is in :mod:`rce.model.requests`; :mod:`rce.protocol.requests` spells it as it is here.
+Requests of clients are in :mod:`rce.model.requests`; :mod:`rce.protocol.requests` has their spelling here.
 :mod:`rce.protocol.reading` makes messages from JSON and checks them, :mod:`rce.protocol.codec` writes them.
 Wire source: ``docs/protocol.md``.
 """
@@ -73,20 +73,20 @@ class CallId(NamedTuple):
 
 
 class ErrorReport(Struct, frozen=True, kw_only=True):
-    """``ER``: something that the client asked for failed."""
+    """``ER``: a request of the client failed."""
 
     problem: str
-    """What, without the call."""
+    """The fault, without the call."""
     call: CallId | None = None
     """The service call that failed."""
     path: Path = ()
-    """Where in a message the fault is."""
+    """The place of the fault in a message."""
     code: FaultCode | None = None
-    """Which kind of fault it is; None: not said."""
+    """The kind of the fault; None if it is not given."""
 
     @property
     def text(self) -> str:
-        """The words for people."""
+        """The text for users."""
         return self.problem if self.call is None else f"{self.call}: {self.problem}"
 
 

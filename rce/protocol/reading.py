@@ -1,7 +1,7 @@
-"""From JSON text to typed messages, with errors that name the place.
+"""Reads typed messages from JSON text, with errors that name the place.
 
-Data messages have a way of their own through msgspec's typed decoder, because they are nearly all the
-traffic; everything else, and everything that is wrong, takes the slow way that finds good words.
+Data messages, which are nearly all the traffic, take a fast path through msgspec's typed decoder. All other
+messages, and wrong ones, take the slow path, which gives better error texts.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class _DataFrame(Struct):
 
 
 class SerializedData(Struct):
-    """A data message that travels serialized, as its text frame tells it."""
+    """The text frame of a serialized data message."""
 
     i_tag: Name = field(name="iTag")
     message_type: MessageTypeName = field(name="type")
@@ -51,7 +51,7 @@ class SerializedData(Struct):
     msg_id: MessageId = field(name="msgID", default=NO_ID)
     latch: SourceName = ""
     msg: UnsetType = UNSET
-    """Must not be there beside ``msg*``."""
+    """Must not be given beside ``msg*``."""
 
 
 class _SerializedFrame(Struct):
@@ -95,7 +95,7 @@ def decode(text: str | bytes, *, max_depth: int = DEFAULT_LIMITS.max_depth) -> C
 
 
 def decode_data(text: str | bytes) -> DataMessage | None:
-    """Read a data message, the quick way. ``None``: it is another type or wrong, the slow way tells which."""
+    """Read a data message on the fast path. ``None``: another type, or wrong; the slow path finds out."""
     try:
         return _decode_data_frame(text).data
     except _DECODE_FAULTS:
@@ -103,7 +103,7 @@ def decode_data(text: str | bytes) -> DataMessage | None:
 
 
 def decode_serialized(text: str | bytes) -> SerializedData | None:
-    """Read a data message that is one binary value, the quick way. ``None``: take the slow way."""
+    """Read a data message that is one binary value on the fast path. ``None``: take the slow path."""
     stars = text.count('*"') if isinstance(text, str) else text.count(b'*"')
     escaped = "\\" in text if isinstance(text, str) else b"\\" in text
     if stars != 1 or escaped:
@@ -153,7 +153,7 @@ def check_depth(value: Any, max_depth: int) -> None:
 
 
 def check_request_size(value: Any, size: int, limit: int) -> None:
-    """Check the size of what is not a data message.
+    """Check the size of a message other than a data message.
 
     Raises:
         MessageError: Its text is longer than ``limit``.
@@ -181,7 +181,7 @@ def parse_json(text: str | bytes) -> Any:
     try:
         value = json.loads(text)
         if _ESCAPED_SURROGATE.search(text.encode(errors="replace") if isinstance(text, str) else text):
-            json.dumps(value, ensure_ascii=False).encode()  # Python reads halves of characters, too
+            json.dumps(value, ensure_ascii=False).encode()  # Python's decoder accepts lone surrogates
     except (ValueError, RecursionError) as error:
         raise MessageError("", f"not valid JSON: {error}") from error
     return value
@@ -223,7 +223,7 @@ def message_from_json(value: Any, accept: Collection[str] = TYPES) -> ClientMess
 
 
 def _convert(value: Any, cls: type[T], place: str) -> T:
-    """Convert with msgspec and give its complaint our words and our place."""
+    """Convert with msgspec; turn its error into one with this project's text and place."""
     try:
         return msgspec.convert(value, cls)
     except msgspec.ValidationError as error:

@@ -1,4 +1,4 @@
-"""How an ``ER`` is written: a text for people, and beside it the same as data for programs.
+"""The form of an ``ER``: a text for users, and the same as data for programs.
 
 ::
 
@@ -35,7 +35,7 @@ def read_report(text: str, fault: Any) -> ErrorReport:
 
     Args:
         text: Its ``data``.
-        fault: Its ``fault``; what is not understood of it is left out.
+        fault: Its ``fault``; unknown parts of it are left out.
     """
     if not isinstance(fault, dict):
         return ErrorReport(problem=text)

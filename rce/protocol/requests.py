@@ -1,4 +1,4 @@
-"""What clients ask for, as it is spelled in the messages ``CC``, ``RC``, ``DC``, ``CN`` and ``CX``.
+"""Requests of clients, as they are spelled in the messages ``CC``, ``RC``, ``DC``, ``CN`` and ``CX``.
 
 Wire source: ``docs/protocol.md``.
 """
@@ -50,7 +50,7 @@ SPELLING = Spelling(
     },
     below={CreateContainer: "containerData", ResizeContainer: "containerData"},
 )
-"""What the client protocol calls the fields."""
+"""The names of the fields in the client protocol."""
 
 _LISTS: dict[type[Request], dict[str, type[Item]]] = {
     ConfigureComponents: {
@@ -72,7 +72,7 @@ _MAX_FAULTS = 32
 
 
 def read_request(kind: str, data: Any) -> Request:
-    """Make a request of its type and its ``data``.
+    """Make a request from its type and its ``data``.
 
     Raises:
         MessageError: ``kind`` is not a request, or ``data`` as a whole is wrong. Wrong items of a ``CN`` or
@@ -101,13 +101,13 @@ def write_request(request: Request) -> dict[str, Any]:
 
 
 def kind_of(value: Any) -> str:
-    """Say what a JSON value is."""
+    """Return the kind of a JSON value."""
     names = {dict: "an object", list: "a list", str: "a string", bool: "a boolean", type(None): "null"}
     return names.get(type(value), "a number" if isinstance(value, int | float) else "binary")
 
 
 def _read_lists(data: dict[str, Any], lists: dict[str, type[Item]]) -> dict[str, Any]:
-    """Read each item of each list on its own, so that a bad one harms no other."""
+    """Read each item of each list on its own, so that a wrong one does not affect the others."""
     count = sum(len(items) for name in lists if isinstance(items := data.get(camel(name)), list))
     if count > _MAX_ITEMS:
         raise MessageError(

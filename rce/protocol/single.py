@@ -1,4 +1,4 @@
-"""A data message whose ``msg`` is binary as a whole, in one frame; for peers that agreed on it. Pure.
+"""A data message whose ``msg`` is binary as a whole, in one frame; for peers with that feature. Pure.
 
 ::
 
@@ -56,7 +56,7 @@ _DECODE_FAULTS = (msgspec.MsgspecError, UnicodeError, RecursionError)
 
 
 def prefix(header: bytes) -> bytes:
-    """Return everything that stands before the serialized message.
+    """Return the bytes before the serialized message.
 
     Args:
         header: ``data`` without ``msg`` as JSON, at most :data:`MAX_HEADER` bytes.
@@ -86,7 +86,7 @@ class SingleReader:
 
         Returns:
             The message; or, if its header is unusual or wrong, its ``data`` as if it had come as JSON, for
-            :func:`rce.protocol.reading.message_from_json` to read or to say what is wrong.
+            :func:`rce.protocol.reading.message_from_json` to read or to find its faults.
 
         Raises:
             ProtocolError: It has no header.
