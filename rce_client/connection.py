@@ -1,4 +1,4 @@
-"""A robot's, or any program's, connection to the engine: :class:`Connection`."""
+"""The connection of a robot or another program to the engine: :class:`Connection`."""
 
 from __future__ import annotations
 
@@ -24,27 +24,29 @@ __all__ = ["Connection", "State"]
 
 
 class Connection(Requests, OwnInterfaces):
-    """A connection that stays: it dials again when it breaks, and restores what the program had made.
+    """A lasting connection to the engine: it reconnects when it breaks, and restores the program's requests.
 
-    An async context manager. Entering waits for the engine without limit (put ``asyncio.timeout`` around it
-    for one); cancelling ends the attempt. Leaving sends what waits, for at most ``timing.flush`` seconds, and
-    closes; cancelled, it closes at once. What was made stays in the engine; :meth:`remove_all` removes it.
+    Use it as an async context manager. Entering waits for the engine without limit; use ``asyncio.timeout``
+    to set one. Cancelling ends the attempt. Leaving sends queued messages for at most ``timing.flush``
+    seconds, and closes the connection; if it is cancelled, it closes at once. Containers, interfaces and
+    other requested items stay in the engine; :meth:`remove_all` removes them.
 
-    Requests such as :meth:`create_container` return when they were handed to the network, or were noted for
-    the reconnect while there is no connection. The protocol has no answer for success; what fails comes as
-    an error text to ``on_error``. Cancelling a request does not take it back: it is sent, and remembered.
+    Requests such as :meth:`create_container` return when they were handed to the network. Without a
+    connection, they are stored and sent after the reconnect. The protocol does not confirm success; a failure
+    arrives as an error text at ``on_error``. Cancelling a request does not withdraw it: it is sent and
+    stored.
 
     Args:
         url: The master, ``http://HOST:9000/`` or ``https://``; several, in a list or separated by commas, are
-            asked in turn.
+            tried in turn.
         user_id: User ID.
         password: The user's password; only its SHA-256 is sent. Empty if there is a token.
         robot_id: Names this robot; one connection at a time.
-        token: The robot's own token (``rce robot add``), in place of the user's password.
+        token: The robot's own token (``rce robot add``), instead of the user's password.
         tls: TLS settings, or a function that returns them for each connection; the system's if None.
         on_error: Called with the text of every ``ER`` that belongs to no service call; must not block.
-            Without it the texts are logged.
-        on_state: Called with every new state and a few words; must not block.
+            Without it, the texts are logged.
+        on_state: Called with every new state and a short description; must not block.
         timing: Times in seconds and sizes in bytes.
         limits: How many messages and bytes may wait to be sent.
 
@@ -60,7 +62,7 @@ class Connection(Requests, OwnInterfaces):
         ```
 
     Raises:
-        RefusedError: On entering: the engine does not take this client.
+        RefusedError: On entering: the engine refuses this client.
     """
 
     def __init__(
@@ -85,13 +87,13 @@ class Connection(Requests, OwnInterfaces):
         self._session = Session(target, on_error=on_error, on_state=on_state, timing=timing, limits=limits)
 
     async def __aenter__(self) -> Self:
-        """Connect, and wait until it is done.
+        """Connect, and wait until the connection is established.
 
-        An engine that cannot be reached is waited for without limit; put ``asyncio.timeout`` around it for
-        one. Cancelling ends the attempt and leaves nothing behind.
+        It waits for an engine that cannot be reached without limit; use ``asyncio.timeout`` to set one.
+        Cancelling ends the attempt and leaves nothing behind.
 
         Raises:
-            RefusedError: The engine does not take this client.
+            RefusedError: The engine refuses this client.
         """
         await self._session.__aenter__()
         return self
@@ -102,16 +104,16 @@ class Connection(Requests, OwnInterfaces):
         exc: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Send what waits, for as long as ``timing.flush`` allows, then close.
+        """Send queued messages for at most ``timing.flush`` seconds, then close the connection.
 
-        What was made in the engine stays there. After an exception, and when it is cancelled, it closes
-        without sending what waits.
+        Requested items stay in the engine. After an exception, and when it is cancelled, it closes
+        without sending queued messages.
         """
         await self._session.__aexit__(exc_type, exc, traceback)
 
     @property
     def state(self) -> State:
-        """Where the connection is in its life."""
+        """The state of the connection."""
         return self._session.state
 
     @property
@@ -126,37 +128,38 @@ class Connection(Requests, OwnInterfaces):
 
     @property
     def active(self) -> Mapping[str, bool]:
-        """Own interface tags to whether they are joined with a peer."""
+        """Whether each own interface is connected to a peer, by interface tag."""
         return self._session.interfaces.active
 
     @property
     def dropped(self) -> Mapping[str, int]:
-        """Interface tag to the number of its messages that were dropped because its queue was full."""
+        """The number of messages dropped because a queue was full, by interface tag."""
         return self._session.transport.dropped
 
     @property
     def knows_sources(self) -> bool:
-        """Whether the engine takes the names of latched messages' sources."""
+        """Whether the engine accepts the names of latched messages' sources."""
         return self._session.knows_sources
 
     @property
     def takes_single_frames(self) -> bool:
-        """Whether the engine takes serialized messages in one frame."""
+        """Whether the engine accepts serialized messages in one frame."""
         return self._session.takes_single_frames
 
     # Requests
 
     async def request(self, request: Request) -> None:
-        """Send any request, and remember it for reconnects.
+        """Send any request, and store it for reconnects.
 
-        Returns when the request was handed to the network, or at once without a connection; it is sent after
-        the reconnect then. Cancelling stops the wait; the request is sent and remembered all the same.
+        It returns when the request was handed to the network. Without a connection it returns at once, and
+        the request is sent after the reconnect. Cancelling ends the wait; the request is
+        sent and stored anyway.
 
         Args:
             request: A request of :mod:`rce.model.requests`.
 
         Raises:
-            RefusedError: The engine refused this client for good.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
         Example:
@@ -169,12 +172,12 @@ class Connection(Requests, OwnInterfaces):
         await self._session.request(request)
 
     async def remove_all(self) -> None:
-        """Remove everything that was made through this connection.
+        """Remove everything that was requested through this connection.
 
-        Cancelling leaves a part of it; call it again to remove the rest.
+        Cancelling may leave a part of it; call it again to remove the rest.
 
         Raises:
-            RefusedError: The engine refused this client for good.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
         Example:
@@ -187,17 +190,17 @@ class Connection(Requests, OwnInterfaces):
             await self.request(request)
 
     async def repeat_requests(self) -> None:
-        """Ask again for everything that was made, because something that it needs may be there by now.
+        """Send all stored requests again, because something that they need may exist by now.
 
-        The engine accepts silently what is there already. Cancelling it changes nothing that was made.
+        The engine silently accepts requests for items that exist. Cancelling does not affect existing items.
 
         Raises:
-            RefusedError: The engine refused this client for good.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
         Example:
             ```python
-            await robot.connect("testRobot/say", "otherRobot/hear")  # which may come later
+            await robot.connect("testRobot/say", "otherRobot/hear")  # which may be created later
             await robot.repeat_requests()
             ```
         """
@@ -207,15 +210,15 @@ class Connection(Requests, OwnInterfaces):
     # Own interfaces
 
     async def wait_active(self, tag: str, timeout: float | None = None) -> None:
-        """Wait until an own interface is joined with a peer (``ST`` true); cancelling changes nothing.
+        """Wait until an own interface is connected to a peer (``ST`` true). Cancelling changes nothing.
 
         Args:
             tag: Interface tag.
-            timeout: Seconds; without limit if None.
+            timeout: Seconds; no limit if None.
 
         Raises:
-            TimeoutError: It is not joined after ``timeout`` seconds; the newest error texts are in the text.
-            RefusedError: The engine refused this client for good.
+            TimeoutError: It is not connected after ``timeout`` seconds; the text has the newest error texts.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
         Example:
@@ -228,12 +231,12 @@ class Connection(Requests, OwnInterfaces):
         await self._session.wait_active(tag, timeout)
 
     async def wait_refused(self) -> NoReturn:
-        """Wait until the engine refuses this client for good; any other loss is repaired meanwhile.
+        """Wait until the engine refuses this client permanently; after any other loss it reconnects.
 
-        For a program whose work is done by callbacks. Cancelling changes nothing.
+        For programs that work in callbacks. Cancelling changes nothing.
 
         Raises:
-            RefusedError: It did.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
         Example:
@@ -246,7 +249,7 @@ class Connection(Requests, OwnInterfaces):
             await self._session.until(lambda: False)
 
     def is_active(self, tag: str) -> bool:
-        """Return whether an interface is joined with a peer.
+        """Return whether an interface is connected to a peer.
 
         Example:
             ```python

@@ -4,14 +4,14 @@
 
     ClientError
     +-- RefusedError          the engine refuses the client; trying again does not help (credentials, version)
-    |   +-- UntrustedError    the engine's certificate is not trusted, or it offers no TLS where it must
+    |   +-- UntrustedError    the engine's certificate is not trusted, or it offers no TLS although it must
     +-- UnavailableError      the engine cannot be reached now; try again
     |   +-- InUseError        another client has this robotID
     |   +-- LostError         the connection broke
     +-- NotConnectedError     nothing can be sent now
-    +-- InterfaceError        an interface is used in a way that it does not allow
+    +-- InterfaceError        an interface does not support this use
     +-- CallError             a service call failed
-        +-- CallTimeoutError  ... no answer came in time
+        +-- CallTimeoutError  no answer arrived in time
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class RefusedError(ClientError):
 
     Attributes:
         status: HTTP status, 0 if there was no answer.
-        reason: What the engine said.
+        reason: The engine's explanation.
     """
 
     def __init__(self, status: int, reason: str) -> None:
@@ -39,7 +39,7 @@ class RefusedError(ClientError):
 
 
 class UntrustedError(RefusedError):
-    """The engine's certificate is not trusted, or it offers no TLS where it must.
+    """The engine's certificate is not trusted, or it offers no TLS although it must.
 
     No credential was sent. A client that was connected before keeps trying, as the operator can repair it.
     """
@@ -52,7 +52,7 @@ class UnavailableError(ClientError):
     """The engine cannot be reached or has no room now.
 
     Attributes:
-        reason: What happened.
+        reason: The cause.
         status: HTTP status, 0 if there was no answer.
     """
 
@@ -77,16 +77,16 @@ class LostError(UnavailableError):
 
 
 class NotConnectedError(ClientError):
-    """Nothing can be sent: there is no connection now, or it was closed."""
+    """Nothing can be sent: the connection is not established, or it was closed."""
 
 
 class InterfaceError(ClientError):
-    """An interface is used in a way that it does not allow."""
+    """An interface does not support this use."""
 
 
 class CallError(ClientError):
-    """A service call failed; the text is the engine's or the provider's."""
+    """A service call failed; the text comes from the engine or the provider."""
 
 
 class CallTimeoutError(CallError, TimeoutError):
-    """No answer to a service call came in time. The call may have been carried out."""
+    """No answer to a service call arrived in time. The service may have processed the call."""

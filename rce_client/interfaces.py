@@ -1,6 +1,6 @@
-"""What the interfaces of a program have in common; see :mod:`rce_client.topics`, :mod:`rce_client.services`.
+"""The base of a program's interfaces; see :mod:`rce_client.topics`, :mod:`rce_client.services`.
 
-Their names are the program's view. The engine names the same interface from its own side, so a
+They are named from the program's point of view, and by the engine from its own. A
 :class:`~rce_client.topics.Publisher` here is an engine ``SubscriberConverter`` (or ``SubscriberForwarder``).
 """
 
@@ -39,15 +39,15 @@ class InterfaceOwner(Protocol):
         """
 
     def is_active(self, tag: str) -> bool:
-        """Return whether an interface is joined with a peer."""
+        """Return whether an interface is connected to a peer."""
 
     @property
     def knows_sources(self) -> bool:
-        """Whether the engine takes the names of latched messages' sources."""
+        """Whether the engine accepts the names of latched messages' sources."""
 
     @property
     def takes_single_frames(self) -> bool:
-        """Whether the engine takes serialized messages in one frame."""
+        """Whether the engine accepts serialized messages in one frame."""
 
     def post_control(self, frames: Sequence[Frame]) -> bool:
         """Send a service message; return False if that is not possible now."""
@@ -56,20 +56,20 @@ class InterfaceOwner(Protocol):
         """Run a coroutine until the program closes the connection."""
 
     async def wait_active(self, tag: str, timeout: float | None = None) -> None:
-        """Wait until an interface is joined with a peer."""
+        """Wait until an interface is connected to a peer."""
 
     async def withdraw(self, interface: ClientInterface) -> None:
         """Remove an interface."""
 
 
 class LatchListener(Protocol[M_contra]):
-    """Takes the latched messages of a topic, for a program that latches them again."""
+    """Receives the latched messages of a topic, for a program that latches them again."""
 
     def received_latched(self, message: M_contra, source: str) -> None:
-        """Take a latched message, which replaces the last one of its source. Must not block."""
+        """Handle a latched message, which replaces the last one of its source. Must not block."""
 
     def keep_latched(self, sources: Sequence[str]) -> None:
-        """Forget what sources other than these latched: they ended."""
+        """Forget the messages of all sources except these: the others ended."""
 
 
 class ClientInterface(ABC):
@@ -83,7 +83,7 @@ class ClientInterface(ABC):
     """
 
     role: Role
-    """The engine's name for what this interface does."""
+    """The engine's name for the role of this interface."""
 
     def __init__(self, owner: InterfaceOwner, tag: str, message_type: str, *, raw: bool) -> None:
         self._owner = owner
@@ -104,14 +104,14 @@ class ClientInterface(ABC):
         return encode_data(self.tag, self.message_type, message, msg_id, latch, single=single)
 
     async def wait_active(self, timeout: float | None = None) -> None:
-        """Wait until the interface is joined with a peer; cancelling changes nothing.
+        """Wait until the interface is connected to a peer. Cancelling changes nothing.
 
         Args:
-            timeout: Seconds; without limit if None.
+            timeout: Seconds; no limit if None.
 
         Raises:
-            TimeoutError: It is not joined after ``timeout`` seconds; the newest error texts are in the text.
-            RefusedError: The engine refused this client for good.
+            TimeoutError: It is not connected after ``timeout`` seconds; the text has the newest error texts.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection.
 
         Example:
@@ -126,10 +126,10 @@ class ClientInterface(ABC):
     async def close(self) -> None:
         """Remove the interface and its connections.
 
-        Iterations over it end, and service calls fail. Cancelling does not take the removal back.
+        Iterations over it end, and service calls fail. Cancelling does not withdraw the removal.
 
         Raises:
-            RefusedError: The engine refused this client for good.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection.
 
         Example:

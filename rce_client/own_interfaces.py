@@ -1,4 +1,4 @@
-"""The interfaces of a robot's own, as methods that make them."""
+"""Methods that create a robot's own interfaces."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ InterfaceT = TypeVar("InterfaceT", bound="ClientInterface")
 Json = dict[str, Any]
 """A message as an object of its fields; binary values are bytes-like."""
 Serialized = bytes | bytearray | memoryview
-"""A serialized ROS message. One that was received is a memoryview of the frame it came in: not a copy."""
+"""A serialized ROS message. A received one is a memoryview of its frame, not a copy."""
 
 
 class OwnInterfaces:
-    """Makes a robot's publishers, subscribers, service clients and service providers.
+    """Creates a robot's publishers, subscribers, service clients and service providers.
 
-    The engine makes an interface a little later than these methods return, and keeps it until it is closed;
-    :meth:`rce_client.Connection.wait_active` waits until it is joined with a peer. What the engine refuses
-    comes as an error text to ``on_error``.
+    The engine creates an interface shortly after these methods return, and keeps it until it is closed.
+    :meth:`rce_client.Connection.wait_active` waits until it is connected to a peer. If the engine refuses an
+    interface, ``on_error`` gets an error text.
     """
 
     robot_id: str
@@ -42,19 +42,19 @@ class OwnInterfaces:
         self, tag: str, message_type: str, *, raw: Literal[True]
     ) -> Publisher[Serialized]: ...
     async def publisher(self, tag: str, message_type: str, *, raw: bool = False) -> Publisher[Any]:
-        """Make an interface of this robot that sends messages.
+        """Create an interface of this robot that sends messages.
 
-        Cancelling does not take the request back: the engine makes the interface. Call it again with the same
-        tag to get it.
+        Cancelling does not withdraw the request: the engine creates the interface. Call the method again with
+        the same tag to get it.
 
         Args:
             tag: Interface tag.
             message_type: Message type, ``package/Type``.
-            raw: Messages are serialized ROS messages (a Forwarder) in place of objects (a Converter).
+            raw: Messages are serialized ROS messages (a Forwarder) instead of objects (a Converter).
 
         Raises:
-            InterfaceError: This program has an interface of this tag already.
-            RefusedError: The engine refused this client for good.
+            InterfaceError: This program already has an interface with this tag.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
         Example:
@@ -98,23 +98,23 @@ class OwnInterfaces:
         queue_size: int = 64,
         latches: LatchListener[Any] | None = None,
     ) -> Subscriber[Any]:
-        """Make an interface of this robot that receives messages.
+        """Create an interface of this robot that receives messages.
 
-        Cancelling does not take the request back, as for :meth:`publisher`.
+        Cancelling does not withdraw the request, as for :meth:`publisher`.
 
         Args:
             tag: Interface tag.
             message_type: Message type, ``package/Type``.
-            callback: Takes the messages. A plain function must not block; a coroutine function is awaited
-                before the next message. Without a callback, iterate over the subscriber.
+            callback: Called with each message. A plain function must not block; a coroutine function is
+                awaited before the next message. Without a callback, iterate over the subscriber.
             raw: Messages are serialized ROS messages, as for :meth:`publisher`, each a memoryview.
-            queue_size: How many messages wait for a coroutine function or an iteration; then the oldest is
-                dropped.
-            latches: Takes the latched messages in place of the callback, if the engine tells which they are.
+            queue_size: How many messages may wait for a coroutine function or an iteration; a full queue
+                drops the oldest.
+            latches: Gets the latched messages instead of the callback, if the engine marks them.
 
         Raises:
-            InterfaceError: This program has an interface of this tag already.
-            RefusedError: The engine refused this client for good.
+            InterfaceError: This program already has an interface with this tag.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
         Example:
@@ -145,9 +145,9 @@ class OwnInterfaces:
         self, tag: str, message_type: str, *, raw: Literal[True]
     ) -> ServiceClient[Serialized]: ...
     async def service_client(self, tag: str, message_type: str, *, raw: bool = False) -> ServiceClient[Any]:
-        """Make an interface of this robot that calls a service.
+        """Create an interface of this robot that calls a service.
 
-        Cancelling does not take the request back, as for :meth:`publisher`.
+        Cancelling does not withdraw the request, as for :meth:`publisher`.
 
         Args:
             tag: Interface tag.
@@ -156,8 +156,8 @@ class OwnInterfaces:
                 are memoryviews.
 
         Raises:
-            InterfaceError: This program has an interface of this tag already.
-            RefusedError: The engine refused this client for good.
+            InterfaceError: This program already has an interface with this tag.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
         Example:
@@ -198,22 +198,23 @@ class OwnInterfaces:
         raw: bool = False,
         max_calls: int = 64,
     ) -> ServiceProvider[Any]:
-        """Make an interface of this robot that answers a service.
+        """Create an interface of this robot that answers a service.
 
-        Cancelling does not take the request back, as for :meth:`publisher`.
+        Cancelling does not withdraw the request, as for :meth:`publisher`.
 
         Args:
             tag: Interface tag.
             message_type: Service type, ``package/Type``.
-            handler: Takes a request and returns the answer. A plain function must not block; coroutine
-                functions run side by side. What it raises is logged, and its text is the caller's error.
+            handler: Called with a request; returns the answer. A plain function must not block; coroutine
+                functions run concurrently. Its exceptions are logged, and the caller gets their text as the
+                error.
             raw: Requests and answers are serialized ROS messages, as for :meth:`publisher`; received ones
                 are memoryviews.
-            max_calls: How many calls are answered at a time; callers of more get an error.
+            max_calls: How many calls are handled at the same time; further calls get an error.
 
         Raises:
-            InterfaceError: This program has an interface of this tag already.
-            RefusedError: The engine refused this client for good.
+            InterfaceError: This program already has an interface with this tag.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
         Example:

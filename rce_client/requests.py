@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 
 
 class Requests(ABC):
-    """Containers and what is in them; interfaces and connections of all endpoints of the user.
+    """Requests for containers and their contents, and for interfaces and connections of the user's endpoints.
 
-    Each method sends one request; what they have in common is said at :meth:`request`: when they return, what
-    they raise, and that cancelling does not take a request back.
+    Each method sends one request. :meth:`request` describes when they return, which errors they raise, and
+    that cancelling does not withdraw a request.
     """
 
     @abstractmethod
@@ -57,14 +57,15 @@ class Requests(ABC):
         special_features: Sequence[str] | str = (),
         wait: bool = False,
     ) -> None:
-        """Create a container; zero and empty: not requested.
+        """Create a container. Zero and empty values are not requested.
 
-        A container that is there already with the same data stays as it is. Cancelling does not take the
-        request back.
+        If the container exists with the same data, it is not changed. Cancelling does not withdraw the
+        request.
 
         Args:
-            tag: Names the container; the user's robots and containers differ in their tags.
-            size: Slots of its machine, 1 to 65536; they bring what the arguments below do not ask for.
+            tag: Name of the container, unique among the user's robots and containers.
+            size: Slots of its machine, 1 to 65536; their share is used for resources that are not requested
+                below.
             cpu: Processor cores: a number, or a text in percent of one core (``"50%"``).
             memory: MB (2^20 bytes): a number, or a text with a unit (``"256M"``, ``"1G"``, ``"512MiB"``); the
                 prefixes are powers of 1024.
@@ -73,17 +74,17 @@ class Requests(ABC):
             network: ``"none"``: its own loopback only; ``"group"``: also the containers of the same group;
                 ``"host"``: the machine's own network, for administrators. By default ``"group"`` if
                 ``group_ip`` is given, else ``"none"``.
-            group: The group; its containers are put together on one machine where that is possible.
+            group: The group; its containers are placed on one machine if possible.
             group_ip: IPv4 address in the group's network, such as ``"10.0.0.2"`` (which means
                 ``"10.0.0.2/24"``); a free one if empty.
             image: Root file system: an OCI image's name, or (administrators) the path of a folder.
             special_features: Labels that the machine must have: a sequence, or one text of words.
-            wait: If no machine has room, wait for one; otherwise that is an error text, and no container is
+            wait: Wait if no machine has room; otherwise ``on_error`` gets an error text, and no container is
                 created.
 
         Raises:
-            ValueError: An argument cannot be read; the text says which, and what would be right.
-            RefusedError: The engine refused this client for good.
+            ValueError: An argument is invalid; the text names it and the expected value.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
         Example:
@@ -117,10 +118,10 @@ class Requests(ABC):
         memory: Quantity | None = None,
         bandwidth: Quantity | None = None,
     ) -> None:
-        """Change what a container may use, while it runs.
+        """Change the resources of a container while it runs.
 
-        If its machine has no room for it, an error text says so and nothing changes. Cancelling does not take
-        the request back.
+        If its machine has no room, ``on_error`` gets an error text and nothing changes. Cancelling does not
+        withdraw the request.
 
         Args:
             tag: The container.
@@ -131,8 +132,8 @@ class Requests(ABC):
                 the request.
 
         Raises:
-            ValueError: An argument cannot be read; the text says which, and what would be right.
-            RefusedError: The engine refused this client for good.
+            ValueError: An argument is invalid; the text names it and the expected value.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
         Example:
@@ -146,13 +147,13 @@ class Requests(ABC):
     async def destroy_container(self, tag: str) -> None:
         """Remove a container with its nodes, interfaces and connections.
 
-        Cancelling does not take the request back.
+        Cancelling does not withdraw the request.
 
         Args:
             tag: The container.
 
         Raises:
-            RefusedError: The engine refused this client for good.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
         Example:
@@ -180,28 +181,28 @@ class Requests(ABC):
         heartbeat: str = "",
         heartbeat_timeout: float = 5.0,
     ) -> None:
-        """Start a node. Cancelling does not take the request back.
+        """Start a node. Cancelling does not withdraw the request.
 
         Args:
             container: Tag of the container.
-            tag: Names the node in the container.
-            pkg: Package, or ``NAME@VERSION`` for a version of a package that the user brought.
+            tag: Name of the node, unique in the container.
+            pkg: Package, or ``NAME@VERSION`` for a version of a package that the user pushed.
             exe: A file in the package.
             args: Its command line, split into words as a shell does; ``$(find PKG)`` becomes a package's
                 folder and ``$(env VAR)`` a variable.
             name: ROS name, if it differs from the node's own.
             namespace: ROS namespace, such as ``"/Robot1"``.
-            restart: When it is started again after it ended by itself: ``"never"``, ``"on-failure"`` or
+            restart: When it is restarted after it ended by itself: ``"never"``, ``"on-failure"`` or
                 ``"always"``.
-            max_restarts: How often in a row; 0 for no limit.
+            max_restarts: Restarts in a row; 0 for no limit.
             after: Tags of nodes of the container that must be ready before it starts.
-            heartbeat: A topic that it publishes as long as it is well.
+            heartbeat: A topic on which the node publishes while it works.
             heartbeat_timeout: Seconds of silence of that topic after which the node counts as stuck, 0.1 to
                 86400.
 
         Raises:
-            ValueError: An argument cannot be read; the text says which, and what would be right.
-            RefusedError: The engine refused this client for good.
+            ValueError: An argument is invalid; the text names it and the expected value.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
         Example:
@@ -227,14 +228,14 @@ class Requests(ABC):
         await self.request(ConfigureComponents(add_nodes=(PLAIN.read(AddNode, given),)))
 
     async def remove_node(self, container: str, tag: str) -> None:
-        """Stop a node. Cancelling does not take the request back.
+        """Stop a node. Cancelling does not withdraw the request.
 
         Args:
             container: Tag of the container.
             tag: The node.
 
         Raises:
-            RefusedError: The engine refused this client for good.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
         Example:
@@ -246,16 +247,16 @@ class Requests(ABC):
         await self.request(ConfigureComponents(remove_nodes=(node,)))
 
     async def set_parameter(self, container: str, name: str, value: Value) -> None:
-        """Set a ROS parameter of a container. Cancelling does not take the request back.
+        """Set a ROS parameter of a container. Cancelling does not withdraw the request.
 
         Args:
             container: Tag of the container.
             name: ROS name, such as ``"limits/speed"``.
-            value: A number, a boolean, a text or a list of these; a text may hold ``$(find PKG)`` and
+            value: A number, a boolean, a text or a list of these; a text may contain ``$(find PKG)`` and
                 ``$(env VAR)``.
 
         Raises:
-            RefusedError: The engine refused this client for good.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
         Example:
@@ -267,14 +268,14 @@ class Requests(ABC):
         await self.request(ConfigureComponents(set_param=(parameter,)))
 
     async def delete_parameter(self, container: str, name: str) -> None:
-        """Delete a ROS parameter of a container. Cancelling does not take the request back.
+        """Delete a ROS parameter of a container. Cancelling does not withdraw the request.
 
         Args:
             container: Tag of the container.
             name: ROS name, as given to :meth:`set_parameter`.
 
         Raises:
-            RefusedError: The engine refused this client for good.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
         Example:
@@ -290,23 +291,23 @@ class Requests(ABC):
     async def add_interface(
         self, endpoint: str, tag: str, interface_type: str, message_type: str, *, addr: str = ""
     ) -> None:
-        """Make an interface of a container or a robot. Cancelling does not take the request back.
+        """Create an interface of a container or a robot. Cancelling does not withdraw the request.
 
-        For this robot's own interfaces there are :meth:`rce_client.Connection.publisher`,
+        For this robot's own interfaces use :meth:`rce_client.Connection.publisher`,
         :meth:`~rce_client.Connection.subscriber`, :meth:`~rce_client.Connection.service_client` and
         :meth:`~rce_client.Connection.service_provider`.
 
         Args:
             endpoint: Tag of the container or robot.
-            tag: Names the interface.
-            interface_type: What the engine does there, and in which form: ``Publisher``, ``Subscriber``,
+            tag: Name of the interface, unique at the endpoint.
+            interface_type: The engine's role and form at this end: ``Publisher``, ``Subscriber``,
                 ``ServiceClient`` or ``ServiceProvider``, then ``Interface`` (in a container), ``Converter``
                 or ``Forwarder`` (at a robot), such as ``"PublisherInterface"``.
             message_type: Message or service type, ``package/Type``.
             addr: ROS name of the topic or service; containers need it.
 
         Raises:
-            RefusedError: The engine refused this client for good.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
         Example:
@@ -320,14 +321,14 @@ class Requests(ABC):
         await self.request(ConfigureComponents(add_interfaces=(interface,)))
 
     async def remove_interface(self, endpoint: str, tag: str) -> None:
-        """Remove an interface and its connections. Cancelling does not take the request back.
+        """Remove an interface and its connections. Cancelling does not withdraw the request.
 
         Args:
             endpoint: Tag of the container or robot.
             tag: The interface.
 
         Raises:
-            RefusedError: The engine refused this client for good.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
         Example:
@@ -339,14 +340,14 @@ class Requests(ABC):
         await self.request(ConfigureComponents(remove_interfaces=(interface,)))
 
     async def connect(self, a: str, b: str) -> None:
-        """Connect two interfaces. Cancelling does not take the request back.
+        """Connect two interfaces. Cancelling does not withdraw the request.
 
         Args:
-            a: One of them, ``ENDPOINT/INTERFACE``.
-            b: The other; which is named first means nothing.
+            a: One interface, ``ENDPOINT/INTERFACE``.
+            b: The other interface; the order does not matter.
 
         Raises:
-            RefusedError: The engine refused this client for good.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
         Example:
@@ -357,14 +358,14 @@ class Requests(ABC):
         await self.request(ConfigureConnections(connect=(Connection(tag_a=a, tag_b=b),)))
 
     async def disconnect(self, a: str, b: str) -> None:
-        """Remove the connection of two interfaces. Cancelling does not take the request back.
+        """Remove the connection of two interfaces. Cancelling does not withdraw the request.
 
         Args:
-            a: One of them, ``ENDPOINT/INTERFACE``.
-            b: The other; which is named first means nothing.
+            a: One interface, ``ENDPOINT/INTERFACE``.
+            b: The other interface; the order does not matter.
 
         Raises:
-            RefusedError: The engine refused this client for good.
+            RefusedError: The engine refused this client permanently.
             NotConnectedError: The program closed the connection, or has not opened it yet.
 
         Example:

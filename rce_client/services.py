@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 M = TypeVar("M")
-"""What messages look like: ``dict[str, Any]`` with a converter, bytes-like with a forwarder."""
+"""The type of messages: ``dict[str, Any]`` with a converter, bytes-like with a forwarder."""
 
 
 class ServiceClient(ClientInterface, Generic[M]):
-    """Calls a service; made by :meth:`rce_client.Connection.service_client`. Calls run side by side.
+    """Calls a service; created by :meth:`rce_client.Connection.service_client`. Calls run concurrently.
 
     Example:
         ```python
@@ -45,7 +45,7 @@ class ServiceClient(ClientInterface, Generic[M]):
     async def __call__(self, request: M, timeout: float = 30.0) -> M:
         """Call the service and return the answer.
 
-        Cancelling stops the wait; the service may still carry the call out.
+        Cancelling ends the wait; the service may still process the call.
 
         Args:
             request: The request.
@@ -53,8 +53,8 @@ class ServiceClient(ClientInterface, Generic[M]):
 
         Raises:
             NotConnectedError: There is no connection; the request was not sent.
-            CallError: The engine or the provider says why it failed, or the connection broke.
-            CallTimeoutError: No answer in time.
+            CallError: The call failed, with the text of the engine or the provider, or the connection broke.
+            CallTimeoutError: No answer arrived in time.
             TypeError: The request cannot be written as JSON.
         """
         msg_id = uuid.uuid4().hex
@@ -90,7 +90,7 @@ class ServiceClient(ClientInterface, Generic[M]):
         return next((call for call in calls if text.startswith(f"{call}: ")), None)
 
     def on_lost(self) -> None:
-        """Fail all calls; whether they were carried out is not known."""
+        """Fail all calls; they may have been processed."""
         for answer in self._calls.values():
             if not answer.done():
                 answer.set_exception(CallError(f"{self.tag}: the connection broke before the answer came"))
@@ -101,9 +101,9 @@ class ServiceClient(ClientInterface, Generic[M]):
 
 
 class ServiceProvider(ClientInterface, Generic[M]):
-    """Answers calls with a handler; made by :meth:`rce_client.Connection.service_provider`.
+    """Answers calls with a handler; created by :meth:`rce_client.Connection.service_provider`.
 
-    Calls run side by side. A call whose connection breaks, or that the program closes, is cancelled.
+    Calls run concurrently. They are cancelled when the connection breaks or the provider is closed.
     """
 
     role = Role.SERVICE_CLIENT
@@ -133,7 +133,7 @@ class ServiceProvider(ClientInterface, Generic[M]):
         task.add_done_callback(self._calls.discard)
 
     def on_fault(self, msg_id: str, text: str) -> None:
-        """Answer a request that cannot be read."""
+        """Answer an unreadable request with an error."""
         self._answer(msg_id, f"the robot could not read the request: {text}")
 
     def on_lost(self) -> None:

@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 M = TypeVar("M")
-"""What messages look like: ``dict[str, Any]`` with a converter, bytes-like with a forwarder."""
+"""The type of messages: ``dict[str, Any]`` with a converter, bytes-like with a forwarder."""
 
 
 class Publisher(ClientInterface, Generic[M]):
-    """Sends messages on a topic; made by :meth:`rce_client.Connection.publisher`.
+    """Sends messages on a topic; created by :meth:`rce_client.Connection.publisher`.
 
-    The last latched message of each source is kept, and sent again whenever the interface is joined with a
-    peer; the engine gives it to the peers that come later.
+    It keeps the last latched message of each source, and sends it again whenever the interface is
+    connected to a peer. The engine sends it to peers that connect later.
     """
 
     role = Role.SUBSCRIBER
@@ -39,17 +39,17 @@ class Publisher(ClientInterface, Generic[M]):
         self._latched: dict[str, M] = {}
 
     def publish(self, message: M, *, latch: str = "") -> bool:
-        """Send a message; never waits.
+        """Send a message. It never waits.
 
         Args:
             message: The message.
-            latch: Keep it for subscribers that come later, in place of the last one of this name. A program
-                that publishes for itself needs only one name, such as ``"1"``; at most 64 characters.
+            latch: Name of a source, at most 64 characters: keep the message for later subscribers, instead
+                of the last one of this source. Most programs need only one name, such as ``"1"``.
 
         Returns:
-            False if there is no connection now, and the message was not sent; a latched one is sent when the
-            interface is joined with a peer. A slow connection drops the oldest queued messages, which
-            :attr:`rce_client.Connection.dropped` counts.
+            False if there is no connection and the message was not sent; a latched message is sent when the
+            interface is connected to a peer. On a slow connection the oldest queued messages are dropped;
+            :attr:`rce_client.Connection.dropped` counts them.
 
         Raises:
             TypeError: The message cannot be written as JSON.
@@ -67,10 +67,10 @@ class Publisher(ClientInterface, Generic[M]):
         return self._owner.is_active(self.tag) and self._post(message, latch)
 
     def keep_latched(self, sources: Sequence[str]) -> None:
-        """Take back what was latched under all names but these.
+        """Withdraw the latched messages of all sources except these.
 
         Args:
-            sources: The names, as given to :meth:`publish`.
+            sources: The names of sources, as given to :meth:`publish`.
 
         Example:
             ```python
@@ -86,7 +86,7 @@ class Publisher(ClientInterface, Generic[M]):
             self._owner.post_data(self.tag, encode(known), "")
 
     def on_active(self) -> None:
-        """Send again what is latched: the engine may have forgotten it, or never known."""
+        """Send the latched messages again: the engine may not have them."""
         for source, message in self._latched.items():
             self._post(message, source)
         self.keep_latched(tuple(self._latched))
@@ -103,9 +103,10 @@ class Publisher(ClientInterface, Generic[M]):
 class Subscriber(ClientInterface, Generic[M]):
     """Receives messages of a topic, by a callback or with ``async for``.
 
-    Made by :meth:`rce_client.Connection.subscriber`. A plain callback runs as messages come and must not
-    block. Without a callback, or with an ``async`` one, messages wait in a queue of ``queue_size``; when it
-    is full the oldest message is dropped and counted in :attr:`dropped`. What a callback raises is logged.
+    Created by :meth:`rce_client.Connection.subscriber`. A plain callback runs as messages arrive and must not
+    block. Without a callback, or with an ``async`` one, messages wait in a queue of ``queue_size``. If it
+    is full, the oldest message is dropped and counted in :attr:`dropped`. Exceptions of a
+    callback are logged.
 
     Example:
         ```python
@@ -136,7 +137,7 @@ class Subscriber(ClientInterface, Generic[M]):
         self._filled = asyncio.Event()
         self._closed = False
         self.dropped = 0
-        """How many messages were dropped because the queue was full."""
+        """The number of messages dropped because the queue was full."""
         is_async = callback is not None and inspect.iscoroutinefunction(inspect.unwrap(callback))
         self._direct = callback is not None and not is_async
         self._pump = owner.spawn(self._feed()) if is_async else None
@@ -169,7 +170,7 @@ class Subscriber(ClientInterface, Generic[M]):
     async def __aiter__(self) -> AsyncIterator[M]:
         """Yield messages until the program closes the subscriber or the connection.
 
-        A connection that breaks and comes back does not end it. Cancelling loses no message: iterate again.
+        The iteration continues after a reconnection. Cancelling loses no message: iterate again.
 
         Raises:
             InterfaceError: The subscriber has a callback.
