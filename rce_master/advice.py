@@ -1,6 +1,6 @@
-"""Advice in words: which containers are too small or too large, which machines too full. Pure.
+"""Advice for users: which containers are too small or too large, which machines too full. Pure.
 
-Every piece names what was seen and the command that mends it.
+Every piece names the observation and the command that fixes the problem.
 """
 
 from __future__ import annotations
@@ -23,12 +23,11 @@ if TYPE_CHECKING:
 THROTTLED = 0.1
 """A container that is held back by its CPU limit for more than this share of the time is too small."""
 NEARLY_FULL = 0.9
-"""A container that uses more than this share of its memory is too small; a machine of which more than this
-is promised is too full."""
+"""Share of memory: a container that uses more is too small; a machine that has promised more is too full."""
 HARDLY_USED = 0.25
-"""A container that never used this share of what it asked for is too large."""
+"""A container that never used this share of its request is too large."""
 OBSERVED_S = 300.0
-"""For so long it must have been watched to be called too large."""
+"""Seconds of observation before a container can count as too large."""
 _SOON_S = 20.0
 _MEMORY_STEP = 16 * MEGABYTE
 _CORES_STEP = 0.05
@@ -44,13 +43,13 @@ class Advice(NamedTuple):
 
 
 def for_container(tag: str, requested: Resources, history: History, room: Room | None) -> list[Advice]:
-    """Tell whether a container should be resized.
+    """Return advice on whether a container should be resized.
 
     Args:
         tag: The container's.
-        requested: What it asked for.
-        history: What it consumed.
-        room: Its machine, to tell whether there is room to grow; None if it is not known.
+        requested: Its request.
+        history: Its usage.
+        room: Its machine, to find out whether it has room to grow; None if unknown.
     """
     return [*_too_small(tag, requested, history, room), *_too_large(tag, requested, history)]
 
@@ -124,7 +123,7 @@ def _too_large(tag: str, requested: Resources, history: History) -> Iterator[Adv
 
 
 def for_machine(room: Room, others: list[Room]) -> list[Advice]:
-    """Tell whether a machine is too full.
+    """Return advice on whether a machine is too full.
 
     Args:
         room: The machine.

@@ -1,4 +1,4 @@
-"""Where robots' logins and requests arrive and are answered."""
+"""Answers robots' logins and requests."""
 
 from __future__ import annotations
 
@@ -49,18 +49,18 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 MAX_PENDING = 1000
-"""Requests in work at the same time; beyond it, the channels they come by wait."""
+"""Concurrent requests; beyond it, their channels wait."""
 MAX_TOGETHER = 200
-"""Commands of one request that are done in one go; between the parts of a larger one come those of others."""
+"""Commands of one request that are done in one batch; other requests run between the batches."""
 MAX_LOGINS = 4096
-"""Logins in work; beyond it robots are told to try later. Nothing else waits for a login that is put off."""
+"""Concurrent logins; beyond it robots are told to try later. A delayed login blocks no other work."""
 
 _UNAUTHORIZED, _FORBIDDEN, _CONFLICT, _TOO_MANY, _UNAVAILABLE = 401, 403, 409, 429, 503
 
 
 @dataclass(eq=False, slots=True)
 class _PendingLogin:
-    """A login in work."""
+    """A login in progress."""
 
     process: str
     id: str
@@ -69,10 +69,10 @@ class _PendingLogin:
 
 
 class ControlHandler:
-    """Takes what task sets send: reports go on to the reconciler, questions are answered here.
+    """Handles the messages of task sets: passes reports to the reconciler, and answers questions.
 
-    Reports and requests are taken in the order of arrival; answers wait for the store without holding up what
-    comes after them.
+    Reports and requests are taken in the order of arrival; answers wait for the store without delaying later
+    messages.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class ControlHandler:
             await asyncio.Event().wait()
 
     async def on_hello(self, peer: Peer, hello: Hello) -> None:
-        """Take a task set that connected."""
+        """Handle a task set that connected."""
         await self._reconciler.on_hello(peer, hello)
 
     async def on_gone(self, peer: Peer) -> None:
@@ -108,7 +108,7 @@ class ControlHandler:
         await self._reconciler.on_gone(peer)
 
     async def on_message(self, peer: Peer, message: ToMaster) -> None:
-        """Take a message of a task set."""
+        """Handle a message of a task set."""
         process = peer.process
         match message:
             case Login():
@@ -140,7 +140,7 @@ class ControlHandler:
         try:
             await work
         except Exception:  # noqa: BLE001 - logged
-            # A fault of ours in one answer; its asker runs into a timeout, everybody else continues.
+            # A bug in one answer; its asker runs into a timeout, all others continue.
             _log.exception("could not answer")
 
     # Logins
@@ -198,11 +198,11 @@ class ControlHandler:
         return LoginReply(request=login.request, status=status, reason=reason)
 
     async def _admission(self, process: str, id_: str, login: Login) -> commands.RobotLogin:
-        """Check what a robot shows; return the command that lets it in.
+        """Check a robot's credentials; return the command that admits it.
 
         Raises:
-            AuthError: It is not right, or cannot be checked now.
-            ForbiddenError: It is right, and not for this.
+            AuthError: The credentials are wrong, or cannot be checked now.
+            ForbiddenError: The credentials are correct, but not for this robot or purpose.
         """
         if not login.token:
             user = await self._authenticator.verify(login.user, login.password, login.address)
@@ -217,17 +217,17 @@ class ControlHandler:
         return commands.RobotLogin(process=process, id=id_, credential=token.digest)
 
     def _probe_previous(self, process: str, id_: str) -> None:
-        """Look after a robot that wants to come in while it is connected at another task set.
+        """Probe the former connection of a robot that logs in while it is connected at another task set.
 
-        Its former connection may be dead without anybody having noticed; then the robot's next attempt finds
-        its place free, and not only after the WebSocket's own pings gave up.
+        The former connection may be dead but not yet detected. The probe frees the robot's place for its next
+        attempt, before the WebSocket's own pings time out.
         """
         robot = self._state_service.tables.robot(id_)
         if robot is not None and robot.task_set != process:
             self._reconciler.probe(id_)
 
     def _note_leaving(self, process: str, message: ToMaster) -> None:
-        """A robot may go before its login is done; its session must not stay connected indefinitely then."""
+        """Note a robot that left before its login is done: its session must not stay connected."""
         if not isinstance(message, Left):
             return
         for pending_login in self._logins:

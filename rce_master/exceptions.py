@@ -1,4 +1,4 @@
-"""What can go wrong in the master.
+"""The errors of the master.
 
 ::
 
@@ -35,41 +35,41 @@ class MasterError(Exception):
 
 
 class RefusedError(MasterError):
-    """A request was not done and nothing was changed by it.
+    """A request was refused and changed nothing.
 
     Attributes:
-        status: The HTTP status that tells the same.
+        status: The matching HTTP status.
     """
 
     status = 400
 
 
 class InvalidRequestError(RefusedError):
-    """The request can never be done like this."""
+    """The request is invalid."""
 
     status = 422
 
 
 class NotFoundError(RefusedError):
-    """The request names something that is not there."""
+    """The request names an object that does not exist."""
 
     status = 404
 
 
 class ConflictError(RefusedError):
-    """The request contradicts what is there."""
+    """The request conflicts with the present state."""
 
     status = 409
 
 
 class LimitReachedError(RefusedError):
-    """There are too many of the kind already."""
+    """The maximum number of objects of this kind is reached."""
 
     status = 409
 
 
 class NoRoomError(RefusedError):
-    """No machine, or not its own, has enough of what a container asks for."""
+    """No machine, or not the container's own one, has the resources that it asks for."""
 
     status = 409
 
@@ -81,16 +81,16 @@ class ForbiddenError(RefusedError):
 
 
 class BusyError(RefusedError):
-    """Too much of the kind is done just now."""
+    """Too many requests of this kind are in progress."""
 
     status = 503
 
 
 class TooMuchError(RefusedError):
-    """A user asks too much at a time.
+    """A user exceeds their rate of requests.
 
     Attributes:
-        retry_after: Seconds after which it can be tried again.
+        retry_after: Seconds until the next attempt.
     """
 
     status = 429
@@ -101,18 +101,18 @@ class TooMuchError(RefusedError):
 
 
 class AuthError(MasterError):
-    """Somebody could not prove who they are."""
+    """Authentication failed."""
 
 
 class WrongCredentialsError(AuthError):
-    """Unknown user, wrong password, unknown or expired token: deliberately not told apart."""
+    """Unknown user, wrong password, unknown or expired token: deliberately not distinguished."""
 
 
 class TooManyFailuresError(AuthError):
     """Too many wrong passwords for this user from this address.
 
     Attributes:
-        retry_after: Seconds until the next attempt is looked at.
+        retry_after: Seconds until the next attempt is checked.
     """
 
     def __init__(self, retry_after: float) -> None:
@@ -146,10 +146,10 @@ class StoreBusyError(StoreError):
 
 
 class StaleTermError(StoreError):
-    """Another master has begun a newer term: this one must write no more.
+    """Another master has begun a newer term: this one must not write any more.
 
     Args:
-        term: In which it was to be written.
+        term: The term of the refused write.
         newest: The newest term of the store.
     """
 
@@ -166,4 +166,4 @@ class StaleTermError(StoreError):
 
 
 class TaskSetAwayError(MasterError):
-    """The task set that is to be asked is not connected, or did not answer in time."""
+    """The task set to ask is not connected, or did not answer in time."""

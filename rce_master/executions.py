@@ -1,4 +1,4 @@
-"""Brings users who run commands in containers together with the task sets that dial for them."""
+"""Connects users who run commands in containers with the task sets that dial for them."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from rce_master.reconciler import Peer
 
 DIAL_S = 10.0
-"""How long a task set may take to dial."""
+"""Seconds that a task set may take to dial."""
 PER_USER = 32
-"""Commands of one user that run at the same time."""
+"""Commands of one user that may run at the same time."""
 
 
 class _Waiting:
@@ -45,7 +45,7 @@ class Executions:
 
     @contextlib.asynccontextmanager
     async def open(self, peer: Peer, id_: str, command: Command) -> AsyncIterator[ServerConnection]:
-        """Have a task set run a command; gives the connection that carries the run's frames.
+        """Have a task set run a command; provide the connection that carries the run's frames.
 
         Args:
             peer: The container's task set.
@@ -54,7 +54,7 @@ class Executions:
 
         Raises:
             LimitReachedError: The container's user runs too many commands already.
-            TaskSetAwayError: The task set cannot do it, or did not dial in time.
+            TaskSetAwayError: The task set does not support it, or did not dial in time.
         """
         tag = id_.partition("/")[2]
         if FEATURE not in peer.features:
@@ -83,7 +83,7 @@ class Executions:
                 del self._running[user]
 
     async def arrived(self, run: str, socket: ServerConnection) -> None:
-        """Take the connection that a task set dialed; returns when the run has ended (for the server)."""
+        """Handle a connection that a task set dialed; return when the run has ended (for the server)."""
         waiting = self._waiting.get(run)
         if waiting is None or waiting.arrived.done():
             return

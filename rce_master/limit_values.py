@@ -1,4 +1,4 @@
-"""Reads what people write for a user's limits (pure)."""
+"""Reads the texts of a user's limits (pure)."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 DEFAULT = "default"
-"""As for all users."""
+"""The text for the limit of all users."""
 _MOST = 10**9
 
 
 def read_limit(kind: str, value: object) -> float | None:
-    """Return a limit as a number; None for that of all users.
+    """Return a limit as a number; None for the limit of all users.
 
     Args:
         kind: One of :data:`rce_master.state.limits.KINDS`.
@@ -46,7 +46,7 @@ def _count(value: object) -> float:
 
 
 _DIGITS = 20
-"""Python reads no more than 4300; the largest limit has fewer."""
+"""Maximum number of digits. Python reads at most 4300; the largest limit has fewer."""
 _READERS: dict[str, Callable[[object], float]] = {
     "cpu": read_cores,
     "memory": read_memory,

@@ -1,4 +1,4 @@
-"""Finds logs where they are: at the machine of a container, or wherever it lived before."""
+"""Finds logs at the machine of a container, or at its earlier machines."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rce_master.state.tables import Tables
 
 
 class LogReader(Protocol):
-    """A connected task set, as far as its logs go."""
+    """The log interface of a connected task set."""
 
     async def read_log(
         self,
@@ -32,7 +32,7 @@ class LogReader(Protocol):
 
 
 class LogRequest(NamedTuple):
-    """What is to be read."""
+    """The log to read."""
 
     id: str
     """Endpoint id of the container."""
@@ -44,15 +44,15 @@ class LogRequest(NamedTuple):
 
 
 async def read_log(tables: Tables, peers: Mapping[str, LogReader], request: LogRequest) -> LogChunk:
-    """Read a log of a container that is there, or of an earlier incarnation that a machine still knows.
+    """Read a log of an existing container, or of an earlier incarnation that a machine still keeps.
 
     Args:
         tables: The state.
         peers: The connected task sets by name.
-        request: What is to be read.
+        request: The log to read.
 
     Raises:
-        NotFoundError: There is no such container, node or log.
+        NotFoundError: The container, node or log does not exist.
         TaskSetAwayError: Its task set is not connected or does not answer.
     """
     user, _, tag = request.id.partition("/")
@@ -80,7 +80,7 @@ async def read_log(tables: Tables, peers: Mapping[str, LogReader], request: LogR
 async def _read_earlier(
     tables: Tables, peers: Mapping[str, LogReader], request: LogRequest, container: Container
 ) -> LogChunk:
-    """Read of an earlier incarnation: where the container is, or else where it was before."""
+    """Read the log of an earlier incarnation: at the container's machine, or else at earlier ones."""
     if container.task_set in peers:
         chunk = await _ask(peers[container.task_set], request)
         if not chunk.error:
@@ -89,7 +89,7 @@ async def _read_earlier(
 
 
 async def _read_anywhere(tables: Tables, peers: Mapping[str, LogReader], request: LogRequest) -> LogChunk:
-    """Ask all machines; of several answers that of the incarnation that ended last counts."""
+    """Ask all machines; of several answers, use that of the incarnation that ended last."""
     asked = [
         peer
         for process, peer in peers.items()
@@ -131,13 +131,14 @@ async def _ask(peer: LogReader | None, request: LogRequest) -> LogChunk:
 
 
 def _is_present(tables: Tables, request: LogRequest) -> bool:
-    """Whether the present incarnation is meant, which is its owner's whatever its machine's clock says."""
+    """Whether the present incarnation is requested: its owner may read it at any time of the machine's
+    clock."""
     status = tables.container_live(request.id).status
     query = request.query
     return not query.previous and query.incarnation in ("", status.incarnation if status is not None else "")
 
 
 def _owner_since(tables: Tables, id_: str) -> float:
-    """When the owner came to be: what a user of the same name left behind is not theirs."""
+    """When the owner was created: logs of a former user of the same name are not theirs."""
     user = tables.users.get(EndpointId.parse(id_).user)
     return user.created if user is not None else 0.0

@@ -48,13 +48,13 @@ _log = logging.getLogger(__name__)
 
 TICK_S = 0.5
 _ACCESS = ("users", "tokens")
-"""Tables that say who may follow what."""
+"""Tables that determine permissions to follow events."""
 DEV_USER = "testUser"
 
 
 @dataclass(frozen=True, slots=True)
 class RunningMaster:
-    """What a running master can be reached by."""
+    """The addresses of a running master."""
 
     url: str
     """Of the HTTP server."""
@@ -66,9 +66,9 @@ class Master:
     """Runs a master on a store.
 
     Args:
-        settings: What was set.
-        secret: What task sets prove to have.
-        store: Where the desired state is kept; stays open, whoever opened it closes it.
+        settings: Its settings.
+        secret: The secret by which task sets authenticate.
+        store: Keeps the desired state; the caller closes it.
         hasher: How passwords are hashed.
     """
 
@@ -149,7 +149,7 @@ class Master:
                 try:
                     await self._serve(services, control_handler, on_ready)
                 finally:
-                    # Only now: task sets that leave while the servers close still need the state service.
+                    # Last: task sets that leave while the servers close still need the state service.
                     for worker in workers:
                         worker.cancel()
         finally:
@@ -195,7 +195,7 @@ class Master:
 
 
 async def make_dev_user(services: Services) -> None:
-    """Make the user of development mode, if it is not there."""
+    """Make the user of development mode, if it does not exist."""
     if DEV_USER in services.state_service.tables.users:
         return
     user = User(

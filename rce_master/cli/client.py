@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 REQUEST_S = 30.0
 UPLOAD_S = 300.0
-"""For an answer to what was sent: the master looks through it first."""
+"""Seconds to wait for an answer to an upload, which the master checks first."""
 RETRY_S = 1.0
 _OK = 400
 _REDIRECTS = 300, 400
@@ -40,7 +40,7 @@ class ApiClient:
     """Talks to a master. Use it as an asynchronous context manager.
 
     Args:
-        url: Of the master's HTTP server; of several, separated by commas, the first that answers is used.
+        url: URL of the master's HTTP server; of several, separated by commas, the first that answers is used.
         token: Bearer token; empty before the login.
         authority: File with the authority that issued the master's certificate; the system's if empty.
     """
@@ -98,7 +98,7 @@ class ApiClient:
                 ) as reply:
                     return await _result(reply)
             except (aiohttp.ClientError, TimeoutError, ValueError) as error:
-                # Only where no connection was made it is certain that nothing was done yet.
+                # Only without a connection it is certain that the request had no effect.
                 if number > 1 and isinstance(error, aiohttp.ClientConnectorError):
                     self._masters.failed(url)
                     continue
@@ -157,7 +157,7 @@ class ApiClient:
             raise CliError(f"cannot use the master at {self._base}: {_words(error)}") from error
 
     async def events(self, since: int | None = None) -> AsyncIterator[Event]:
-        """Follow events indefinitely; a stream that breaks is resumed where it broke.
+        """Follow events without end; resume a broken stream where it broke.
 
         Raises:
             ApiError: The master refused.

@@ -1,4 +1,4 @@
-"""What can go wrong in the commands.
+"""The errors of the commands.
 
 ::
 

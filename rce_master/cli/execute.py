@@ -66,7 +66,7 @@ def _execute(
 
 
 def run_command(container: str, command: Command, *, user: str = "", stdin: bool = True) -> int:
-    """Run a command with this program's standard streams; print why if that fails.
+    """Run a command with this program's standard streams; print the reason of a failure.
 
     Returns:
         The exit code.
@@ -107,7 +107,7 @@ async def _run(container: str, command: Command, user: str, stdin: bool) -> int:
 
 
 async def _show(socket: ClientWebSocketResponse) -> int:
-    """Write what the command writes, until it has ended; returns its exit code."""
+    """Write the command's output, until it has ended; return its exit code."""
     async for message in socket:
         if message.type is not aiohttp.WSMsgType.BINARY:
             continue
@@ -123,7 +123,7 @@ async def _show(socket: ClientWebSocketResponse) -> int:
                     _write(2, f"rce: {ended.reason}\n".encode())
                 return ended.code
             case Part.STARTED:
-                pass  # there is nothing to show
+                pass  # no output
             case Part.INPUT | Part.END_OF_INPUT | Part.SIZE | Part.SIGNAL:
                 raise CliError(f"the engine sent {frame.part.name}, which only a user sends")
             case _:
@@ -138,7 +138,7 @@ def _write(fd: int, data: bytes) -> None:
 
 
 async def _send_input(socket: ClientWebSocketResponse, stdin: bool, terminal: bool) -> None:
-    """Send what is typed or piped in, and its end."""
+    """Send the typed or piped input, and its end."""
     if stdin:
         while data := await _read_input():
             await socket.send_bytes(Frame(Part.INPUT, data).encode())
@@ -168,7 +168,7 @@ def _wake(ready: asyncio.Future[None]) -> None:
 
 @contextlib.contextmanager
 def _raw_terminal(wanted: bool) -> Iterator[None]:
-    """Leave what is typed to the terminal in the container."""
+    """Pass keystrokes unprocessed to the terminal in the container."""
     if not wanted or not sys.stdin.isatty():
         yield
         return
@@ -176,7 +176,7 @@ def _raw_terminal(wanted: bool) -> Iterator[None]:
     import tty
 
     before = termios.tcgetattr(0)
-    tty.setraw(0, termios.TCSADRAIN)  # what was typed ahead is kept
+    tty.setraw(0, termios.TCSADRAIN)  # input typed ahead is kept
     try:
         yield
     finally:
@@ -185,7 +185,7 @@ def _raw_terminal(wanted: bool) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _signals(socket: ClientWebSocketResponse, terminal: bool) -> Iterator[None]:
-    """Pass signals on to the command, and the terminal's size."""
+    """Pass signals and the terminal's size on to the command."""
     loop = asyncio.get_running_loop()
     tasks: set[asyncio.Task[None]] = set()
 

@@ -84,7 +84,7 @@ async def _logs(path: str, follow: bool, offset: int, query: dict[str, str]) -> 
 
 
 async def _started_again(client: ApiClient, url: str, query: dict[str, str], incarnation: str) -> bool:
-    """Whether the container has another incarnation than the one that was read to its end."""
+    """Whether the container has a newer incarnation than the one that was read to its end."""
     now = {name: value for name, value in query.items() if name == "user"}
     try:
         chunk = await _read(client, url, {**now, "limit": 1}, patient=True)
@@ -96,7 +96,7 @@ async def _started_again(client: ApiClient, url: str, query: dict[str, str], inc
 
 
 def _shown(text: str) -> str:
-    """A log as it is; on a terminal without what that would obey."""
+    """Return a log's text; for a terminal, without control characters."""
     return for_terminal(text) if sys.stdout.isatty() else text
 
 
@@ -109,7 +109,7 @@ def _obituary(chunk: dict[str, Any]) -> str:
 async def _read(
     client: ApiClient, url: str, query: dict[str, str | int], *, patient: bool
 ) -> dict[str, Any] | None:
-    """Read a piece; None if the container is out of reach for now and we can wait."""
+    """Read a piece; return None if the container is unreachable for now and the program can wait."""
     try:
         chunk: dict[str, Any] = await client.call("GET", url, query=query)
     except ApiError as error:

@@ -42,7 +42,7 @@ async def _machines(as_json: bool) -> None:
 
 
 def overview(found: list[Machine]) -> Table:
-    """Lay out machines."""
+    """Format machines as a table."""
     names = ("task set", "machine", "state", "containers", "slots", "cores", "memory")
     table = Table(*names, "limits", "runtime", "labels", box=None)
     for machine in sorted(found, key=lambda m: (m["kind"], m["machine"], m["process"])):

@@ -1,7 +1,7 @@
 """Work on a master's state folder while no master runs on it.
 
-What is changed is in the audit log, as what is changed over the API: who is the user of the operating system,
-and the place is ``offline``.
+Changes are in the audit log, as changes over the API: the user is that of the operating system, and the
+address is ``offline``.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ StateDir = Annotated[
 
 
 def choose(state_dir: Path | None) -> Path | Credentials:
-    """Choose: the folder that was named, else the master where one is logged in, else the default folder."""
+    """Choose the named folder, else the master of the login, else the default folder."""
     if state_dir is not None:
         return state_dir
     try:
@@ -54,10 +54,10 @@ def choose(state_dir: Path | None) -> Path | Credentials:
 
 
 class OfflineState:
-    """The state of a master that does not run. Its store is locked meanwhile.
+    """The state of a master that does not run. Its store is locked.
 
     Attributes:
-        state: What the store held, with what was changed since.
+        state: The state of the store, with the changes since.
         folder: Where it is.
     """
 
@@ -69,7 +69,7 @@ class OfflineState:
         self._audit = audit
 
     async def do(self, command: Command, action: str, subject: str) -> None:
-        """Change something, keep it, and write it to the audit log.
+        """Apply a change, store it, and write it to the audit log.
 
         Args:
             command: The change.
@@ -77,7 +77,7 @@ class OfflineState:
             subject: What it is about.
 
         Raises:
-            MasterError: The state does not allow it, or it cannot be kept.
+            MasterError: The state does not allow it, or it cannot be stored.
         """
         rows = self.state.apply(command, time.monotonic()).rows()
         await self._store.save(rows, self._term)
@@ -86,7 +86,7 @@ class OfflineState:
 
 @asynccontextmanager
 async def open_state(state_dir: Path) -> AsyncIterator[OfflineState]:
-    """Open the state in a folder: the master's own, or the engine's, in which that is a folder.
+    """Open the state in a folder: the master's own, or the engine's, which contains the master's.
 
     Raises:
         CliError: A master runs on it, or the settings cannot be read.
@@ -112,7 +112,7 @@ async def open_state(state_dir: Path) -> AsyncIterator[OfflineState]:
 
 
 def _caller() -> str:
-    """Return who runs this program, also through sudo."""
+    """Return the user who runs this program, also through sudo."""
     number = os.getuid()
     through = os.environ.get("SUDO_UID", "") if number == 0 else ""
     if through.isdecimal():

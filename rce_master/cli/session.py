@@ -43,8 +43,8 @@ async def _login(url: str, user: str, password: str, authority: str) -> None:
 
 
 async def _give_back(url: str) -> None:
-    """Give the token of the login until now back, if it is one at the same master."""
-    with contextlib.suppress(CliError, ApiError):  # none, unreadable or expired: nothing to give back
+    """Revoke the token of the former login, if it is at the same master."""
+    with contextlib.suppress(CliError, ApiError):  # missing, unreadable or expired: nothing to revoke
         former = credentials.load()
         if former.url == url:
             async with ApiClient.of(former) as client:
@@ -64,7 +64,7 @@ async def _logout() -> None:
 
 
 def read_password(*, from_stdin: bool, confirm: bool = False, what: str = "Password") -> str:
-    """Read a password: asked for at a terminal, or the next line of standard input."""
+    """Read a password: ask for it at a terminal, else read the next line of standard input."""
     if from_stdin:
         return sys.stdin.readline().rstrip("\n")
     return str(typer.prompt(what, hide_input=True, confirmation_prompt=confirm))

@@ -1,4 +1,4 @@
-"""Who a request is of, and from where."""
+"""Identifies the user and the address of a request."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 
 def bearer(request: web.Request, services: Services) -> tuple[str, User | None]:
-    """Return the token that a request carries, and whose it is; without one, nothing and None.
+    """Return the token of a request and its user; without one, an empty text and None.
 
     Raises:
-        WrongCredentialsError: It is unknown or expired.
-        ForbiddenError: It is not for the API.
+        WrongCredentialsError: The token is unknown or expired.
+        ForbiddenError: The token is not for the API.
     """
     token = _token(request)
     if not token:
@@ -36,7 +36,7 @@ def admit(route: Route, user: User | None) -> None:
     """Check that a user may use a route.
 
     Raises:
-        WrongCredentialsError: Nobody is known, and the route is not open to everybody.
+        WrongCredentialsError: The request is not authenticated, and the route is not public.
         ForbiddenError: The user's role is not enough.
     """
     if user is None and not route.open:
@@ -51,14 +51,14 @@ def admit(route: Route, user: User | None) -> None:
 
 
 def check_metrics(request: web.Request, services: Services) -> None:
-    """Check that a request may read the metrics, whose labels name everybody's robots and containers.
+    """Check that a request may read the metrics, whose labels name the robots and containers of all users.
 
-    A token is needed everywhere, because a request that a proxy on this machine passes on need not look
-    different from one of a program here. In development mode, programs of this machine need none.
+    A token is always needed, because requests that a proxy on this machine forwards may look like those of
+    local programs. In development mode, programs of this machine do not need a token.
 
     Raises:
-        WrongCredentialsError: There is no token, or it is unknown or expired.
-        ForbiddenError: It is not one for this.
+        WrongCredentialsError: The token is missing, unknown or expired.
+        ForbiddenError: The token is not for the metrics.
     """
     token = _token(request)
     if not token:

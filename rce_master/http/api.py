@@ -1,4 +1,4 @@
-"""The REST API: its routes, what they read and answer, and the document that describes them.
+"""The REST API: its routes, their requests and answers, and the OpenAPI document.
 
 It is loaded with the first request for it: see :mod:`rce_master.http.late`.
 """
@@ -58,7 +58,7 @@ class Api:
     """Answers all requests for paths of the API.
 
     Args:
-        services: What the handlers work with.
+        services: The services of the handlers.
     """
 
     def __init__(self, services: Services) -> None:
@@ -76,8 +76,8 @@ class Api:
         """Answer a request.
 
         Raises:
-            HTTPException: There is no such path, or not with this method.
-            MasterError: It was not done.
+            HTTPException: The path does not exist, or does not have this method.
+            MasterError: The request failed.
         """
         found = await self._router.resolve(request)
         if found.http_exception is not None:
@@ -133,7 +133,7 @@ def read_body(model: type[BaseModel], text: bytes) -> BaseModel:
     """Read a request's body.
 
     Raises:
-        InvalidRequestError: It does not fit; the text names each fault with its path.
+        InvalidRequestError: It does not fit the model; the text names each fault with its path.
     """
     try:
         return model.model_validate_json(text or b"{}")

@@ -22,7 +22,7 @@ async def log_in(call: Call) -> models.TokenOut:
     user = await services.authenticator.verify(body.userID, client_digest(body.password), call.address)
     lifetime = min(body.lifetime or services.token_lifetime, services.token_lifetime)
     token, record = new_token(user.name, body.label, services.clock(), lifetime)
-    # What was used lately must not make room for this one.
+    # A recently used token must not be dropped for this one.
     uses = services.tokens.uses()
     _, outcome = await services.state_service.submit_all(
         [uses, commands.AddToken(token=record, password=user.password)]
@@ -113,7 +113,7 @@ async def set_role(call: Call) -> None:
 
 
 async def _check_old(call: Call, password: str) -> None:
-    """Whoever found a token must not be able to lock its owner out."""
+    """Check the old password: the finder of a token must not be able to lock its owner out."""
     if not password:
         raise InvalidRequestError(
             "old_password: is missing; to change your own password, give the one until now"

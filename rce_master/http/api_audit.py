@@ -1,4 +1,4 @@
-"""REST: who came in, who was refused, and who changed what."""
+"""REST: the audit log of logins, refusals and changes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ async def read_audit(call: Call) -> models.AuditOut:
     everybody=True,
 )
 async def note_action(call: Call) -> None:
-    """Note what somebody steered; a station does it with the token of who steered."""
+    """Record a control action; a station sends it with the token of the acting user."""
     body = call.read(models.AuditIn)
     if call.caller.role is UserRole.VIEWER and body.outcome == "done":
         raise ForbiddenError("role viewer steers nothing, so there is nothing to note")

@@ -37,10 +37,10 @@ _QUERY = (OF_USER,)
 
 
 async def _do(call: Call, request: Request | Component) -> None:
-    """Do what is asked for.
+    """Carry out a request.
 
     Raises:
-        Refused: It was not done.
+        Refused: The state does not allow it.
         StoreError: It could not be stored.
     """
     commands = list(commands_of(request, call.owner))
@@ -50,10 +50,10 @@ async def _do(call: Call, request: Request | Component) -> None:
 
 
 def _read(request: type[T], data: dict[str, Any]) -> T:
-    """Read a request that is spelled as in this API.
+    """Read a request in the spelling of this API.
 
     Raises:
-        InvalidRequestError: Something is wrong in it.
+        InvalidRequestError: It is not valid.
     """
     try:
         return SPELLING.read(request, data)
@@ -62,7 +62,7 @@ def _read(request: type[T], data: dict[str, Any]) -> T:
 
 
 def _sent(body: Model) -> dict[str, Any]:
-    """What a body says, and nothing of what it leaves out."""
+    """Return the fields that a body contains, without those that it leaves out."""
     return body.model_dump(exclude_unset=True)
 
 

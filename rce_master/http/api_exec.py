@@ -25,7 +25,7 @@ routes = route_table("exec")
 FIRST_MESSAGE_S = 10.0
 HEARTBEAT_S = 15.0
 CHECK_S = 60.0
-"""How long it is waited for the end of the login before it is looked at anew."""
+"""Interval of checks whether the login has ended."""
 
 
 @routes.route(
@@ -65,8 +65,8 @@ async def _first(user: web.WebSocketResponse) -> Command:
     """Receive the command.
 
     Raises:
-        ValueError: Something else came.
-        TimeoutError: Nothing came.
+        ValueError: The message is not a command.
+        TimeoutError: No message was received.
     """
     async with asyncio.timeout(FIRST_MESSAGE_S):
         message = await user.receive()
@@ -79,8 +79,8 @@ async def _first(user: web.WebSocketResponse) -> Command:
 
 
 async def _relay(call: Call, user: web.WebSocketResponse, machine: ServerConnection) -> None:
-    """Pass frames on until either side has gone, or the user may not do this any more."""
-    with contextlib.suppress(ConnectionClosed, ConnectionResetError):  # either side may just go
+    """Pass frames on until either side disconnects, or the user loses the permission."""
+    with contextlib.suppress(ConnectionClosed, ConnectionResetError):  # either side may disconnect
         await run_until_first(_to_machine(user, machine), _to_user(machine, user), _watch(call))
 
 
@@ -101,10 +101,10 @@ async def _to_user(machine: ServerConnection, user: web.WebSocketResponse) -> No
 
 
 async def _watch(call: Call) -> None:
-    """Return never; raise when the login has ended.
+    """Never return; raise when the login has ended.
 
     Raises:
-        ValueError: It has.
+        ValueError: The login has ended.
     """
     while await call.lasts(CHECK_S):
         pass

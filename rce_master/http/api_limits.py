@@ -1,4 +1,4 @@
-"""REST: what a user may have, and what of it is used."""
+"""REST: the limits of a user, and their usage."""
 
 from __future__ import annotations
 

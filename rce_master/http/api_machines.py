@@ -1,4 +1,4 @@
-"""REST: container machines that are emptied."""
+"""REST: draining of container machines."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ async def drain_machine(call: Call) -> models.MachinesOut:
     admin=True,
 )
 async def undrain_machine(call: Call) -> models.MachinesOut:
-    """Take a drain back."""
+    """Cancel a drain."""
     return await _set(call, draining=False)
 
 

@@ -69,7 +69,7 @@ async def show_package(call: Call) -> models.PackageOut:
     ),
 )
 async def push_package(call: Call) -> models.PackageOut:
-    """Take a version of a package; the same one again changes nothing."""
+    """Accept a version of a package; an identical one changes nothing."""
     request = PushRequest(
         user=call.caller.name,
         name=call.path("name"),
@@ -122,7 +122,7 @@ async def register_package_key(call: Call) -> models.PackageKeyOut:
 
 @routes.route("DELETE", "/package-keys/{id}", "Trust a key no more", status=204, query=_QUERY)
 async def revoke_package_key(call: Call) -> None:
-    """Trust a key no more."""
+    """Stop trusting a key."""
     await call.services.state_service.submit(commands.RemovePackageKey(user=call.owner, id=call.path("id")))
 
 

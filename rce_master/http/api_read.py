@@ -1,4 +1,4 @@
-"""REST: what is there."""
+"""REST: lists of robots, containers and other objects."""
 
 from __future__ import annotations
 

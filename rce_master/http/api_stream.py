@@ -112,14 +112,14 @@ def _one_of(words: type[E], name: str, word: str) -> E:
     ),
 )
 async def stream_events(call: Call) -> web.StreamResponse:
-    """Stream events until the client or the server ends it, or the token is worth nothing any more."""
+    """Stream events until the client or the server ends it, or the token becomes invalid."""
     with call.services.quotas.stream(call.caller):
         return await _stream(call, call.scope, _start(call))
 
 
 async def _stream(call: Call, scope: str | None, last: int) -> web.StreamResponse:
     owner = call.services.state_service.tables.users.get(scope or "")
-    born = owner.created if owner is not None else 0.0  # what happened before was another one's of that name
+    born = owner.created if owner is not None else 0.0  # earlier events belong to a former user of that name
     response = web.StreamResponse(
         headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     )
@@ -134,14 +134,14 @@ async def _stream(call: Call, scope: str | None, last: int) -> web.StreamRespons
             if not call.is_still_valid:
                 await response.write(_frame(_farewell(call, last)))
                 return response
-            # A comment now and then keeps proxies from giving up, and finds out that a client is gone.
+            # Periodic comments prevent timeouts of proxies, and detect that a client has disconnected.
             frames = [_frame(event) for event in news if event.time >= born and _concerns(call, event)]
             if frames or clock() >= written + HEARTBEAT_S:
                 await response.write(b"".join(frames) or b":\n\n")
                 written = clock()
             last = news[-1].id if news else last
     except ConnectionResetError:
-        # The client went away: the only way in which a stream ends from its side.
+        # The client disconnected: a stream does not end in another way from its side.
         return response
 
 
@@ -153,12 +153,12 @@ def _start(call: Call) -> int:
 
 
 def _concerns(call: Call, event: Event) -> bool:
-    """Return whether an event is for a caller's eyes: what is of no user is for administrators."""
+    """Return whether a caller may see an event; events without a user are for administrators."""
     return bool(event.user) or call.is_admin
 
 
 def _farewell(call: Call, last: int) -> Event:
-    """Return the last event of a stream whose caller may not follow it any more."""
+    """Return the last event of a stream whose caller has lost the permission."""
     return Event(
         id=last,
         time=call.services.clock(),

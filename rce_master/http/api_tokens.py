@@ -17,7 +17,7 @@ _DAY_S = 24 * 3600.0
 
 @routes.route("GET", "/tokens", "List a user's tokens", reply=models.TokensOut, query=(OF_USER,))
 async def list_tokens(call: Call) -> models.TokensOut:
-    """List tokens, never the texts that they are used by."""
+    """List tokens, without their secrets."""
     return models.TokensOut(tokens=[_show(call, token) for token in _of(call)])
 
 

@@ -1,4 +1,4 @@
-"""REST: what is consumed, once or as a stream."""
+"""REST: the usage, once or as a stream."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LEAST_INTERVAL_S, MOST_INTERVAL_S = 1, 3600
     query=(OF_USER,),
 )
 async def show_usage(call: Call) -> UsageOut:
-    """Show what is consumed."""
+    """Show the usage."""
     return _usage(call, call.scope)
 
 
@@ -38,7 +38,7 @@ async def show_usage(call: Call) -> UsageOut:
     ),
 )
 async def stream_usage(call: Call) -> web.StreamResponse:
-    """Stream what is consumed until an end is made of it, or the token is worth nothing any more."""
+    """Stream the usage until the client or the server ends it, or the token becomes invalid."""
     interval = call.number("interval", 2)
     if not LEAST_INTERVAL_S <= interval <= MOST_INTERVAL_S:
         raise InvalidRequestError(
@@ -61,7 +61,7 @@ async def _stream(call: Call, scope: str | None, interval: int) -> web.StreamRes
                 return response
             await response.write(_frame(_usage(call, scope)))
     except ConnectionResetError:
-        # The client went away: the only way in which a stream ends from its side.
+        # The client disconnected: a stream does not end in another way from its side.
         return response
 
 

@@ -1,4 +1,4 @@
-"""``GET /healthz``: whether the master works. Open to everybody; many who ask cost one look at the store."""
+"""``GET /healthz``: whether the master works. Public; concurrent requests share one check of the store."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ if TYPE_CHECKING:
 
 
 class Health:
-    """Answers whether the store can be used, and how many task sets are connected.
+    """Reports whether the store is usable, and how many task sets are connected.
 
     Args:
-        state_service: Whose store it is.
+        state_service: The owner of the store.
     """
 
     def __init__(self, state_service: StateService) -> None:
         self._state_service = state_service
         self._look: asyncio.Task[str] | None = None
-        """Whoever asks while it runs waits for the same answer."""
+        """The running check; concurrent requests wait for its result."""
 
     async def handle(self, _: web.Request) -> web.Response:
-        """Answer 200, or 503 with what is wrong."""
+        """Answer 200, or 503 with the fault."""
         if self._look is None:
             self._look = asyncio.create_task(self._check())
         fault = await asyncio.shield(self._look)

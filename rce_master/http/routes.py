@@ -1,4 +1,4 @@
-"""The routes of the REST API: who may use them, and what their handlers are given."""
+"""The routes of the REST API: their permissions, and the arguments of their handlers."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ if TYPE_CHECKING:
 M = TypeVar("M", bound="BaseModel")
 
 ACCESS_CHECK_S = 15.0
-"""How long after its expiry a token may still keep a stream open."""
+"""Seconds after its expiry during which a token may still keep a stream open."""
 ENDED = "your access ended: the token was revoked or expired, or the user was changed; log in again"
-"""What streams say last when they end for that."""
+"""The last message of streams that end because of an expired token."""
 
 _NUMBER = re.compile(r"-?[0-9]{1,18}")
 
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """What the handlers work with."""
+    """The services of the handlers."""
 
     state_service: StateService
     reconciler: Reconciler
@@ -64,12 +64,12 @@ class Services:
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """One request of somebody who proved who they are."""
+    """An authenticated request."""
 
     request: web.Request
     services: Services
     user: User | None
-    """None only on routes that are open to everybody."""
+    """None only on public routes."""
     token: str
     body: BaseModel | None
     parts: Mapping[str, str]
@@ -77,25 +77,25 @@ class Call:
 
     @property
     def address(self) -> str:
-        """Where the request comes from, as far as proxies that are trusted tell."""
+        """The address of the request, as reported by trusted proxies."""
         transport = self.request.transport
         peer = None if transport is None else transport.get_extra_info("peername")
         return self.services.proxies.origin(peer, self.request.headers.getall("X-Forwarded-For", ()))
 
     @property
     def caller(self) -> User:
-        """Who asks."""
+        """The calling user."""
         assert self.user is not None
         return self.user
 
     @property
     def is_admin(self) -> bool:
-        """Whether an administrator asks."""
+        """Whether the caller is an administrator."""
         return self.user is not None and self.user.role is UserRole.ADMIN
 
     @property
     def is_still_valid(self) -> bool:
-        """Whether the caller could ask for the same now; for answers that go on for long."""
+        """Whether the caller still has the permission; for long answers."""
         try:
             user, _ = self.services.tokens.find(self.token)
         except WrongCredentialsError:
@@ -103,7 +103,7 @@ class Call:
         return user == self.user
 
     async def lasts(self, seconds: float) -> bool:
-        """Wait; return False as soon as the caller could not ask for the same any more."""
+        """Wait; return False as soon as the caller has lost the permission."""
         loop = asyncio.get_running_loop()
         end = loop.time() + seconds
         while self.is_still_valid:
@@ -115,11 +115,11 @@ class Call:
 
     @property
     def owner(self) -> str:
-        """Whose robots and containers are meant: the caller's, or those of ``?user=`` for an administrator.
+        """The user of the robots and containers: the caller, or ``?user=`` for an administrator.
 
         Raises:
-            ForbiddenError: Somebody else's are asked for.
-            NotFoundError: There is no such user.
+            ForbiddenError: The caller may not name another user.
+            NotFoundError: The user does not exist.
         """
         return self._owner(looks=self.request.method == "GET")
 
@@ -141,7 +141,7 @@ class Call:
 
     @property
     def scope(self) -> str | None:
-        """Whose things are to be listed; None: everybody's, the default of those who may see them."""
+        """The user whose objects to list; None: all users, the default of callers who may see them."""
         return None if self.caller.role.sees_all and "user" not in self.request.query else self.owner
 
     def path(self, name: str) -> str:
@@ -149,10 +149,10 @@ class Call:
         return self.parts[name]
 
     def query(self, name: str) -> str:
-        """A query parameter that must be there.
+        """Return a required query parameter.
 
         Raises:
-            InvalidRequestError: It is not.
+            InvalidRequestError: It is missing.
         """
         try:
             return self.request.query[name]
@@ -160,10 +160,10 @@ class Call:
             raise InvalidRequestError(f"query parameter {name!r} is missing") from None
 
     def number(self, name: str, default: int) -> int:
-        """A query parameter that is a whole number.
+        """Return a query parameter that is an integer.
 
         Raises:
-            InvalidRequestError: It is none, or one that no counter reaches.
+            InvalidRequestError: It is not an integer, or is out of range.
         """
         text = self.request.query.get(name, str(default))
         if not _NUMBER.fullmatch(text):
@@ -171,7 +171,7 @@ class Call:
         return int(text)
 
     def read(self, model: type[M]) -> M:
-        """The body, which the route declared to be of this model."""
+        """Return the body, which the route declared to be of this model."""
         assert isinstance(self.body, model)
         return self.body
 
@@ -181,23 +181,23 @@ Handler = Callable[[Call], Awaitable["BaseModel | StreamResponse | None"]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Route(routes.Route[Handler]):
-    """A method of a path, and who may use it."""
+    """A method of a path, and its permissions."""
 
     admin: bool = False
     everybody: bool = False
-    """Whether who may only look may use it all the same."""
+    """Whether read-only users may use it too."""
     acts: bool = False
-    """Whether it changes something though it is a GET."""
+    """Whether it makes a change although it is a GET."""
 
     def told(self) -> dict[str, Any]:
-        """Say who may use it, and the errors that follow from what it takes."""
+        """Return its OpenAPI description: permissions and possible errors."""
         return {
             "summary": self.summary + (" (administrators only)" if self.admin else ""),
             "errors": tuple(set(self._errors())),
         }
 
     def _errors(self) -> Iterator[int]:
-        """The statuses of what may go wrong."""
+        """Return the statuses of its possible errors."""
         yield from (401, 403, 421, 429)
         if "{" in self.path or OF_USER in self.query:
             yield 404

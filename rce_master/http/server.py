@@ -1,4 +1,4 @@
-"""Puts the HTTP application together: routes, who may use them, and how errors look."""
+"""Builds the HTTP application: routes, permissions and error answers."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ def make_app(
     """Make the application.
 
     Args:
-        services: What the handlers work with.
+        services: The services of the handlers.
         allowed_origins: Origins whose pages may use the server from a browser, such as
             ``https://fleet.example.org``; pages of the server itself always may.
-        names: By which the server may be asked for.
+        names: The allowed host names of the server.
     """
     guard = _origin_guard(frozenset(allowed_origins), names or ServerNames())
     app = web.Application(middlewares=[guard, _errors], client_max_size=MAX_BODY)
@@ -66,7 +66,7 @@ def make_app(
 def _metrics(services: Services) -> Handler:
     @cache
     def scraped() -> Callable[[], web.Response]:
-        from rce_master.http.metrics import make_answer  # takes memory that only scraped masters spend
+        from rce_master.http.metrics import make_answer  # only scraped masters spend this memory
 
         checks = services.authenticator
         return make_answer(services.state_service.tables, services.reconciler.book, lambda: checks.checks)
@@ -78,15 +78,15 @@ def _metrics(services: Services) -> Handler:
     return handle
 
 
-# What applies to all
+# Middleware of all routes
 
 
 def _origin_guard(allowed: frozenset[str], names: ServerNames) -> Any:
     @web.middleware
     async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Refuse pages of other sites: a browser would send them with the user's network position."""
+        """Refuse requests of other sites' pages, which a browser would send from the user's network."""
         origin, host = request.headers.get(hdrs.ORIGIN), request.headers.get(hdrs.HOST, "")
-        # Robots ask for their endpoint by any name that leads here: the answer is not secret.
+        # Robots ask for their endpoint by any name of this server: the answer is not secret.
         refusal = None if origin is None and request.path == "/" else names.refusal(host)
         if refusal is not None and origin not in allowed:
             return _error(421, refusal)

@@ -1,6 +1,7 @@
-"""What the REST API takes and gives of containers, nodes, parameters, interfaces and connections.
+"""The REST API's models of containers, nodes, parameters, interfaces and connections.
 
-Their fields are those of :mod:`rce.model.specs` and :mod:`rce.model.requests`; here is what only the API has.
+Most fields are those of :mod:`rce.model.specs` and :mod:`rce.model.requests`; this module has those of the
+API only.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ SPELLING = Spelling(
         (InterfaceSpec, "message_type"): "cls",
     },
 )
-"""What the REST API calls the fields."""
+"""The REST API's names of the fields."""
 
 
 def takes(request: type[Struct], *path: str) -> Callable[[type[M]], type[M]]:
@@ -81,7 +82,7 @@ def _extended(model: type[M], fields: dict[str, Any]) -> type[M]:
 
 
 def _taken(field: Field) -> Any:
-    """Tell the type of what is sent; what is valid of it, the request's reader knows."""
+    """Return the type of a sent field; the request's reader validates the value."""
     kind = field.rule.type
     if get_origin(kind) is Literal:
         kind = str
@@ -101,7 +102,7 @@ def _default(field: Field) -> Any:
 
 
 def _given(field: Field) -> Any:
-    """Tell the type of what is shown."""
+    """Return the type of a shown field."""
     if isinstance(field.kept, type) and issubclass(field.kept, Enum):
         return str
     return list[str] if get_origin(field.kept) is tuple else field.kept

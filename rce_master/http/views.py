@@ -1,4 +1,4 @@
-"""Makes what the API gives of the state's tables."""
+"""Builds the API's answers from the state's tables."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _NO_INTERFACE_USAGE = InterfaceUsage()
 
 
 class Views:
-    """Shows users, robots, containers and what belongs to them.
+    """Shows users, robots, containers and their parts.
 
     Args:
         tables: The state's tables.
-        usage: What each task set last told of what it consumes.
+        usage: The last usage report of each task set.
     """
 
     def __init__(self, tables: Tables, usage: Mapping[str, Usage]) -> None:
@@ -165,7 +165,7 @@ class Views:
         )
 
     def staying(self, task_set: TaskSet) -> list[models.StayingOut]:
-        """Show what a draining machine still has, and why."""
+        """Show the containers that a draining machine still has, and why."""
         return [
             models.StayingOut(container=container.id, why=self._why_it_stays(container))
             for container in self._tables.endpoints.by("task_set", task_set.process)
@@ -180,12 +180,12 @@ class Views:
         return live.stays or "its turn comes"
 
     def usage_of(self, endpoint: Endpoint) -> EndpointUsage:
-        """Tell what an endpoint consumes."""
+        """Return the usage of an endpoint."""
         usage = self._usage.get(endpoint.task_set)
         return usage.endpoints.get(endpoint.id, _NO_USAGE) if usage else _NO_USAGE
 
     def is_established(self, connection: Connection) -> bool:
-        """Tell whether both ends report a connection as established."""
+        """Return whether both ends report a connection as established."""
         ends = (open_end_key(endpoint, connection.id) for endpoint in (connection.a, connection.b))
         return all(key in self._tables.open_ends for key in ends)
 

@@ -1,1 +1,1 @@
-"""Packages that users bring: how they come in and where their contents are kept."""
+"""Packages that users bring: uploads, and storage of their contents."""

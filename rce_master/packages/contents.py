@@ -1,4 +1,4 @@
-"""Archives by their hash, in a folder: ``FOLDER/SHA256``, and ``FOLDER/incoming`` for what is on its way."""
+"""Archives by their hash, in a folder: ``FOLDER/SHA256``, and ``FOLDER/incoming`` for running uploads."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _BUFFER = 1 << 20
 
 
 class Incoming:
-    """An archive that came in whole."""
+    """A completely received archive."""
 
     def __init__(self, path: Path, limits: ArchiveLimits, sha256: str, size: int) -> None:
         self.path = path
@@ -36,7 +36,7 @@ class Incoming:
         self._limits = limits
 
     async def inspect(self) -> Contents:
-        """Tell what it holds.
+        """Return its contents.
 
         Raises:
             InvalidRequestError: It is not a package's archive.
@@ -52,10 +52,10 @@ class Incoming:
 
 
 class ContentStore:
-    """The archives of all users. Two of equal contents are one.
+    """The archives of all users. Archives with equal contents are stored once.
 
     Args:
-        folder: Made when the first archive comes.
+        folder: Made with the first archive.
         limits: How large each may be.
     """
 
@@ -65,10 +65,10 @@ class ContentStore:
 
     @contextlib.asynccontextmanager
     async def receive(self, chunks: AsyncIterator[bytes]) -> AsyncIterator[Incoming]:
-        """Take an archive in; what was not kept at the end is removed.
+        """Receive an archive; it is removed at the end unless it was kept.
 
         Raises:
-            InvalidRequestError: It is too large.
+            InvalidRequestError: The archive is too large.
             StoreError: It cannot be written.
         """
         try:
@@ -95,21 +95,21 @@ class ContentStore:
         """Read a piece of an archive.
 
         Returns:
-            The piece and the size of the whole; None if there is no such archive.
+            The piece and the size of the archive; None if the archive does not exist.
         """
         if _HASH.fullmatch(sha256) is None:
             return None
         return await asyncio.to_thread(self._read, sha256, offset, count)
 
     def sweep(self, known: Collection[str]) -> None:
-        """Remove all archives but those whose hashes are known. Blocks."""
+        """Remove all archives except those with known hashes. Blocks."""
         with contextlib.suppress(FileNotFoundError):
             for path in self._folder.iterdir():
                 if _HASH.fullmatch(path.name) and path.name not in known:
                     path.unlink(missing_ok=True)
 
     def forget_incoming(self) -> None:
-        """Remove what an earlier master was taking in when it ended. Blocks."""
+        """Remove unfinished uploads of an earlier master. Blocks."""
         shutil.rmtree(self._folder / _INCOMING, ignore_errors=True)
 
     def _make_incoming(self) -> Path:

@@ -1,4 +1,4 @@
-"""Takes packages that users push, and lets go of the contents that nobody needs any more."""
+"""Accepts packages that users push, and removes contents that are not needed any more."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 INSPECTED_AT_ONCE = 2
-"""Archives that are looked through, which takes processor time."""
+"""Archives that are inspected at the same time, which takes processor time."""
 
 
 _NOT_INSTALLED = (
@@ -39,7 +39,7 @@ _NOT_INSTALLED = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PushRequest:
-    """A version that a user wants to be taken."""
+    """A request to accept a version."""
 
     user: str
     name: str
@@ -51,11 +51,11 @@ class PushRequest:
 
 
 class PackageService:
-    """Where packages come in.
+    """Accepts packages.
 
     Args:
         state_service: Knows the versions and the keys.
-        store: Keeps what they hold.
+        store: Keeps their contents.
         clock: Seconds since 1970.
     """
 
@@ -67,13 +67,13 @@ class PackageService:
         self._clock = clock
         self._uploads = Uploads()
         self._turns = Turns(INSPECTED_AT_ONCE, waiting=MAX_UPLOADS)
-        # Held while contents are there of which the state does not know yet, or any more.
+        # Held while contents exist that the state does not know yet, or any more.
         self._lock = asyncio.Lock()
         self._dirty = asyncio.Event()
         state_service.listeners.append(self._note)
 
     async def run(self) -> None:
-        """Let go of contents that nobody needs, until cancelled."""
+        """Remove contents that are not needed, until cancelled."""
         await asyncio.to_thread(self._store.forget_incoming)
         self._dirty.set()
         while True:
@@ -89,19 +89,19 @@ class PackageService:
     async def push(
         self, request: PushRequest, size: int, chunks: AsyncIterator[bytes]
     ) -> tuple[UserPackage, tuple[str, ...]]:
-        """Take a version of a package.
+        """Accept a version of a package.
 
         Args:
-            request: What it is to be.
-            size: Bytes of the archive as its sender says; 0 if it does not.
+            request: The version.
+            size: Bytes of the archive, from the sender; 0 if unknown.
             chunks: The archive.
 
         Returns:
-            The version as it is known from now on, and what its owner should know.
+            The stored version, and notes for its owner.
 
         Raises:
-            Refused: It cannot be taken.
-            StoreError: It cannot be kept.
+            Refused: It cannot be accepted.
+            StoreError: It cannot be stored.
         """
         self._check_early(request, size)
         async with self._uploads.one(request.user) as upload:
@@ -131,7 +131,7 @@ class PackageService:
             raise BusyError("too many packages are pushed at the same time; try again in a moment") from None
 
     def _check_early(self, request: PushRequest, size: int) -> None:
-        """Refuse what is to be refused anyway before all of it has come."""
+        """Refuse an invalid version before its archive has been received."""
         tables, settings = self._state_service.tables, self._state_service.state.settings
         if package_key_key(request.user, request.key) not in tables.package_keys:
             raise ForbiddenError("the key is not registered with your account; run: rce package key register")

@@ -1,4 +1,4 @@
-"""Who is sending an archive just now: one of each user, and so many that slow ones keep nobody out."""
+"""The running uploads of archives: one per user, with a total limit that slow uploads cannot exhaust."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
 UPLOAD_S = 1800.0
-"""How long an archive may take to come in."""
+"""Maximum duration of an upload."""
 MAX_UPLOADS = 64
-"""At the same time; of one user one."""
+"""Maximum number of uploads at the same time; one per user."""
 FIRST_S = 10.0
-"""So long an upload is not asked to make room: it may only have begun."""
+"""Minimum age at which an upload may be replaced by a new one."""
 
 
 @dataclass(eq=False, slots=True)
 class Upload:
-    """An archive that is on its way."""
+    """A running upload."""
 
     user: str
     begun: float
@@ -33,18 +33,18 @@ class Upload:
     gave_way: bool = field(default=False)
 
     async def counted(self, chunks: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
-        """Pass on what comes, and count it."""
+        """Pass on the received data, and count it."""
         async for chunk in chunks:
             self.received += len(chunk)
             yield chunk
 
     def rate(self, now: float) -> float:
-        """Tell how many bytes came each second."""
+        """Return the received bytes per second."""
         return self.received / (now - self.begun)
 
 
 class Uploads:
-    """The archives that are on their way. When there are too many, the slowest gives way to a new one.
+    """The running uploads. If there are too many, a new one replaces the slowest.
 
     Args:
         clock: Seconds that never go back.
@@ -57,11 +57,11 @@ class Uploads:
 
     @contextlib.asynccontextmanager
     async def one(self, user: str) -> AsyncIterator[Upload]:
-        """Have a place for as long as the context lasts.
+        """Hold a place as long as the context lasts.
 
         Raises:
-            TooMuchError: The user is sending another one.
-            BusyError: There is no room, or it took too long, or gave way to another one.
+            TooMuchError: The user has another running upload.
+            BusyError: All places are taken, or the upload took too long, or another one replaced it.
         """
         if user in self._uploads:
             raise TooMuchError("you are pushing another package just now; try again when it is done", 5)
