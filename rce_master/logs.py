@@ -131,8 +131,7 @@ async def _ask(peer: LogReader | None, request: LogRequest) -> LogChunk:
 
 
 def _is_present(tables: Tables, request: LogRequest) -> bool:
-    """Whether the present incarnation is requested: its owner may read it at any time of the machine's
-    clock."""
+    """Whether the present incarnation is requested, whatever the time of the machine's clock."""
     status = tables.container_live(request.id).status
     query = request.query
     return not query.previous and query.incarnation in ("", status.incarnation if status is not None else "")

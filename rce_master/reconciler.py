@@ -1,4 +1,4 @@
-"""Makes the task sets do what is desired, and the state know what they report."""
+"""Sends the desired state to the task sets, and their reports to the state."""
 
 from __future__ import annotations
 
@@ -54,21 +54,21 @@ class Peer(LogReader, Protocol):
 
     @property
     def features(self) -> frozenset[str]:
-        """What it can do that one of an earlier release could not."""
+        """Its features that earlier releases do not have."""
 
     def send(self, message: ToTaskSet) -> None:
-        """Send a message; one that does not get through is made up for by the next ``Sync``."""
+        """Send a message; the next ``Sync`` makes up for a lost one."""
 
 
 class Reconciler:
     """Sends every change to the task sets that it concerns.
 
-    What changed of an endpoint goes to where it is placed, as a patch of the revision that was sent there
-    last; as a whole, if there is none or the task set takes no patches. Listens to the state service, so
-    nothing goes out that is not stored.
+    A change of an endpoint goes to its task set, as a patch of the revision that was last sent there; as a
+    whole, without such a revision or if the task set does not take patches. Listens to the state service, so
+    only stored changes are sent.
 
     Attributes:
-        book: What the connected task sets told of what they consume.
+        book: The usage reports of the connected task sets.
     """
 
     def __init__(self, state_service: StateService) -> None:
@@ -77,19 +77,19 @@ class Reconciler:
         self._peers: dict[str, Peer] = {}
         self._arriving: dict[str, Peer] = {}
         self._sent: dict[str, dict[str, int]] = {}
-        """The revision of each endpoint that a connected task set was sent last, by process and id."""
+        """The last revision of each endpoint that was sent to a connected task set, by process and id."""
         self._asked: set[tuple[str, str]] = set()
-        """Of which endpoints a whole status is on its way, with their process."""
+        """Endpoints whose whole status was requested, with their process."""
         state_service.listeners.append(self.on_changes)
 
     # From the task sets
 
     async def on_hello(self, peer: Peer, hello: Hello) -> None:
-        """Take a task set that just connected: adopt what runs there and tell it what is desired.
+        """Handle a task set that just connected: adopt what runs there and send the desired state.
 
         Raises:
             PeerRefusedError: Its name cannot be used.
-            StoreError: It cannot be stored; the task set is not taken.
+            StoreError: It cannot be stored; the task set is refused.
         """
         self._arriving[peer.process] = peer
         try:
@@ -100,7 +100,7 @@ class Reconciler:
             self._arriving.pop(peer.process, None)
 
     async def on_message(self, process: str, message: ToMaster) -> None:
-        """Note a report. It is done in the order of arrival, though not yet when this returns."""
+        """Queue a report. Reports are applied in the order of arrival, after this returns."""
         command: commands.Command
         match message:
             case Status():
@@ -145,7 +145,7 @@ class Reconciler:
         """Read the log of a container's node where it is (:func:`rce_master.logs.read_log`).
 
         Raises:
-            NotFoundError: There is no such container, node or log.
+            NotFoundError: The container, node or log does not exist.
             TaskSetAwayError: Its task set is not connected or does not answer.
         """
         request = LogRequest(id_, node, offset, limit, query)
@@ -155,7 +155,7 @@ class Reconciler:
         """Return the connected task set of a container.
 
         Raises:
-            NotFoundError: There is no such container.
+            NotFoundError: The container does not exist.
             TaskSetAwayError: Its task set is not connected, or it waits for a machine.
         """
         container = self._state_service.tables.container(id_)
@@ -169,13 +169,13 @@ class Reconciler:
 
     @property
     def usage(self) -> Mapping[str, Usage]:
-        """What each connected task set last told of what it consumes, by process name."""
+        """The last usage report of each connected task set, by process name."""
         return self.book.newest
 
     # To the task sets
 
     def on_changes(self, changes: Changes) -> None:
-        """Send what follows from a change."""
+        """Send the messages that follow from a change."""
         for withdrawal in changes.withdrawals:
             message = Drop(id=withdrawal.id, revision=withdrawal.revision, reason=withdrawal.reason)
             self._sent.get(withdrawal.process, {}).pop(withdrawal.id, None)
@@ -185,7 +185,7 @@ class Reconciler:
             if endpoint is None:
                 continue
             if id_ == changes.answered:
-                # Which revision the answer will have is not known yet, so the next change goes as a whole.
+                # The answer's revision is not known yet, so the next change goes as a whole.
                 self._sent.get(endpoint.task_set, {}).pop(id_, None)
             else:
                 self._send_change(endpoint.task_set, id_, touched)
@@ -199,13 +199,13 @@ class Reconciler:
             self._notify(notice)
 
     def probe(self, robot: str) -> None:
-        """Have the task set of a robot find out whether the robot is still there."""
+        """Ask the task set of a robot whether the robot still responds."""
         found = self._state_service.tables.robot(robot)
         if found is not None:
             self._send(found.task_set, Probe(id=robot))
 
     def _send_change(self, process: str, id_: str, touched: Touched) -> None:
-        """Send what changed of an endpoint to where it is, and to where it moves."""
+        """Send the changes of an endpoint to its task set, and to the one it moves to."""
         peer = self._peers.get(process)
         if peer is not None and self._sent[process].get(id_) == touched.since and PATCHES in peer.features:
             patch = self._state_service.patch(id_, touched)
@@ -225,7 +225,7 @@ class Reconciler:
             peer.send(Put(endpoint=spec))
 
     def _ask_status(self, process: str, id_: str) -> None:
-        """Ask for the whole status of an endpoint, once until it comes."""
+        """Ask for the whole status of an endpoint, once until it arrives."""
         peer = self._peers.get(process)
         if peer is not None and (process, id_) not in self._asked:
             self._asked.add((process, id_))
@@ -240,7 +240,7 @@ class Reconciler:
         peer.send(Sync(endpoints=specs))
 
     def _forget(self, process: str) -> None:
-        """Forget what is known of a connection that ended."""
+        """Forget the revisions of a connection that ended."""
         self._peers.pop(process, None)
         self._sent.pop(process, None)
         self._asked = {asked for asked in self._asked if asked[0] != process}

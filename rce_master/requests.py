@@ -1,4 +1,4 @@
-"""Turns what users ask for into commands on the state."""
+"""Converts users' requests to commands on the state."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def count_items(request: ClientRequest) -> int:
-    """Count the nodes, interfaces, ... that a client's request is about, without reading them."""
+    """Count the nodes, interfaces, ... in a client's request, without reading them."""
     content = request.content
     if content is not None:
         lists: Any = [getattr(content, name) for name in content.__struct_fields__ if name != "faults"]
@@ -28,7 +28,7 @@ def count_items(request: ClientRequest) -> int:
 
 
 def read(user: str, request: ClientRequest) -> tuple[list[commands.Request], list[str]]:
-    """Read a client's request. Task sets of the release before send it as the client did.
+    """Read a client's request. Task sets of the previous release send it in the client's form.
 
     Returns:
         The commands in the order in which they are to be done, and a text for each item that cannot be read.
@@ -44,14 +44,14 @@ def read(user: str, request: ClientRequest) -> tuple[list[commands.Request], lis
 
 
 def commands_of(request: Request | Component, user: str) -> Iterator[commands.Request]:
-    """Tell the commands of a request, in the order in which they are to be done.
+    """Return the commands of a request, in the order in which they are to be done.
 
-    What it removes is removed first, so that one request can replace something; parameters are set and
-    interfaces made before nodes start, so that a node finds them.
+    Removals come first, so that one request can replace an object; parameters are set and interfaces made
+    before nodes start, so that a node finds them.
 
     Args:
-        request: What is asked for.
-        user: Who asks.
+        request: The request.
+        user: The requesting user.
     """
     match request:
         case requests.ConfigureComponents():

@@ -1,4 +1,4 @@
-"""What is reported of interfaces and connections: which are in use now."""
+"""Reports about interfaces and connections: which are in use now."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def note(tx: Transaction, status: EndpointStatus) -> None:
-    """Note all that a whole report says of an endpoint's interfaces and connections."""
+    """Apply a whole report about an endpoint's interfaces and connections."""
     id_, tables = status.id, tx.tables
     active = {tag for tag, is_active in status.interfaces.items() if is_active}
     for interface in tables.active.by("endpoint", id_):
@@ -29,7 +29,7 @@ def note(tx: Transaction, status: EndpointStatus) -> None:
 
 
 def amend(tx: Transaction, patch: StatusPatch) -> None:
-    """Note what changed in a report."""
+    """Apply the changes of a report."""
     id_, tables = patch.status.id, tx.tables
     for tag in patch.removed_interfaces:
         tx.delete(tables.active, interface_key(id_, tag))
@@ -45,7 +45,7 @@ def amend(tx: Transaction, patch: StatusPatch) -> None:
 
 
 def forget(tx: Transaction, id_: str) -> None:
-    """Note that nothing is known of an endpoint any more."""
+    """Forget the reports about an endpoint."""
     for interface in tx.tables.active.by("endpoint", id_):
         tx.delete(tx.tables.active, interface.id)
     for end in tx.tables.open_ends.by("endpoint", id_):

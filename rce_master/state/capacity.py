@@ -1,4 +1,4 @@
-"""What the machines have and what was promised of it, out of the tables; and what one user may ask for."""
+"""The capacity and the promises of machines, from the tables; and the limits of one user's requests."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 
 def is_draining(tables: Tables, task_set: TaskSet) -> bool:
-    """Whether a machine takes no new containers and hands over those that it has."""
+    """Whether a machine is being drained."""
     return task_set.machine.draining or task_set.process in tables.drains
 
 
 def room_at(tables: Tables, task_set: TaskSet) -> Room:
-    """Count what is promised at a machine: to the containers there and to those that are on their way."""
+    """Sum up the promises of a machine: to its containers and to those that move there."""
     placed = [e for e in tables.endpoints.by("task_set", task_set.process) if isinstance(e, Container)]
     coming = [tables.container(move.id) for move in tables.moves.by("to", task_set.process)]
     room = Room(
@@ -39,7 +39,7 @@ def room_at(tables: Tables, task_set: TaskSet) -> Room:
 
 
 def _alias(tables: Tables, task_set: TaskSet) -> str:
-    """Tell one task set from others on the same machine: by its process."""
+    """Return a name that distinguishes task sets on the same machine."""
     namesakes = sum(
         s.machine.name == task_set.machine.name and s.kind is TaskSetKind.CONTAINER for s in tables.task_sets
     )
@@ -47,7 +47,7 @@ def _alias(tables: Tables, task_set: TaskSet) -> str:
 
 
 def rooms(tables: Tables, *, away: bool = False) -> dict[str, Room]:
-    """Count all container machines that are connected, or also those that may still come back, by process."""
+    """Return all connected container machines, or also those that may still come back, by process."""
     return {
         task_set.process: room_at(tables, task_set)
         for task_set in tables.task_sets
@@ -56,7 +56,7 @@ def rooms(tables: Tables, *, away: bool = False) -> dict[str, Room]:
 
 
 def group_mates(tables: Tables, container: Container) -> list[Container]:
-    """List the other containers that must be on the same machine: those of its group's network."""
+    """Return the other containers that must be on the same machine: those of its group's network."""
     requested = container.resources
     if requested.network is not Network.GROUP:
         return []
@@ -69,7 +69,7 @@ def group_mates(tables: Tables, container: Container) -> list[Container]:
 
 
 def open_to(tables: Tables, container: Container, found: dict[str, Room]) -> list[Room]:
-    """Choose, of machines, those where a container may be: with its group, not where it still ends."""
+    """Return the machines where a container may be: with its group, and not where it is still ending."""
     tied = {mate.task_set for mate in group_mates(tables, container) if mate.task_set}
     return [
         room
@@ -80,7 +80,7 @@ def open_to(tables: Tables, container: Container, found: dict[str, Room]) -> lis
 
 
 def company(tables: Tables, container: Container) -> Counter[str]:
-    """Count, by process, what a container belongs together with: its peers, and others of its group.
+    """Count, by process, the related endpoints of a container: its peers, and others of its group.
 
     A robot counts for the container machines on the same machine as its task set.
     """
@@ -116,20 +116,20 @@ def own(tables: Tables, container: Container) -> Counter[str]:
     return Counter(c.task_set for c in tables.containers(container.user) if c.id != container.id)
 
 
-# What a user may ask for
+# Limits of users' requests
 
 
 def check_resources(tx: Transaction, user: str, id_: str, requested: Resources) -> None:
-    """Check that a user may ask for this.
+    """Check that a user may request these resources.
 
     Args:
         tx: The transaction.
-        user: Whose container it is.
-        id_: The container; what it was promised before does not count.
-        requested: What it is to get.
+        user: The container's user.
+        id_: The container; its former promise does not count.
+        requested: The requested resources.
 
     Raises:
-        Refused: They may not; the text says why and how to mend it.
+        Refused: The request exceeds a limit; the text says why and how to fix it.
     """
     if 0 < requested.memory < MIN_MEMORY:
         raise InvalidRequestError(

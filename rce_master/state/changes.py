@@ -1,4 +1,4 @@
-"""What a command did: the journal of one transaction and all that follows from it outside the core."""
+"""The changes of a command: the journal of one transaction and its effects outside the core."""
 
 from __future__ import annotations
 
@@ -59,24 +59,24 @@ class Notice:
 
 @dataclass(frozen=True, slots=True)
 class StateEvent:
-    """Something that people want to know of; becomes an event of the API."""
+    """A message for users; becomes an event of the API."""
 
     kind: str
     user: str
     """Empty: of interest to administrators only."""
     subject: str
-    """What it is about, such as an endpoint id."""
+    """The object of the event, such as an endpoint id."""
     text: str
 
 
 @dataclass(slots=True)
 class Touched:
-    """Which parts of an endpoint's spec changed; the tables tell what they are now, or that they are gone."""
+    """The changed parts of an endpoint's spec; the tables hold those that still exist."""
 
     since: int = 0
     """The endpoint's revision before."""
     contents: bool = False
-    """Whether it is (also) something else than interfaces, links and connections."""
+    """Whether parts other than interfaces, links and connections changed (too)."""
     interfaces: dict[str, None] = field(default_factory=dict)
     """By tag."""
     links: dict[str, None] = field(default_factory=dict)
@@ -85,7 +85,7 @@ class Touched:
     """By id."""
 
     def include(self, earlier: Touched) -> None:
-        """Include what changed before this."""
+        """Include the changes before this one."""
         self.since = earlier.since
         self.contents |= earlier.contents
         self.interfaces = {**earlier.interfaces, **self.interfaces}
@@ -102,10 +102,10 @@ class _Write:
 
 @dataclass(slots=True)
 class Changes:
-    """All that one command changed and that has to follow."""
+    """The changes of one command and their effects."""
 
     touched: dict[str, Touched] = field(default_factory=dict)
-    """What changed in the specs of endpoints that are still desired, by their ids."""
+    """The changes in the specs of endpoints that are still desired, by their ids."""
     withdrawals: list[Withdrawal] = field(default_factory=list)
     notices: list[Notice] = field(default_factory=list)
     events: list[StateEvent] = field(default_factory=list)
@@ -120,11 +120,11 @@ class Changes:
     _writes: list[_Write] = field(default_factory=list)
 
     def written(self) -> dict[tuple[str, str], Table[Any]]:
-        """Tell which records the store has to keep: name of the table and key, to the table."""
+        """Return the records that the store has to keep: name of the table and key, to the table."""
         return {(w.table.name, w.key): w.table for w in self._writes if w.table.persistent}
 
     def rows(self) -> list[Row]:
-        """Write what the store has to keep, each key once."""
+        """Return the rows for the store, each key once."""
         return [make_row(table, key) for (_, key), table in self.written().items()]
 
     def revert(self) -> None:
@@ -134,22 +134,22 @@ class Changes:
         self._writes.clear()
 
     def record(self, table: Table[Any], key: str, before: Any) -> None:
-        """Note what was there before a write."""
+        """Note the former record before a write."""
         self._writes.append(_Write(table, key, before))
 
 
 def make_row(table: Table[Any], key: str) -> Row:
-    """Write a record as the store keeps it; one that is gone as its removal."""
+    """Return a record as a row of the store; for a removed one, its removal."""
     record = table.get(key)
     return Row(table.name, key, None if record is None else table.encode(record))
 
 
 class Transaction:
-    """Access to the tables for one command; whatever is written through it can be undone.
+    """Access to the tables for one command; all its writes can be undone.
 
     Args:
         tables: The tables.
-        now: Seconds of a clock that never goes back.
+        now: Seconds of a monotonic clock.
         settings: Limits and grace times.
         make_token: Makes a secret for a link.
     """
@@ -189,13 +189,13 @@ class Transaction:
         self._assign(self._table_of(record), record)
 
     def delete(self, table: Table[Any], key: str) -> None:
-        """Remove a record if it is there."""
+        """Remove a record if it exists."""
         if key in table:
             self.changes.record(table, key, table[key])
             table.assign(key, None)
 
     def touch(self, endpoint: str) -> None:
-        """Note that an endpoint's spec changed in something else than interfaces, links and connections."""
+        """Note that an endpoint's spec changed in parts other than interfaces, links and connections."""
         self._touched(endpoint).contents = True
 
     def touch_interface(self, endpoint: str, tag: str) -> None:
@@ -222,7 +222,7 @@ class Transaction:
         return value
 
     def newest(self, counter: str) -> int:
-        """Tell the number of a counter that was taken last."""
+        """Return the last number that was taken from a counter."""
         found = self.tables.counters.get(counter)
         return found.value if found else 0
 
@@ -245,12 +245,12 @@ class Transaction:
         self.changes.notices.append(Notice(to, text))
 
     def happen(self, kind: str, subject: str, text: str = "", *, user: str | None = None) -> None:
-        """Note an event. Without ``user``, the subject is an endpoint id that tells it."""
+        """Note an event. Without ``user``, the subject is an endpoint id that contains it."""
         owner = subject.partition("/")[0] if user is None else user
         self.changes.events.append(StateEvent(kind, owner, subject, text))
 
     def seal(self) -> Changes:
-        """Give every touched endpoint its new revision and hand out what was done."""
+        """Give every touched endpoint its new revision and return the changes."""
         touched = self.changes.touched
         self.changes.touched = {}
         for id_, parts in touched.items():

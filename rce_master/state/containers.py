@@ -1,4 +1,4 @@
-"""Containers: what users ask of them, where they are placed, what is reported of them."""
+"""Containers: requests of users, placement, and reports."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ _EVENTS = {
 }
 
 
-# What users ask for
+# Requests of users
 
 
 def create_container(tx: Transaction, command: CreateContainer) -> None:
-    """Make a container; the same one again is accepted silently."""
+    """Make a container; an identical one is accepted silently."""
     id_ = f"{command.user}/{command.tag}"
     there = tx.tables.endpoints.get(id_)
     if isinstance(there, Container):
@@ -69,14 +69,14 @@ def create_container(tx: Transaction, command: CreateContainer) -> None:
 
 
 def destroy_container(tx: Transaction, command: DestroyContainer) -> None:
-    """Remove a container with all that is in it and connected to it."""
+    """Remove a container with its parts and connections."""
     container = find(tx, command.user, command.tag)
     endpoints.remove(tx, container.id, "destroyed by its user")
     tx.happen("container_destroyed", container.id)
 
 
 def add_node(tx: Transaction, command: AddNode) -> None:
-    """Add a node; the same one again is accepted silently."""
+    """Add a node; an identical one is accepted silently."""
     container = find(tx, command.user, command.container)
     node = command.node
     there = container.nodes.get(node.tag)
@@ -96,7 +96,7 @@ def add_node(tx: Transaction, command: AddNode) -> None:
 
 
 def _check_order(container: Container, node: NodeSpec) -> None:
-    """Refuse nodes that would wait for one another; what a node comes after may be yet to come."""
+    """Refuse nodes that would wait for one another; a predecessor may be added later."""
     after = {other.tag: other.after for other in (*container.nodes.values(), node)}
     circle = find_circle(node.tag, after)
     if circle:
@@ -117,7 +117,7 @@ def remove_node(tx: Transaction, command: RemoveNode) -> None:
 
 
 def set_parameter(tx: Transaction, command: SetParameter) -> None:
-    """Set a parameter, whatever it was before."""
+    """Set a parameter; replaces an existing value."""
     container = find(tx, command.user, command.container)
     _check_value(command.name, command.value)
     there = container.parameters.get(command.name)
@@ -129,7 +129,7 @@ def set_parameter(tx: Transaction, command: SetParameter) -> None:
         )
     before = None if there is None else (command.name, there)
     size = endpoints.grown(tx, container, (command.name, command.value), before)
-    # Taken out first: 1 and True are equal, and an equal value must still replace the old one.
+    # Removed first: 1 and True are equal, and an equal value must still replace the old one.
     kept = {n: v for n, v in container.parameters.items() if n != command.name}
     tx.put(replace(container, parameters=kept))
     tx.put(replace(container, parameters={**kept, command.name: command.value}, size=size))
@@ -161,7 +161,7 @@ def find(tx: Transaction, user: str, tag: str) -> Container:
     """Find a container of a user.
 
     Raises:
-        Refused: There is none; the text says what there is.
+        Refused: It does not exist; the text lists the existing ones.
     """
     found = tx.tables.endpoints.get(f"{user}/{tag}")
     if isinstance(found, Container):
@@ -171,11 +171,11 @@ def find(tx: Transaction, user: str, tag: str) -> Container:
     raise NotFoundError(f"there is no container {tag!r}; create it first")
 
 
-# What task sets report
+# Reports of task sets
 
 
 def lose(tx: Transaction, container: Container) -> None:
-    """Give a container up at a task set that stayed away."""
+    """Give up a container at a task set that stayed away."""
     if draining.promote(tx, container):
         return
     text = f"container {container.tag!r} was lost with its machine {container.task_set!r}"
@@ -185,7 +185,7 @@ def lose(tx: Transaction, container: Container) -> None:
 
 
 def ended(tx: Transaction, container: Container) -> None:
-    """Note that a container's task set ended it though it is desired; it is placed again."""
+    """Note that a container's task set ended it although it is desired; it is placed again."""
     if draining.promote(tx, container):
         return
     _unbind(tx, container, ContainerEvent.WITHDRAW)
@@ -214,7 +214,7 @@ def _forget_status(tx: Transaction, container: Container) -> None:
 
 
 def reported(tx: Transaction, container: Container, status: EndpointStatus) -> None:
-    """Note what its task set reports of a container beside its interfaces and connections."""
+    """Apply a task set's report about a container, except its interfaces and connections."""
     before = tx.tables.container_live(container.id)
     event = _EVENTS[status.state]
     if before.after(event, tx.now).phase is not before.phase:

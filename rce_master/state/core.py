@@ -1,4 +1,4 @@
-"""The state: applies commands, one after the other, each wholly or not at all."""
+"""The state: applies commands one after the other, each atomically."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def _new_token() -> str:
 
 
 class State:
-    """Users, task sets, robots, containers and how they are wired, desired and observed.
+    """Users, task sets, robots, containers and their wiring, desired and observed.
 
     No I/O, no clock, no task: the time comes with every command.
 
@@ -109,11 +109,11 @@ class State:
     def load(
         cls, snapshot: Snapshot, now: float, settings: StateSettings | None = None, *, revision: int = 0
     ) -> State:
-        """Go on from what the store holds.
+        """Load the state from the store.
 
         Args:
-            snapshot: What the store holds, of this release or the one before; a store that is written to
-                must be converted first (:func:`rce_master.state.migration.conversion`).
+            snapshot: The contents of the store, of this release or the previous one; a store that is written
+                to must be converted first (:func:`rce_master.state.migration.conversion`).
             now: Seconds of a clock that never goes back.
             settings: Limits and times.
             revision: Revisions continue above this, also if the store is an old copy. It must grow from one
@@ -137,14 +137,14 @@ class State:
         """Apply a command.
 
         Args:
-            command: What is asked or happened.
+            command: The command.
             now: Seconds of a clock that never goes back.
 
         Returns:
-            What changed and what has to follow.
+            The changes and their effects.
 
         Raises:
-            Refused: It cannot be done; nothing changed.
+            Refused: The state does not allow it; nothing changed.
         """
         tx = self._begin(now)
         try:
@@ -155,7 +155,7 @@ class State:
             raise
 
     def spec(self, endpoint: str) -> EndpointSpec:
-        """Tell what is desired of an endpoint.
+        """Return the desired state of an endpoint.
 
         Raises:
             KeyError: There is no such endpoint.
@@ -163,11 +163,11 @@ class State:
         return build_spec(self.tables, endpoint)
 
     def copy_spec(self, endpoint: str) -> tuple[str, EndpointSpec] | None:
-        """Tell what is desired of a container's copy at the machine that it moves to; None if there is none.
+        """Return the desired state of a container's copy at its next machine; None without a copy.
 
         Returns:
-            The process name of the task set, and what it is to make: all that is in the container, but
-            nothing that joins it with others.
+            The process name of the task set, and the spec to make: the contents of the container, without
+            interfaces and connections.
         """
         move = self.tables.moves.get(endpoint)
         if move is None:
@@ -175,7 +175,7 @@ class State:
         return move.to, build_spec(self.tables, endpoint, with_wiring=False)
 
     def patch(self, endpoint: str, touched: Touched) -> SpecPatch:
-        """Return what is desired now of the parts of an endpoint that changed.
+        """Return the desired state of the changed parts of an endpoint.
 
         Raises:
             KeyError: There is no such endpoint.
@@ -186,7 +186,7 @@ class State:
         """Check all invariants.
 
         Raises:
-            AssertionError: One does not hold; the text says which.
+            AssertionError: An invariant does not hold; the text says which.
         """
         validate(self.tables)
 

@@ -1,4 +1,4 @@
-"""What robots and containers have in common: removal, addresses, who dials whom."""
+"""Functions for robots and containers: removal, addresses, and which end dials."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
     from rce_master.state.wiring_records import Connection, Link
 
 _SMALL = 32 * 2**10
-"""Endpoints up to this size are so small that their number limits them well enough."""
+"""Endpoints up to this size are not checked: their number limits them sufficiently."""
 
 
 def size_of(part: object) -> int:
-    """Tell how many bytes a node, a parameter or an interface takes when it is written down."""
+    """Return how many bytes a node, a parameter or an interface takes when it is encoded."""
     return len(msgspec.json.encode(part))
 
 
 def grown(tx: Transaction, endpoint: Endpoint, part: object, instead_of: object = None) -> int:
-    """Tell an endpoint's size when a part is put into it.
+    """Return an endpoint's size with a new part.
 
     Raises:
         LimitReachedError: It, or all endpoints of its user, would be too large.
@@ -83,7 +83,7 @@ def withdraw(tx: Transaction, endpoint: Endpoint, reason: str) -> None:
 
 
 def drop_copy(tx: Transaction, id_: str, reason: str) -> None:
-    """Have the copy of a container that is being handed over dropped, if there is one."""
+    """Drop the copy of a container that is being handed over, if it exists."""
     move = tx.tables.moves.get(id_)
     if move is None:
         return

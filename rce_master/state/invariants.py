@@ -1,4 +1,4 @@
-"""What always holds between two commands."""
+"""The invariants of the state between two commands."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def validate(tables: Tables) -> None:
     """Check all invariants.
 
     Raises:
-        AssertionError: One does not hold; the text says which.
+        AssertionError: An invariant does not hold; the text says which.
     """
     _check_indexes(tables)
     for endpoint in tables.endpoints:

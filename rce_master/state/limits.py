@@ -1,4 +1,4 @@
-"""What one user may have, and what they have: containers, what these ask for, packages."""
+"""The limits of one user, and their usage: containers, requested resources, packages."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Limit(NamedTuple):
 
 
 def set_limits(tx: Transaction, command: SetLimits) -> None:
-    """Change what a user may have; what is there already stays."""
+    """Change a user's limits; existing objects stay."""
     if command.user not in tx.tables.users:
         raise NotFoundError(f"there is no user {command.user!r}")
     there = tx.tables.user_limits.get(command.user) or UserLimits(user=command.user)
@@ -50,13 +50,13 @@ def set_limits(tx: Transaction, command: SetLimits) -> None:
 
 
 def forget(tx: Transaction, user: str) -> None:
-    """Forget what was set for a user."""
+    """Remove the limits that were set for a user."""
     if user in tx.tables.user_limits:
         tx.delete(tx.tables.user_limits, user)
 
 
 def limit_of(tables: Tables, settings: StateSettings, user: str, kind: str) -> Limit:
-    """Tell how much of a kind a user may have."""
+    """Return a user's limit of a kind."""
     own = tables.user_limits.get(user)
     if own is not None and (most := asdict(own)[kind]) is not None:
         return Limit(kind, most, "user")
@@ -70,7 +70,7 @@ def limit_of(tables: Tables, settings: StateSettings, user: str, kind: str) -> L
 
 
 def used_of(tables: Tables, user: str) -> dict[str, float]:
-    """Tell how much of each kind a user has."""
+    """Return a user's usage of each kind."""
     all_requested = [container.resources for container in tables.containers(user)]
     packages = tables.packages.by("user", user)
     return {
@@ -85,7 +85,7 @@ def check_containers(tx: Transaction, user: str) -> None:
     """Check that a user may have one more container.
 
     Raises:
-        LimitReachedError: There are as many as they may have.
+        LimitReachedError: The limit is reached.
     """
     limit = limit_of(tx.tables, tx.settings, user, "containers")
     if limit.most and len(tx.tables.containers(user)) >= limit.most:
@@ -95,10 +95,10 @@ def check_containers(tx: Transaction, user: str) -> None:
 
 
 def check_all_resources(tx: Transaction, user: str, all_requested: list[Resources]) -> None:
-    """Check what a user's containers ask for together.
+    """Check the total of the requests of a user's containers.
 
     Raises:
-        LimitReachedError: It is more than they may have.
+        LimitReachedError: It exceeds a limit.
     """
     for kind in _OF_MACHINES:
         limit = limit_of(tx.tables, tx.settings, user, kind)
@@ -154,7 +154,7 @@ _SETTINGS = {
 
 
 def _offered(tables: Tables, kind: str) -> float:
-    """Count what all machines have that are known, also of those that are away."""
+    """Sum up the resources of all known machines, including those that are away."""
     machines = [s.machine for s in tables.task_sets if s.kind is TaskSetKind.CONTAINER]
     return sum({"slots": m.slots, "cpu": m.cores, "memory": m.memory}[kind] for m in machines)
 

@@ -1,6 +1,6 @@
-"""Converts what the release before stored: interfaces and connections were parts of endpoints and links.
+"""Converts stores of the previous release, whose endpoints and links contain interfaces and connections.
 
-Pure. What is converted already stays as it is, so that a conversion that was interrupted is done again.
+Pure. Converted records stay as they are, so an interrupted conversion can be repeated.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _write = msgspec.json.encode
 
 
 def conversion(snapshot: Snapshot) -> list[Row]:
-    """Return the rows to write so that a store of the release before is one of this release.
+    """Return the rows that convert a store of the previous release to this release.
 
     Raises:
         StoreError: A record cannot be read.
@@ -63,7 +63,7 @@ def conversion(snapshot: Snapshot) -> list[Row]:
 
 
 def converted(snapshot: Snapshot) -> Snapshot:
-    """Return what a store holds as this release stores it.
+    """Return the contents of a store in the form of this release.
 
     Raises:
         StoreError: A record cannot be read.

@@ -1,6 +1,6 @@
 """Packages that users bring: their versions, and the keys by which these are signed.
 
-What a version holds is kept elsewhere, under its hash; here is what is known of it.
+The contents of a version are kept elsewhere, under its hash; this module keeps its record.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def add_key(tx: Transaction, command: AddPackageKey) -> None:
-    """Trust a key; the same one again is accepted silently."""
+    """Trust a key; a trusted one is accepted silently."""
     key = command.key
     if key.user not in tx.tables.users:
         raise NotFoundError(f"there is no user {key.user!r}")
@@ -40,7 +40,7 @@ def add_key(tx: Transaction, command: AddPackageKey) -> None:
 
 
 def remove_key(tx: Transaction, command: RemovePackageKey) -> None:
-    """Trust a key no more. What it signed before stays until it is removed."""
+    """Stop trusting a key. Packages that it signed before stay until they are removed."""
     found = [key for key in tx.tables.package_keys.by("user", command.user) if key_id(key.key) == command.id]
     if not found:
         raise NotFoundError(f"you have no key {command.id!r}")
@@ -49,12 +49,12 @@ def remove_key(tx: Transaction, command: RemovePackageKey) -> None:
 
 
 def check_new(tables: Tables, package: UserPackage) -> bool:
-    """Tell whether a version is new; the same one again is not.
+    """Return whether a version is new; an identical one is not.
 
     Raises:
         InvalidRequestError: Its name or version cannot be one.
         NotFoundError: Its key is not registered.
-        ConflictError: There is another one of the same version.
+        ConflictError: The same version exists with other contents.
     """
     if not is_name(package.name) or not is_version(package.version):
         raise InvalidRequestError(
@@ -75,7 +75,7 @@ def check_new(tables: Tables, package: UserPackage) -> bool:
 
 
 def add_package(tx: Transaction, command: AddPackage) -> None:
-    """Take a version; the same one again is accepted silently. What names the package is told of it."""
+    """Store a version; an identical one is accepted silently. Containers that name the package get it."""
     package = command.package
     if package.user not in tx.tables.users:
         raise NotFoundError(f"there is no user {package.user!r}")
@@ -133,7 +133,7 @@ def forget_user(tx: Transaction, user: str) -> None:
 
 
 def find(tables: Tables, user: str, pkg: str) -> UserPackage | None:
-    """Find what a node names: the version that it says, or the newest; None if the user brought none."""
+    """Return the version that a node names, or the newest; None if the user brought none."""
     name, version = split_package(pkg)
     if version:
         return tables.packages.get(user_package_key(user, name, version))
@@ -141,12 +141,12 @@ def find(tables: Tables, user: str, pkg: str) -> UserPackage | None:
 
 
 def _finder(tables: Tables, user: str) -> Callable[[str], UserPackage | None]:
-    """Make a :func:`find` that looks once for each text: many nodes name the same, and versions are many."""
+    """Return a cached :func:`find`: many nodes name the same package, and there may be many versions."""
     return cache(lambda pkg: find(tables, user, pkg))
 
 
 def uses(tables: Tables, user: str) -> dict[str, list[str]]:
-    """Tell which nodes of a user need which version: ``CONTAINER/NODE`` by the versions' ids."""
+    """Return the nodes of a user that need each version: ``CONTAINER/NODE`` by the versions' ids."""
     found: dict[str, list[str]] = {}
     lookup = _finder(tables, user)
     for container in tables.containers(user):
@@ -158,10 +158,10 @@ def uses(tables: Tables, user: str) -> dict[str, list[str]]:
 
 
 def check_node(tables: Tables, user: str, node: NodeSpec) -> None:
-    """Check that there is the version which a node names.
+    """Check that the version which a node names exists.
 
     Raises:
-        NotFoundError: There is not.
+        NotFoundError: It does not exist.
     """
     name, version = split_package(node.pkg)
     if version and find(tables, user, node.pkg) is None:
@@ -171,7 +171,7 @@ def check_node(tables: Tables, user: str, node: NodeSpec) -> None:
 
 
 def package_specs(tables: Tables, container: Container) -> tuple[PackageSpec, ...]:
-    """Tell what the nodes of a container need, in the order of names and versions."""
+    """Return the packages that the nodes of a container need, in the order of names and versions."""
     found = map(_finder(tables, container.user), [node.pkg for node in container.nodes.values()])
     needed = {package.id: package for package in found if package is not None}
     return tuple(_spec(needed[id_]) for id_ in sorted(needed))
