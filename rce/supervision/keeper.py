@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rce.supervision.process import Child
 
 OUTPUT_TIMEOUT_S = 1.0
-"""How long the output of an ended program is read on; something that it started may hold it open."""
+"""How long the output of an ended program is still read; a process that it started may hold it open."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,11 +22,11 @@ class RestartPolicy:
     """When a program that ended is started again."""
 
     backoff: Backoff
-    """Pauses before it is."""
+    """Pauses before each start."""
     stable_s: float
-    """A program that ran for so long is well: its ends are counted from the first again."""
+    """Seconds after which a running program counts as stable: the count of its ends restarts."""
     max_ends: int = 0
-    """So many ends in a row are the last; 0: no number is."""
+    """After so many ends in a row it is not started again; 0: no limit."""
 
 
 class Keeper:
@@ -56,7 +56,7 @@ class Keeper:
         self._stopping = asyncio.Event()
 
     async def start(self) -> Child:
-        """Start a process, without waiting for its end; :meth:`run` does what follows.
+        """Start a process without waiting for its end; then call :meth:`run`.
 
         Raises:
             OSError: That is not possible.
@@ -67,8 +67,8 @@ class Keeper:
     async def run(self, on_end: Callable[[int, float | None], bool]) -> int:
         """Keep the program running.
 
-        A process that :meth:`start` started is the first one. What ends this, also cancellation and an error
-        of ``on_end``, ends the process.
+        A process that :meth:`start` started is the first one. The end of this call, also by cancellation or
+        an error of ``on_end``, ends the process.
 
         Args:
             on_end: Called with the exit code of each process that ended by itself, and with the pause before
@@ -99,7 +99,7 @@ class Keeper:
                 return code
 
     async def stop(self, *, timeout: float) -> None:
-        """End the program, and start it no more. :meth:`run` returns then.
+        """End the program, and do not start it again. :meth:`run` then returns.
 
         Args:
             timeout: Seconds from SIGTERM to SIGKILL.
@@ -117,7 +117,7 @@ class Keeper:
     async def _run_once(self, child: Child) -> int:
         reading = asyncio.create_task(self._read(child))
         try:
-            if self._stopping.is_set():  # it was told to as the process was being started
+            if self._stopping.is_set():  # stop was called while the process was being started
                 await child.stop()
             return await child.wait()
         finally:

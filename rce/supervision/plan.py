@@ -1,6 +1,6 @@
-"""What a supervisor is to run, and how the program that read the command line hands it to a small one.
+"""The plan of a supervisor, and its handover from the program that read the command line to a small one.
 
-What reads command lines and settings takes 10 MB, which the supervisor would hold for as long as it runs.
+The readers of command lines and settings take 10 MB, which the supervisor would hold for as long as it runs.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Program:
     argv: Sequence[str]
     env: Mapping[str, str] = field(default_factory=dict)
     final: Sequence[str] = ()
-    """A command that removes what the program leaves if it is killed. It runs after the program's last end if
+    """A command that cleans up after the program if it is killed. It runs after the program's last end if
     that was not a proper one, and also when the supervisor itself is killed."""
     module: str = ""
     """The Python package that :attr:`argv` runs, if the program may be a fork of its supervisor: its
@@ -36,13 +36,13 @@ class Program:
 
     @property
     def arguments(self) -> Sequence[str]:
-        """What follows the module on the command line."""
+        """The arguments after the module on the command line."""
         return self.argv[self.argv.index(self.module) + 1 :]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """The programs of an engine, and what to say of them."""
+    """The programs of an engine, and the lines to print."""
 
     programs: tuple[Program, ...]
     shared: tuple[str, ...] = ()
@@ -55,10 +55,10 @@ class Plan:
     """The engine's settings as a document, if its certificates are to be kept; empty without TLS."""
 
     def hand_over(self) -> NoReturn:
-        """Go on as the supervisor of this plan, in this process; what was loaded is given back.
+        """Become the supervisor of this plan, in this process; the memory of loaded modules is released.
 
         Raises:
-            OSError: The interpreter cannot be started, or the plan not be written.
+            OSError: The interpreter cannot be started, or the plan cannot be written.
         """
         from tempfile import TemporaryFile  # takes 1 MB, which the supervisor does not need
 

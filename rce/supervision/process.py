@@ -44,7 +44,7 @@ class Process(Protocol):
 
     @property
     def stdout(self) -> asyncio.StreamReader | None:
-        """What it prints."""
+        """Its output."""
 
     async def wait(self) -> int:
         """Wait for its end; return the exit code."""
@@ -87,7 +87,7 @@ class Child:
         return self._process.returncode
 
     async def lines(self) -> AsyncIterator[str]:
-        """Yield what the program prints, until it closes its output."""
+        """Yield the lines of the program's output, until it closes the output."""
         assert self._process.stdout is not None
         while True:
             try:
@@ -116,7 +116,7 @@ class Child:
                 await self.wait()
 
     def hurry(self) -> None:
-        """Tell it once more to end, which programs take as a request not to wait for others."""
+        """Send SIGTERM once more, which programs take as a request not to wait for others."""
         if self.returncode is None:
             self._signal(signal.SIGTERM)
 

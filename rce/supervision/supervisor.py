@@ -27,7 +27,7 @@ class Supervisor:
     Args:
         programs: In the order in which they start.
         show: Gets every line they print.
-        prepared: Forks that are to become some of them, by their names, at their first start.
+        prepared: Forks for the first start of some of them, by their names.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Supervisor:
         self._finals: dict[str, FinalCommand] = {}
 
     def hurry(self) -> None:
-        """Pass on to the programs that the user wants the end at once."""
+        """Tell the programs that the user wants them to end at once."""
         for child in self._children():
             child.hurry()
 
@@ -87,9 +87,9 @@ class Supervisor:
             self._finals[program.name] = await FinalCommand.arm(program.final)
 
     async def _end_finally(self) -> None:
-        """Remove what programs left that did not end properly.
+        """Clean up after programs that did not end properly.
 
-        One may have been killed before, and the next have ended before it removed what the first one left.
+        One may have been killed before, and the next may have ended before it cleaned up after the first one.
         """
         is_clean = not any(child.returncode for child in self._children())
         for name, final in self._finals.items():
@@ -124,13 +124,13 @@ class Supervisor:
 async def _end(tasks: Sequence[asyncio.Task[None]]) -> None:
     """Cancel tasks one after the other, the last one first."""
     for task in reversed(tasks):
-        if not task.cancelling():  # a second time would cut short how it ends its program
+        if not task.cancelling():  # a second cancellation would interrupt the end of its program
             task.cancel()
         await asyncio.wait([task])
 
 
 async def _to_its_end(work: Coroutine[Any, Any, None]) -> None:
-    """Do something whole, however often this is cancelled meanwhile."""
+    """Run something to its end, however often this is cancelled meanwhile."""
     task = asyncio.create_task(work)
     cancelled = False
     while not task.done():

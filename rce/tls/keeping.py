@@ -1,4 +1,4 @@
-"""Have the certificates of an engine that ``rce up`` runs: made at first, renewed while it runs."""
+"""Makes the certificates of an engine that ``rce up`` runs, and renews them while it runs."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ CHECK_EVERY_S = 6 * 3600.0
 
 @contextlib.asynccontextmanager
 async def keep_certificates(settings: EngineSettings, say: Callable[[str], None]) -> AsyncIterator[None]:
-    """Keep the engine's certificate good while the context lasts. Does nothing for an engine without TLS.
+    """Keep the engine's certificate valid while the context lasts. Does nothing for an engine without TLS.
 
     Args:
         settings: Of the engine.
-        say: Told what was made or renewed.
+        say: Called with a text on each certificate that was made or renewed.
 
     Raises:
         CertificateError: The certificates cannot be made.
@@ -44,7 +44,7 @@ async def keep_certificates(settings: EngineSettings, say: Callable[[str], None]
 
 
 def ensure(settings: EngineSettings, full_name: str) -> str:
-    """Make what is missing of the engine's certificates; blocks.
+    """Make the missing certificates of the engine; blocks.
 
     Args:
         settings: Of the engine.

@@ -1,4 +1,4 @@
-"""A table of routes: each says what it takes and gives, so that server and document are made of one."""
+"""A table of routes with their parameters and replies, from which server and document are made."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
 H = TypeVar("H")
-"""What handles a request: a function or a method."""
+"""A handler of requests: a function or a method."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Route(Generic[H]):
-    """A method of a path, what it takes and gives, and what handles it.
+    """A method of a path, its parameters, its reply and its handler.
 
-    A server whose routes say more derives from this.
+    A server whose routes have more fields derives from this.
     """
 
     method: str
@@ -45,7 +45,7 @@ class Route(Generic[H]):
 
     @property
     def operation(self) -> Operation:
-        """What the OpenAPI document tells of it."""
+        """Its entry in the OpenAPI document."""
         told = {field.name: getattr(self, field.name) for field in fields(Operation)}
         name = self.name or getattr(self.handler, "__name__", self.summary)
         return Operation(**(told | {"name": name} | self.told()))
@@ -83,9 +83,9 @@ class RouteTable(Generic[R]):
         """Decorate a handler.
 
         Args:
-            method: HTTP's.
+            method: The HTTP method.
             path: See :attr:`Route.path`.
-            summary: What it does, in a line.
+            summary: A line on its purpose.
             options: Further fields of the route.
 
         Raises:
