@@ -1,4 +1,4 @@
-"""Giving back in order what was taken: handles of a node, and many connections at once."""
+"""Orderly closing: handles of a node, and many connections at once."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Protocol
 from rce.ros.errors import MasterError
 
 CLOSE_TIMEOUT = 1.0
-"""Seconds that peers get to take what was written before their connections are cut."""
+"""Seconds that peers may take to read written data before their connections are aborted."""
 
 
 class Closable(Protocol):
@@ -20,14 +20,14 @@ class Closable(Protocol):
     """Set when the socket is closed."""
 
     def close(self) -> None:
-        """Close once what was written is out."""
+        """Close once the written data has been sent."""
 
     def abort(self) -> None:
         """Close now."""
 
 
 async def close_all(connections: Iterable[Closable]) -> None:
-    """Close connections and wait until their sockets are closed; those that take too long are cut."""
+    """Close connections and wait until their sockets are closed; abort those that take too long."""
     pending = list(connections)
     for connection in pending:
         connection.close()
@@ -49,7 +49,7 @@ class Handle(Protocol):
     """A publisher, subscriber or service of a node."""
 
     async def close(self) -> None:
-        """Give it back."""
+        """Close the handle."""
 
 
 async def release(handle: Handle) -> None:

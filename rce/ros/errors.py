@@ -1,23 +1,23 @@
-"""Everything that can go wrong on a ROS graph.
+"""Errors of a ROS graph.
 
 ::
 
     RosError
     +-- InvalidNameError            a graph name or remapping that ROS does not allow (also a ValueError)
-    +-- XmlRpcError                 talking XML-RPC
-    |   +-- MalformedDocumentError  what came or should go is not acceptable XML-RPC
+    +-- XmlRpcError                 an XML-RPC exchange failed
+    |   +-- MalformedDocumentError  a received document, or a value to send, is not valid XML-RPC
     |   +-- RemoteFaultError        the server answered with a fault
     |   +-- RpcUnreachableError     no answer: refused, lost or timed out
     +-- MasterError
     |   +-- MasterUnreachableError  the master gave no answer
-    |   +-- MasterRefusedError      the master answered that it could not or would not
+    |   +-- MasterRefusedError      the master answered with a status other than success
     +-- ParameterMissingError       no such parameter (also a KeyError)
-    +-- TcprosError                 talking TCPROS
+    +-- TcprosError                 a TCPROS connection cannot continue
     |   +-- MalformedFrameError     a header or length that breaks the protocol
     |   +-- HandshakeRefusedError   the two ends do not agree on type or name
     +-- TypeMismatchError           one topic or service used with two types in one node
     +-- ServiceError                a service call that has no response
-    |   +-- ServiceNotFoundError    nobody provides the service
+    |   +-- ServiceNotFoundError    the service has no provider
     |   +-- ServiceLostError        the provider could not be reached or went away before it answered
     |   +-- ServiceFaultError       the provider answered with an error; handlers raise it to do so
     |   +-- ServiceTimeoutError     no answer in time (also a TimeoutError)
@@ -48,7 +48,7 @@ class RemoteFaultError(XmlRpcError):
 
     Attributes:
         code: The server's fault code.
-        text: The server's words.
+        text: The server's text.
     """
 
     def __init__(self, code: int, text: str) -> None:
@@ -64,7 +64,7 @@ class RpcUnreachableError(XmlRpcError):
     """No answer came from a server.
 
     Attributes:
-        uri: Who was called.
+        uri: The server's URI.
         reason: Why there is no answer.
     """
 
@@ -102,9 +102,9 @@ class MasterRefusedError(MasterError):
     """The ROS master answered with a status other than success.
 
     Attributes:
-        method: What was asked.
+        method: The method that was called.
         status: -1 for a caller's mistake, 0 for a failure of the master.
-        text: The master's words.
+        text: The master's text.
     """
 
     def __init__(self, method: str, status: int, text: str) -> None:
@@ -168,7 +168,7 @@ class ServiceError(RosError):
 
 
 class ServiceNotFoundError(ServiceError):
-    """Nobody provides the service."""
+    """The service has no provider."""
 
     text = "it has no provider"
 

@@ -4,10 +4,10 @@ A package is a folder with a ``package.yaml`` (ours) or a ``package.xml`` (ROS's
 of the package path (:mod:`rce.ros.package_tree`), or one directly below that holds ``msg`` or ``srv`` folders
 only, as distributions install them. Its executables are files in the folder itself or in
 ``nodes``, ``scripts``, ``bin`` or ``lib`` below it; those of a package that is installed as
-``PREFIX/share/PKG`` are also in ``PREFIX/lib/PKG``. What is in none of these is looked for at any depth of
+``PREFIX/share/PKG`` are also in ``PREFIX/lib/PKG``. Executables in none of these are searched at any depth of
 the package's folder, as rosrun and roslaunch do (:mod:`rce.ros.executables`).
 
-An installed Python distribution adds packages and nodes by entry points; what is on the path goes before:
+An installed Python distribution adds packages and nodes by entry points; the path takes precedence:
 
 * group ``rce.packages``: named after a package; the value is the Python package whose folder it is.
 * group ``rce.nodes``: named ``PKG:EXE``; the value is a function, or a module that is run as a script.
@@ -50,7 +50,7 @@ FOLDERS = ("", "nodes", "scripts", "bin", "lib")
 """Folders below a package in which a node's file is looked for."""
 
 MANIFESTS = ("package.yaml", "package.xml")
-"""What a manifest may be called, the more important first."""
+"""Names of manifests, the more important first."""
 
 ROSBUILD_MANIFEST = "manifest.xml"
 """The manifest of packages from before catkin, which gives no name: the folder's counts."""
@@ -60,11 +60,11 @@ _PYTHONS = ("engine", "system")
 
 
 class PackageError(Exception):
-    """Base of what can go wrong with packages."""
+    """Base of all errors of packages."""
 
 
 class PackageNotFoundError(PackageError, LookupError):
-    """There is no package of a name on the path."""
+    """A package was not found on the path."""
 
 
 class ExecutableNotFoundError(PackageError, LookupError):
@@ -84,22 +84,22 @@ class Package(NamedTuple):
     python: str = "system"
     """``engine``: .py files run with the engine's Python; ``system``: as their first line says."""
     version: str = ""
-    """As the manifest says it; empty if it does not."""
+    """As in the manifest; empty if it has none."""
 
     def executable(self, exe: str) -> list[str]:
-        """Return what to execute to start a node: the first words of its command line.
+        """Return the command that starts a node: the first words of its command line.
 
         Args:
             exe: Name of the file, with or without the folder below the package.
 
         Raises:
-            ExecutableNotFoundError: There is no such file, it may not be executed, or the name leads out of
-                the package.
+            ExecutableNotFoundError: The file does not exist, may not be executed, or the name leads out of
+            the package.
         """
         if not exe or exe.startswith("/") or "\0" in exe or ".." in PurePosixPath(exe).parts:
             raise ExecutableNotFoundError(f"{exe!r} is not a file inside package {self.name}")
         files = [folder / exe for folder in self._folders()]
-        meant = [file for file in files if os.path.isfile(file)]  # noqa: PTH113 - pathlib's question may raise
+        meant = [file for file in files if os.path.isfile(file)]  # noqa: PTH113 - pathlib's method may raise
         for file in meant:
             if command := self._command(file):
                 return command
@@ -107,7 +107,7 @@ class Package(NamedTuple):
             return [str(found)]
         if meant:
             raise ExecutableNotFoundError(f"{meant[0]} may not be executed (chmod +x makes it so)")
-        for name, target in _scripts(self.name):  # last, because all that is installed must be looked through
+        for name, target in _scripts(self.name):  # last, because it searches all installed distributions
             if name == exe:
                 return [sys.executable, *_arguments_of(target)]
         where = ", ".join(str(folder) for folder in self._folders() if folder.is_dir())
@@ -123,7 +123,7 @@ class Package(NamedTuple):
             yield self.path.parent.parent / "lib" / self.name
 
     def _command(self, file: Path) -> list[str]:
-        """Return how to execute a file; empty if it may not be executed."""
+        """Return the command that executes a file; empty if it may not be executed."""
         if self.python == "engine" and file.suffix == ".py":
             return [sys.executable, str(file)]
         return [str(file)] if is_executable(file) else []
@@ -153,7 +153,7 @@ class PackageIndex:
         """Return the package of a name.
 
         Raises:
-            PackageNotFoundError: There is none on the path, and no distribution adds nodes under its name.
+            PackageNotFoundError: It is not on the path, and no distribution adds nodes under its name.
             BadPackageError: Its manifest cannot be read.
         """
         folder = self.locate(name)
@@ -167,7 +167,7 @@ class PackageIndex:
         raise PackageNotFoundError(f"no package {name!r} on the package path ({self.describe_path()}){hint}")
 
     def locate(self, name: str) -> Path | None:
-        """Return the folder of a package, None if there is none on the path and no distribution has it.
+        """Return the folder of a package; None if it is neither on the path nor in a distribution.
 
         Raises:
             BadPackageError: A distribution names a folder that does not exist.
@@ -225,7 +225,7 @@ def _installed(share: Path, name: str) -> Path | None:
 
 
 def _holds_definitions(folder: Path) -> bool:
-    # Not pathlib's question: it raises where a folder may not be entered, and the other folders are to count.
+    # Not pathlib's method: it raises if a folder may not be entered, and the other folders must be searched.
     return any(os.path.isdir(folder / kind) for kind in ("msg", "srv", "action"))  # noqa: PTH112
 
 
@@ -279,8 +279,8 @@ def parse_manifest(manifest: Path, text: bytes, name: str) -> Package:
     """Read the text of a manifest.
 
     Args:
-        manifest: Where it is from; its suffix tells its kind.
-        text: What it holds.
+        manifest: Its path; the suffix tells its kind.
+        text: Its contents.
         name: The package's name if the manifest gives none.
 
     Raises:
@@ -310,7 +310,7 @@ def _parse_yaml(manifest: Path, text: bytes, name: str) -> Package:
 
 
 def _text(data: dict[Any, Any], key: str) -> str:
-    # Of anything else no text is made: a few lines of aliases may stand for a tree of any size.
+    # Other values are not converted to text: a few lines of aliases may expand to a tree of any size.
     found = data.get(key, "")
     return found if isinstance(found, str) else ""
 
@@ -329,7 +329,7 @@ def _parse_xml(manifest: Path, text: bytes, name: str) -> Package:
 
 @cache
 def _distributed() -> Mapping[str, str]:
-    """Read which packages Python distributions add: name to Python package."""
+    """Return the packages that Python distributions add: name to Python package."""
     from importlib.metadata import entry_points
 
     return {point.name: point.value for point in entry_points(group=PACKAGE_ENTRY_POINTS)}
@@ -349,7 +349,7 @@ def _distributed_nodes() -> tuple[tuple[str, str, str], ...]:
 
 
 def _arguments_of(target: str) -> list[str]:
-    """Return what Python is given to run an entry point."""
+    """Return Python's arguments for running an entry point."""
     module, _, function = target.partition(":")
     if not function:
         return [str(_file_of(target))]

@@ -1,8 +1,8 @@
 """Programs as forks of their supervisor, made before it does anything else.
 
-The supervisor loads what its programs share, and forks them: what they do not change is in memory once. Each
-fork waits until it is told to begin, and then is what ``python -P -m MODULE ARGUMENT ...`` would be. What is
-started again later is executed: a supervisor at work has an event loop, which must not be forked.
+The supervisor loads the modules that its programs share, and forks them: unchanged memory is shared. Each
+fork waits until it is told to begin, and then behaves like ``python -P -m MODULE ARGUMENT ...``. Later
+restarts execute the program: a running supervisor has an event loop, which must not be forked.
 """
 
 from __future__ import annotations

@@ -50,10 +50,10 @@ def decode_header(body: bytes) -> dict[str, str]:
 
 
 def raise_error_field(fields: Mapping[str, str]) -> None:
-    """Raise what the other end put into its header's ``error`` field, if it did.
+    """Raise the error in the other end's header, if it has a field ``error``.
 
     Raises:
-        HandshakeRefusedError: It did.
+        HandshakeRefusedError: The header has that field.
     """
     if "error" in fields:
         raise HandshakeRefusedError(fields["error"])
@@ -71,7 +71,7 @@ def require(fields: Mapping[str, str], *required: str) -> None:
 
 
 def check_type(fields: Mapping[str, str], *, md5sum: str, type_name: str, subject: str) -> None:
-    """Check that the other end means the same type; ``*`` on either side matches all.
+    """Check that the other end expects the same type; ``*`` on either side matches all.
 
     Args:
         fields: The other end's header.

@@ -16,7 +16,7 @@ from rce.ros.tcpros.header import decode_header, encode_header
 _log = logging.getLogger(__name__)
 
 HEADER_TIMEOUT = 30.0
-"""Seconds that a peer may take to say what it wants."""
+"""Seconds that a peer may take to send its header."""
 
 Accept = Callable[[Connection, dict[str, str]], None]
 """Takes a connection over, given the peer's header: answers it and sets its owner, or refuses."""
@@ -90,7 +90,7 @@ class _Greeter:
             connection.close()
 
     def connection_lost(self, connection: Connection, error: Exception | None) -> None:
-        del connection, error  # it went before it said what it wanted
+        del connection, error  # the peer left before it sent its header
         self._stop_waiting()
 
     def writable(self, connection: Connection) -> None:

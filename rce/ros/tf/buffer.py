@@ -1,6 +1,6 @@
-"""The tree of frames over the last seconds, and questions to it. Pure: no I/O, no clock.
+"""The tree of frames over the last seconds, and lookups in it. Pure: no I/O, no clock.
 
-Answers are those of ROS's tf2. Times in questions are :class:`~rce.ros.types.Time`; zero, or None, means the
+Results are those of ROS's tf2. Times in lookups are :class:`~rce.ros.types.Time`; zero, or None, means the
 latest time at which all edges of the path are known.
 """
 
@@ -30,9 +30,9 @@ _Place = Callable[[str], Sample]
 
 
 class Buffer:
-    """What is known of all frames.
+    """The known transforms of all frames.
 
-    Invariant: every parent and child that was told of is in :attr:`frames`.
+    Invariant: every parent and child of an inserted transform is in :attr:`frames`.
     """
 
     def __init__(self, cache_time: float = CACHE_TIME) -> None:
@@ -60,7 +60,7 @@ class Buffer:
 
         Args:
             stamped: The edge.
-            static: It holds indefinitely; its stamp does not count.
+            static: It is valid at all times; its stamp is ignored.
 
         Returns:
             False if it is older than the cache reaches, or its time is known already.
@@ -82,7 +82,7 @@ class Buffer:
         return edge.insert(Sample(stamped.stamp.to_nsec(), parent, transform))
 
     def clear(self) -> None:
-        """Forget all but what holds indefinitely; for a time that begins anew."""
+        """Remove all transforms except static ones; for a time that begins anew."""
         self._edges = {child: edge for child, edge in self._edges.items() if isinstance(edge, StaticEdge)}
         self._frames = {}
         for child, edge in self._edges.items():
@@ -99,7 +99,7 @@ class Buffer:
             time: When; zero or None: the latest time that all edges of the path have in common.
 
         Returns:
-            The transform with the time that it holds at; zero if it holds indefinitely.
+            The transform with its time; zero if it is valid at all times.
 
         Raises:
             UnknownFrameError: There is no such frame.
@@ -121,7 +121,7 @@ class Buffer:
         source_time: Time | None,
         fixed: str,
     ) -> StampedTransform:
-        """Return ``target_from_source`` between two times: where what was seen then is now.
+        """Return ``target_from_source`` between two times: from the source then to the target now.
 
         Args:
             target: The frame to take coordinates to.
@@ -208,7 +208,7 @@ class Buffer:
                 return up[: meeting[frame]], down[:index]
         for end in (up_end, down_end):
             if end.obstacle is not None:
-                self._moment(target, source, None)  # that there is no way at all is the better reason
+                self._moment(target, source, None)  # a missing connection is the better reason
                 raise end.obstacle
         raise ConnectivityError(target, down_end.frame, source, up_end.frame)
 

@@ -1,4 +1,4 @@
-"""Hearing from the graph where frames are."""
+"""The listener, which receives transforms from the graph."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ JUMP = 1.0
 """Seconds that time must jump back for the buffer to forget: a simulation or a bag began anew."""
 
 MAX_COMPLAINTS = 100
-"""How many different frames the log complains of."""
+"""For how many different frames warnings are logged."""
 
 _A_LONG_TIME = 3600.0
 
@@ -45,8 +45,8 @@ class TransformListener:
     ``async with TransformListener(node) as tf: pose = await tf.wait_for("map", "base_link", timeout=1.0)``
 
     Attributes:
-        buffer: What was heard; its names of frames are full names.
-        prefix: What names of frames without a slash at their beginning live below, in questions.
+        buffer: The received transforms, with full names of frames.
+        prefix: The prefix of frames in lookups whose names do not begin with a slash.
     """
 
     def __init__(self, node: Node, buffer: Buffer | None = None, *, prefix: str | None = None) -> None:
@@ -54,8 +54,8 @@ class TransformListener:
 
         Args:
             node: The node that it is part of; it must be running while the listener is.
-            buffer: Where to keep what is heard; None: in a new one.
-            prefix: What the frames live below; None: what the parameter ``tf_prefix`` says.
+            buffer: Keeps the received transforms; None: a new one.
+            prefix: The prefix of the frames; None: the parameter ``tf_prefix``.
         """
         self.buffer = buffer if buffer is not None else Buffer()
         self.prefix = prefix or ""
@@ -131,11 +131,11 @@ class TransformListener:
             target: The frame to take coordinates to.
             source: The frame to take them from.
             time: When; zero or None: as soon as there is any answer.
-            timeout: Real seconds to wait; None: indefinitely.
+            timeout: Real seconds to wait; None: without a limit.
 
         Raises:
             TransformTimeoutError: It did not become known in time; the cause says why.
-            ExtrapolationError: ``time`` is before what the buffer holds: waiting does not help.
+            ExtrapolationError: ``time`` is before the times in the buffer: waiting does not help.
             FrameLoopError: The frames are not a tree.
             NodeClosedError: The node stops.
         """
@@ -157,7 +157,7 @@ class TransformListener:
         """Return the full name of a frame."""
         return resolve(self.prefix, frame)
 
-    # Hearing
+    # Receiving
 
     async def _next_change(self) -> None:
         if self._stopped:
@@ -175,7 +175,7 @@ class TransformListener:
         self._changed.set()
 
     def _fresh_buffer(self) -> Buffer:
-        """Return the buffer, without what is from before a jump of time."""
+        """Return the buffer, without transforms from before a jump of time."""
         now = self._node.time()
         if now < self._latest - JUMP:
             _log.warning("time jumped back by %.3f s: transforms are forgotten", self._latest - now)

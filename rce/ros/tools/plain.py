@@ -1,4 +1,4 @@
-"""Messages as plain values, and as text for people and programs."""
+"""Messages as plain values, and as text for users and programs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rce.ros.types import MessageType
 
 _LONG = 64
-"""Elements of an array above which it is cut in text for people."""
+"""Elements of an array above which it is cut in text for users."""
 
 
 def plain(message: Message, *, longest: int | None = None) -> dict[str, Any]:

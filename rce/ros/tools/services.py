@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 async def list_services(context: ToolContext) -> None:
-    """Print all services but this tool's own."""
+    """Print all services except this tool's own."""
     services = (await look(context.master)).services
     for service in sorted(services):
         if services[service] != [context.node.name]:
@@ -29,15 +29,15 @@ async def call(context: ToolContext, service: str, values: str, *, json: bool, t
     """Call a service and print its response.
 
     Args:
-        context: What to work with.
+        context: The node and the output.
         service: The service.
         values: The request's fields as YAML.
         json: JSON in place of YAML.
         timeout: Seconds.
 
     Raises:
-        ToolError: There is no such service, or the values do not fit its request.
-        ServiceError: There is no response.
+        ToolError: The service does not exist, or the values do not fit its request.
+        ServiceError: The call got no response.
     """
     name = context.node.resolve(service)
     kind = context.types.service(await service_type(name, context.master))

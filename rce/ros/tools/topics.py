@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from rce.ros.xmlrpc import RpcClient
 
 WINDOW = 100
-"""Messages of which the rate is taken."""
+"""Number of messages over which the rate is measured."""
 LATE_SUBSCRIBERS_S = 1.0
 """How long a single message waits for a subscriber, and stays for those that come at once."""
 
 
 class ToolContext(NamedTuple):
-    """What a command works with."""
+    """The context of a command."""
 
     node: Node
     master: MasterClient

@@ -26,7 +26,7 @@ class ActionPart(NamedTuple):
     """One of the seven message types."""
 
     suffix: str
-    """What follows the action's name in the type's name."""
+    """The part of the type's name after the action's name."""
     text: str
     """The definition."""
     first_line: int

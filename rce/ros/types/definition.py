@@ -20,7 +20,7 @@ SEPARATOR = "=" * 80
 """Line between the parts of a full definition text."""
 
 PART_HEADER = "MSG: "
-"""What follows the separator, before the name of the part's type."""
+"""The text between the separator and the name of the part's type."""
 
 MAX_FIXED_LENGTH = 1 << 20
 """Longest fixed array that a definition may ask for: its default value is made in memory."""
@@ -186,7 +186,7 @@ def _parse_constant(code: str, line: str) -> Constant:
     type_name, _, rest = code.partition(" ")
     name, _, text = rest.partition("=")
     if type_name == "string":
-        # All that follows the first '=' belongs to a string, a '#' too.
+        # Everything after the first '=' belongs to a string, a '#' too.
         text = line.partition("=")[2]
     name, text = name.strip(), text.strip()
     if _NAME.fullmatch(name) is None:

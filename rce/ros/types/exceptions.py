@@ -1,4 +1,4 @@
-"""What can go wrong with message types.
+"""Errors of message types.
 
 ::
 
@@ -16,11 +16,11 @@ class TypesError(Exception):
 
 
 class UnknownTypeError(TypesError, LookupError):
-    """There is no definition of a type.
+    """The definition of a type was not found.
 
     Attributes:
-        name: The type that was asked for.
-        hint: Where it was looked for and what was missing.
+        name: The requested type.
+        hint: The places that were searched, and what was missing.
     """
 
     def __init__(self, name: str, hint: str) -> None:
@@ -38,7 +38,7 @@ class BadDefinitionError(TypesError, ValueError):
     Attributes:
         source: The file, or the type's name where the text came from elsewhere.
         line: Line number in ``source``, from 1; 0 where the fault is of the whole.
-        reason: What is wrong.
+        reason: The fault.
     """
 
     def __init__(self, source: str, line: int, reason: str) -> None:

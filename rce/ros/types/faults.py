@@ -1,4 +1,4 @@
-"""Slow walks that find out which field is to blame when a codec failed."""
+"""Slow walks that find the faulty field after a codec failed."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _check_element(field: Field, value: Any, root: str, path: str) -> None:
 
 
 def scalar_fault(type_name: str, value: Any) -> str:
-    """Tell why ``value`` does not fit a built-in type; empty if it does."""
+    """Return why ``value`` does not fit a built-in type; empty if it does."""
     try:
         if type_name == "string":
             value.encode()

@@ -1,4 +1,4 @@
-"""The fields of a message type, and what follows from one alone. Pure descriptions: no values."""
+"""The fields of a message type and their properties. Pure descriptions: no values."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rce.ros.types.message import MessageType
 
 Buffer = bytes | bytearray | memoryview
-"""What a serialized message is read from."""
+"""The buffer of a serialized message."""
 
 LARGE = 1 << 16
 """Bytes above which a message is read through a view: slicing it copies nothing."""

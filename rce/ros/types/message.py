@@ -82,7 +82,7 @@ class MessageType:
         """Make a message; nested messages may be given as dicts, arrays as any sequence.
 
         Raises:
-            SerializationError: There is no such field, or a value cannot be made into what the field holds.
+            SerializationError: A field does not exist, or a value cannot be converted to the field's type.
         """
         return make_message(self, values, self.name, "")
 

@@ -1,4 +1,4 @@
-"""Where message and service types come from: packages, the built-in definitions, connection headers."""
+"""Sources of message and service types: packages, the built-in definitions, connection headers."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class TypeRegistry:
     ROS packages, then among those learned with :meth:`from_definition`.
 
     Args:
-        packages: Where to look for packages; None: on the paths that the environment names
-            (:meth:`~rce.ros.packages.PackageIndex.from_environ`).
+        packages: The packages to search; None: those on the paths in the environment
+        (:meth:`~rce.ros.packages.PackageIndex.from_environ`).
     """
 
     def __init__(self, packages: PackageIndex | None = None) -> None:
@@ -87,7 +87,7 @@ class TypeRegistry:
         """Return the type that a full definition text describes, as a connection header carries it.
 
         The text alone counts: types of the same names that the registry knows are not used. The type is
-        remembered, so that :meth:`message` finds it where there is no other definition.
+        remembered, so that :meth:`message` finds it if no other definition exists.
 
         Raises:
             UnknownTypeError: The text uses a type that it does not hold.

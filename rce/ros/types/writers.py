@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class WriteDialect(Protocol):
-    """How Python values become what is packed. Methods may add lines to the code."""
+    """The conversion of Python values to packed ones. Methods may add lines to the code."""
 
     def open(self, code: Code, message_type: MessageType, holder: str) -> None:
         """Begin a message whose fields are taken from the variable ``holder``."""
@@ -47,7 +47,7 @@ class WriteDialect(Protocol):
 class WriterBuilder:
     """Generates the writer of one message type.
 
-    The writer takes the message and a list, which the dialect may use to note what it saw on the way.
+    The writer takes the message and a list, in which the dialect may note its findings.
     """
 
     def __init__(self, dialect: WriteDialect, writer_of: Callable[[MessageType], Any]) -> None:

@@ -12,7 +12,7 @@ from rce.ros.xmlrpc.dispatch import BadArgumentError
 def graph_name(role: str, value: Any, caller: str) -> str:
     """Check a topic, service or node name and make it global.
 
-    Only what cannot be a name is refused: real nodes use names that the written rules do not allow.
+    Only impossible names are refused: real nodes use names that the written rules do not allow.
 
     Args:
         role: The parameter's name, for errors.

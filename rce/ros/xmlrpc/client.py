@@ -74,7 +74,7 @@ class RpcClient:
         return await self.send(uri, method, encode_call(method, arguments), timeout=timeout)
 
     async def send(self, uri: str, method: str, document: bytes, *, timeout: float = DEFAULT_TIMEOUT) -> Any:
-        """Make a call that was written already, as :meth:`call` does.
+        """Make a call from an encoded document, as :meth:`call` does.
 
         Args:
             uri: ``http://host:port/``.
@@ -171,9 +171,9 @@ class _Connection:
         return self._http.our_state is h11.IDLE and not self._reader.at_eof()
 
     async def close(self) -> None:
-        """Close at once and wait until it is."""
+        """Close at once and wait until it is closed."""
         self._writer.transport.abort()
-        with contextlib.suppress(OSError):  # it may have been lost already: as good as closed
+        with contextlib.suppress(OSError):  # it may have been lost already, which counts as closed
             await self._writer.wait_closed()
 
     async def post(self, document: bytes) -> bytes:
@@ -217,7 +217,7 @@ class _Connection:
 
 
 def _keep_alive(connection: socket.socket) -> None:
-    """Let the system notice within half a minute that the other machine vanished without a word."""
+    """Set TCP keep-alive, so that the system notices within half a minute that the other machine is gone."""
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 4)):
         if hasattr(socket, option):

@@ -115,7 +115,7 @@ def _parse(document: bytes) -> Unmarshaller:
         parser.Parse(document, True)
     except MalformedDocumentError:
         raise
-    except Exception as error:  # the unmarshaller raises whatever a wrong value leads it to
+    except Exception as error:  # the unmarshaller may raise any exception for a wrong value
         raise MalformedDocumentError(f"not XML-RPC: {error}") from error
     return target
 

@@ -1,9 +1,9 @@
-"""From a method call's document to its answer's, for APIs in the ROS manner. No I/O.
+"""Answers method calls, from document to document, for ROS-style APIs. No I/O.
 
 Every ROS method answers ``[status, message, value]`` with status 1 for success, 0 for a failure and -1 for a
 mistake of the caller. Real clients do not expect faults, so a wrong number or kind of arguments is answered
-``[-1, message, 0]`` (or another value that says nothing: of the type that the method's answers have); a fault
-says only that there is no such method or that the document is not a call.
+``[-1, message, 0]`` (or another empty value, of the type of the method's answers). A fault means only that
+the method does not exist or that the document is not a call.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Dispatcher:
 
         Args:
             methods: By their names.
-            nothing: What a method's failures carry as value; 0 if it is not in here.
+            nothing: The value in a method's failed answers; 0 for methods that are not listed.
         """
         self._methods = dict(methods)
         self._nothing = dict(nothing or {})
@@ -54,7 +54,7 @@ class Dispatcher:
         """Answer the call in ``document``. Never raises."""
         try:
             method, arguments = decode_call(document)
-        except Exception as error:  # noqa: BLE001 - whatever it does to the parser, its sender is told
+        except Exception as error:  # noqa: BLE001 - the sender gets every failure of the parser
             return encode_fault(_FAULT_NO_CALL, str(error))
         try:
             result = self._call(method, arguments)
@@ -79,7 +79,7 @@ class Dispatcher:
             return handler(*arguments)
         except BadArgumentError as error:
             return ERROR, f"{method}: {error}", self._nothing.get(method, 0)
-        except Exception as error:  # noqa: BLE001 - a caller is answered, whatever happens
+        except Exception as error:  # noqa: BLE001 - the caller always gets an answer
             _log.exception("%s failed for %s", method, arguments[0] if arguments else "?")
             return FAILURE, f"internal failure: {error}", self._nothing.get(method, 0)
 
@@ -106,7 +106,7 @@ class Dispatcher:
 
 
 class _NoSuchMethodError(Exception):
-    """Nothing here can take the call."""
+    """The method does not exist."""
 
 
 def _arity(method: Method) -> tuple[int, int]:
