@@ -96,16 +96,16 @@ class Timing:
     ping_interval: float | None = 10.0
     """Seconds between two pings; None for no pings."""
     ping_timeout: float | None = 10.0
-    """Seconds for the answer to a ping, after which the connection counts as lost; None for no limit."""
+    """Seconds to wait for the answer to a ping; then the connection counts as lost. None for no limit."""
     close: float = 3.0
     """Seconds for the closing handshake."""
     flush: float = 5.0
-    """Seconds for what waits to be sent when the program closes the connection."""
+    """Seconds for sending queued messages when the program closes the connection."""
     max_message: int = 64 << 20
-    """Bytes of the largest message that is taken from the engine."""
+    """Bytes of the largest message that is accepted from the engine."""
     write_buffer: tuple[int, int] = (128 << 10, 32 << 10)
-    """Bytes in the socket above which messages stay in their queue, where others can overtake them, and below
-    which the next one follows."""
+    """High and low limit of the bytes in the socket. Above the first, messages wait in their queue, where
+    others can overtake them; below the second, the next one is sent."""
     backoff: Backoff = Backoff(first=0.2, longest=15.0, jitter=1.0)
     """Pauses between attempts to connect."""
 
@@ -117,16 +117,19 @@ class Listener(Protocol):
         """Learn that an attempt to connect begins."""
 
     def on_failure(self, error: ClientError) -> None:
-        """Learn that it failed; another one follows, or :meth:`EngineTransport.run` ends with this error."""
+        """Learn that an attempt failed.
+
+        Another one follows, or :meth:`EngineTransport.run` ends with this error.
+        """
 
     def on_connected(self) -> None:
-        """Learn that there is a connection; what is posted from now on is sent."""
+        """Learn that the connection is established; messages posted from now on are sent."""
 
     def on_lost(self, error: LostError) -> None:
         """Learn that the connection ended."""
 
     def on_event(self, event: Event) -> None:
-        """Take what came from the engine."""
+        """Handle an event from the engine."""
 
 
 class EngineTransport:

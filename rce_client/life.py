@@ -8,35 +8,35 @@ from rce.lifecycle import LifeCycle
 
 
 class State(Enum):
-    """Where a connection is in its life."""
+    """The states of a connection."""
 
     CLOSED = "closed"
-    """Not opened yet, closed by the program, or refused by the engine for good."""
+    """Not opened yet, closed by the program, or refused by the engine permanently."""
     CONNECTING = "connecting"
-    """Looking for the engine, for the first time or again."""
+    """Trying to connect, for the first time or again."""
     CONNECTED = "connected"
     """Connected for the first time."""
     LOST = "lost"
-    """The connection broke; everything that was made is remembered."""
+    """The connection broke; all requests are stored."""
     RESTORED = "restored"
-    """Connected again, and everything that was made was asked for again."""
+    """Connected again, and all stored requests were sent again."""
 
 
 class ConnectionEvent(Enum):
-    """What can happen to a connection."""
+    """The events of a connection."""
 
     DIAL = "dial"
     """An attempt to connect begins."""
     FAIL = "fail"
-    """It failed; another one follows, unless the engine refused this client."""
+    """The attempt failed; another one follows, unless the engine refused this client."""
     CONNECT = "connect"
-    """It succeeded, for the first time."""
+    """The attempt succeeded for the first time."""
     RESTORE = "restore"
-    """It succeeded, and there was a connection before."""
+    """The attempt succeeded after an earlier connection."""
     LOSE = "lose"
     """The connection broke."""
     REFUSE = "refuse"
-    """The engine refused this client for good."""
+    """The engine refused this client permanently."""
     CLOSE = "close"
     """The program closed the connection."""
 

@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class QueueLimits:
-    """How much may wait to be sent. A topic's queue always takes one message, however large."""
+    """Limits of the messages that wait to be sent. A topic's queue always accepts one message of any size."""
 
     topic_messages: int = 64
-    """Messages of one topic; then the oldest is dropped."""
+    """Messages of one topic; beyond it, the oldest is dropped."""
     topic_bytes: int = 16 << 20
-    """Bytes of the messages of one topic; then the oldest are dropped."""
+    """Bytes of the messages of one topic; beyond it, the oldest are dropped."""
     control_messages: int = 1024
-    """Service messages; then calls fail. Requests are always taken."""
+    """Service messages; beyond it, calls fail. Requests are always accepted."""
 
 
 @dataclass(eq=False, slots=True)
@@ -35,9 +35,9 @@ class QueuedMessage:
     frames: Sequence[Frame]
     size: int
     key: str | None = None
-    """A message with a key is dropped only for a newer one of the same key: what is latched, by source."""
+    """A message with a key is dropped only for a newer one with this key. Latched messages: the source."""
     sent: asyncio.Future[None] | None = None
-    """Completed when the message was handed to the network, or could not be."""
+    """Completed when the message was handed to the network, or failed."""
 
     @classmethod
     def of(cls, frames: Sequence[Frame], key: str | None = None) -> QueuedMessage:
