@@ -63,7 +63,7 @@ class App:
         """Run until SIGINT or SIGTERM.
 
         Args:
-            ready: Called with the WebSocket URL when robots can come.
+            ready: Called with the WebSocket URL when robots can connect.
 
         Raises:
             OSError: A port cannot be taken.
@@ -74,7 +74,7 @@ class App:
         for number in end_signals():
             loop.add_signal_handler(number, stop.set)
         async with self.started(ready, stop):
-            # What is there now stays; to look through it for garbage again and again takes 20 ms each time.
+            # The present objects stay; each garbage collection of them would take 20 ms.
             gc.collect()
             gc.freeze()
             await stop.wait()
@@ -83,11 +83,11 @@ class App:
     async def started(
         self, ready: Callable[[str], None], stop: asyncio.Event | None = None
     ) -> AsyncIterator[None]:
-        """Run for as long as the context lasts.
+        """Run as long as the context lasts.
 
         Args:
             ready: As for :meth:`run`.
-            stop: Set when the context is to be left at once: nothing is waited for at its start then.
+            stop: Set when the context is to be left at once: then its start does not wait.
         """
         settings = self.settings
         for_robots, for_task_sets = self.tls.for_clients(), self.tls.for_task_sets()
@@ -153,7 +153,7 @@ def _warn(text: str | None) -> None:
 
 
 def _package_index(given: Sequence[Path]) -> PackageIndex:
-    """Return the packages on the given path, then on the environment's, then those that are shipped."""
+    """Return the packages on the given path, then on the environment's, then the shipped ones."""
     path = [*given, *PackageIndex.from_environ().path]
     with contextlib.suppress(ShippedFileError):
         path.append(examples_dir())
@@ -161,7 +161,7 @@ def _package_index(given: Sequence[Path]) -> PackageIndex:
 
 
 async def _announce(channel: TaskSetChannel, url: str, ready: Callable[[str], None]) -> None:
-    """Say that robots can come, once the master knows where to send them."""
+    """Report that robots can connect, once the master knows where to send them."""
     await channel.wait_connected()
     ready(url)
 
@@ -169,7 +169,7 @@ async def _announce(channel: TaskSetChannel, url: str, ready: Callable[[str], No
 async def _listen(
     hub: LinkHub, machine: str, name: str, reach: str, settings: RobotSettings, *, tls: bool
 ) -> LinkAddress:
-    """Accept links on a unix socket and on TCP; return where."""
+    """Accept links on a unix socket and on TCP; return the addresses."""
     remove_stale_sockets(run_dir(), "robot_*.sock")
     path = run_dir() / socket_name(name)
     await hub.listen_unix(path)
@@ -178,7 +178,7 @@ async def _listen(
 
 
 async def _bind(host: str, port: int) -> socket.socket:
-    """Take the WebSocket port, so that its number is known before anything is told to the master."""
+    """Bind the WebSocket port, so that its number is known before the first message to the master."""
     infos = await LOOKUPS.addresses(host or None, port, flags=socket.AI_PASSIVE)
     family, _, _, _, address = infos[0]
     listener = socket.socket(family, socket.SOCK_STREAM)

@@ -1,4 +1,4 @@
-"""What can go wrong between a robot and its endpoint.
+"""The errors between a robot and its endpoint.
 
 ::
 
@@ -23,17 +23,17 @@ if TYPE_CHECKING:
 
 
 class RobotError(Exception):
-    """Base of all faults of :mod:`rce_robot`; the text is fit for an ``ER``.
+    """Base of all faults of :mod:`rce_robot`; the text is suitable for an ``ER``.
 
     Attributes:
-        call: The service call that ends with it, if it is one's.
+        call: The service call that ends with it, if any.
     """
 
     call: CallId | None = None
 
     @classmethod
     def at(cls, tag: str, msg_id: str, problem: str) -> Self:
-        """Make the fault of a message at an interface, which is a service call's or not."""
+        """Make the fault of a message at an interface, with or without a service call."""
         call = call_at(tag, msg_id)
         error = cls(problem if call is not None else f"{tag}: {problem}")
         error.call = call
@@ -49,11 +49,11 @@ class RobotError(Exception):
 
 
 class UnreadableError(RobotError):
-    """A data message is not what its interface carries."""
+    """A data message does not fit its interface."""
 
 
 class ConversionError(UnreadableError, ValueError):
-    """A message cannot be converted; the text is fit for an ``ER``.
+    """A message cannot be converted; the text is suitable for an ``ER``.
 
     Attributes:
         field: Path of the faulty field, such as ``header.seq`` or ``poses[2].position.x``; the type's name
@@ -73,12 +73,12 @@ class ConversionError(UnreadableError, ValueError):
 
 
 class MisdirectedError(RobotError):
-    """A data message is for no interface, for one of another class, or for one that only sends."""
+    """A data message names an unknown interface, one of another class, or one that only sends."""
 
 
 class BusyError(RobotError):
-    """Too much waits already."""
+    """Too many messages or calls wait already."""
 
 
 class ConversionFailedError(RobotError):
-    """A conversion was given up; the text is fit for an ``ER``."""
+    """A conversion was abandoned; the text is suitable for an ``ER``."""

@@ -1,4 +1,4 @@
-"""Chooses what reads and writes the messages of a robot's interface, by its type and class."""
+"""Chooses the form of a robot's interface, by its type and class."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class FormFactory:
         """Return the forms from and to the robot.
 
         Raises:
-            InterfaceError: The interface is none of a robot, or its class is not known.
+            InterfaceError: The interface is not one of a robot, or its class is unknown.
         """
         if type_.form is FormName.INTERFACE:
             raise InterfaceError(f"{type_} is a container's; a robot has Converters and Forwarders")

@@ -1,4 +1,4 @@
-"""Conversions that would hold the event loop for too long: queues of them, and processes that do them."""
+"""Conversions that would block the event loop for too long: their queues and worker processes."""
 
 from rce_robot.conversion.jobs import ReadText, ReadValue, Result, Show
 from rce_robot.conversion.pool import ConversionPool

@@ -1,4 +1,4 @@
-"""A worker process as the event loop sees it."""
+"""The event loop's side of a worker process."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class WorkerProcess:
 
     Args:
         packages: Folders with packages that define messages.
-        memory: What it may use, in bytes.
+        memory: Bytes that it may use.
     """
 
     def __init__(self, packages: Sequence[Path], memory: int) -> None:
@@ -42,7 +42,7 @@ class WorkerProcess:
 
     @property
     def pid(self) -> int:
-        """Of the process; 0 before it is there."""
+        """The pid; 0 before the process exists."""
         return 0 if self._process is None else self._process.pid
 
     async def start(self) -> None:
@@ -94,7 +94,7 @@ class WorkerProcess:
         return decode_result(meta), received
 
     async def end(self) -> None:
-        """Kill the process and wait until it is gone."""
+        """Kill the process and wait until it has ended."""
         if self._transport is not None:
             self._transport.abort()
         if self._process is not None:
@@ -104,7 +104,7 @@ class WorkerProcess:
 
 
 class _PacketReader(asyncio.BufferedProtocol):
-    """Reads packets straight into memory of their size."""
+    """Reads packets directly into memory of their size."""
 
     def __init__(self) -> None:
         loop = asyncio.get_running_loop()
@@ -115,7 +115,7 @@ class _PacketReader(asyncio.BufferedProtocol):
         self._begin(1)
 
     def expect(self) -> asyncio.Future[list[memoryview]]:
-        """Return the parts of the next packet, when they are there."""
+        """Wait for the next packet; return its parts."""
         self._answer = asyncio.get_running_loop().create_future()
         if self._lost:
             self._fail()
@@ -128,13 +128,13 @@ class _PacketReader(asyncio.BufferedProtocol):
         return self._view[self._filled :]
 
     def buffer_updated(self, nbytes: int) -> None:
-        """Go on with the next part when one is full."""
+        """Continue with the next part when one is full."""
         self._filled += nbytes
         while self._filled == len(self._view):
             self._part_received(self._view)
 
-    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - that it ended is enough
-        """Fail what waits."""
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - the reason is not needed
+        """Fail the waiting call."""
         self._lost = True
         if not self.ready.done():
             self.ready.set_exception(

@@ -54,7 +54,7 @@ class Converter:
 
     @property
     def is_costly(self) -> bool:
-        """Whether a conversion may take long, because a custom converter takes part."""
+        """Whether a conversion may take long, because it includes a custom converter."""
         names = {self.kind.name, *(needed.name for needed in self.kind.dependencies)}
         return not names.isdisjoint(self._customs)
 
@@ -62,7 +62,7 @@ class Converter:
         """Turn a JSON value into the message's bytes.
 
         Args:
-            value: As it came from the robot, binary values in their places.
+            value: The robot's value, with binary values in their places.
 
         Returns:
             The serialized message, and the paths of unknown fields, such as ``header.foo`` or
@@ -87,7 +87,7 @@ class Converter:
         """Turn a message's bytes into its JSON form.
 
         Returns:
-            An object of the fields, or what the class's custom converter makes. Binary values in it are
+            An object of the fields, or the result of the class's custom converter. Binary values in it are
             ``memoryview`` (of ``payload``, which must not change while they are used) or ``bytes``.
 
         Raises:

@@ -21,7 +21,7 @@ def find_fault(kind: MessageType, value: Any, customs: Mapping[str, CustomConver
     """Walk a JSON object that could not be converted.
 
     Raises:
-        ConversionError: Of the first field whose value does not fit. Returns if there is none.
+        ConversionError: For the first field whose value does not fit. Returns if all fit.
     """
     if not isinstance(value, dict):
         custom = customs.get(kind.name)

@@ -1,1 +1,1 @@
-"""The ways by which robots come in; :mod:`rce_robot.doors.base` says what a door is."""
+"""The doors, by which robots connect; see :mod:`rce_robot.doors.base`."""

@@ -1,8 +1,8 @@
-"""What a door owes the robots behind it, and what it may ask of them.
+"""The interfaces between a door and the robots that connect by it.
 
-A door serves one protocol: it shakes hands (:class:`Admission` says who may come in), makes a session of each
-robot's stream, and keeps what waits for the robot in an outbox. A robot's namespace knows sessions only as
-:class:`DoorSession`, so it is the same by whichever door its robot came.
+A door serves one protocol: it does the handshake (:class:`Admission` decides which robots may connect), makes
+a session of each robot's stream, and keeps waiting messages in an outbox. A robot's namespace knows sessions
+only as :class:`DoorSession`, so it does not depend on the door.
 """
 
 from __future__ import annotations
@@ -25,49 +25,49 @@ if TYPE_CHECKING:
 
 
 class Queued(Protocol):
-    """What an outbox holds."""
+    """A message in an outbox."""
 
     @property
     def size(self) -> int:
-        """Bytes that it counts in the queue's limits."""
+        """Bytes for the queue's limits."""
 
     def render(self) -> Rendered | None:
-        """Make it ready to be sent; None if that turns out to be impossible.
+        """Prepare it for sending; return None if that is impossible.
 
-        Called when its turn has come: a message that is dropped in the queue costs no conversion.
+        Called when its turn has come: messages that are dropped in the queue are not converted.
         """
 
 
 class Admission(Protocol):
-    """Who lives here, and who knows who may; the task set."""
+    """Decides on admission and knows the robots; the task set."""
 
     async def log_in(self, credentials: Credentials, address: str) -> EndpointSpec:
-        """Ask the master; raises :class:`HandshakeError` with its answer if the robot may not come in."""
+        """Ask the master; raise :class:`HandshakeError` with its answer if the robot is refused."""
 
     def find(self, id: EndpointId) -> Namespace | None:  # noqa: A002
-        """Return the robot's namespace if there is one."""
+        """Return the robot's namespace if it exists."""
 
     async def settle(self, spec: EndpointSpec) -> Namespace:
         """Return the robot's namespace with the spec applied."""
 
 
 class DoorSession(Protocol):
-    """A robot that came in by a door, from the handshake until everything that it sent was handled."""
+    """A robot's session at a door, from the handshake until all its messages were handled."""
 
     @property
     def client(self) -> str:
-        """From where the robot is connected, and since when, in words for its user."""
+        """The robot's address and the time of its connection, as text for its user."""
 
     @property
     def knows_sources(self) -> bool:
-        """Whether the robot can be told of the sources of latched messages."""
+        """Whether the robot supports sources of latched messages."""
 
     @property
     def held(self) -> int:
         """Bytes of the robot's messages that are kept here, both ways."""
 
     def shed(self, size: int) -> None:
-        """Drop the oldest of what is kept, until ``size`` bytes are free."""
+        """Drop the oldest kept messages, until ``size`` bytes are free."""
 
     def fail(self, reason: str) -> None:
         """Drop the connection."""
@@ -79,10 +79,10 @@ class DoorSession(Protocol):
         """End the connection unless the robot answers; return whether it does."""
 
     def tick(self) -> None:
-        """Do what is to be done every few seconds."""
+        """Do periodic work; called every few seconds."""
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> bool:
-        """Run something until the robot leaves; False if there is too much of it."""
+        """Run a coroutine until the robot leaves; return False if too many run already."""
 
     def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy) -> bool:
         """Send an interface's message when its turn comes."""
@@ -91,16 +91,16 @@ class DoorSession(Protocol):
         """Send a message before all data."""
 
     def send_latched(self, tag: str, source: str, message: Queued, *, shared: bool) -> None:
-        """Send the latched message of a source; it takes the place of an older one that waits."""
+        """Send the latched message of a source; it replaces an older one that waits."""
 
     def send_sources(self, tag: str, sources: Sequence[str]) -> None:
-        """Tell which sources' latched messages are in force."""
+        """Send which sources' latched messages are in force."""
 
     def drop_latched(self, tag: str, source: str) -> None:
-        """Take a latched message back, if it was not sent yet."""
+        """Withdraw a latched message that was not sent yet."""
 
     def await_binaries(self, large: LargeData, ids: Sequence[str]) -> None:
-        """Have a large message come again with its binary values."""
+        """Handle a large message again when its binary values have arrived."""
 
     def report(self, problem: str, call: CallId | None = None) -> None:
         """Tell the robot of an error."""
@@ -109,17 +109,17 @@ class DoorSession(Protocol):
         """Tell the robot whether an interface is in use."""
 
     def discard(self, tag: str) -> None:
-        """Drop what waits of an interface that is gone."""
+        """Drop the waiting messages of a removed interface."""
 
 
 class Owner(Protocol):
-    """What a session needs of the robot it belongs to."""
+    """The interface of a session to its robot."""
 
     def take(self, message: DataMessage) -> None:
         """Handle a data message; raises :class:`RobotError` if it is refused."""
 
     def take_large(self, large: LargeData) -> None:
-        """Handle a data message that was not parsed yet; raises :class:`RobotError` if it is refused."""
+        """Handle an unparsed data message; raise :class:`RobotError` if it is refused."""
 
     def keep_latched(self, i_tag: str, sources: Sequence[str]) -> None:
         """The robot's sources at an interface other than these ended."""
@@ -128,23 +128,23 @@ class Owner(Protocol):
         """A message of a service call was refused before it could be handled."""
 
     async def ask_master(self, request: Request) -> tuple[str, ...]:
-        """Have a request carried out; return what went wrong, as texts."""
+        """Have a request carried out; return the faults as texts."""
 
     def joined(self, session: DoorSession) -> None:
         """The session can send now."""
 
     def leaving(self, session: DoorSession) -> None:
-        """The session's connection ended; nothing can be sent any more."""
+        """The session's connection ended; it cannot send any more."""
 
     def grew(self) -> None:
         """The session holds more bytes than before. May make it :meth:`DoorSession.shed`."""
 
     def left(self, session: DoorSession, reason: str) -> None:
-        """Everything that the session received was handled. Its last word."""
+        """All received messages were handled. The session's last call."""
 
 
 class Door(Protocol):
-    """A way by which robots come in."""
+    """A door, by which robots connect."""
 
     def opened(self, admission: Admission) -> AbstractAsyncContextManager[None]:
-        """Let robots in within the context; at its end their connections are closed."""
+        """Accept robots within the context; at its end their connections are closed."""

@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 class ClientDoor:
     """The door of the client protocol. Implements :class:`rce_robot.doors.base.Door`.
 
-    There is no compression: per-message deflate costs each message more time than it saves on any link but
-    the slowest, and large messages (images, maps) are compressed already or go as binary values.
+    Messages are not compressed: per-message deflate costs more time than it saves, except on the slowest
+    links, and large messages (images, maps) are already compressed or go as binary values.
 
     Args:
-        settings: What was set.
+        settings: The settings of the task set.
         listener: The socket to listen on.
-        lobby: Where connections are counted that have not logged in.
-        tls: Gives the TLS context for each connection; none for plain WebSockets.
+        lobby: Counts connections that have not logged in.
+        tls: Returns the TLS context for each connection; None for plain WebSockets.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class ClientDoor:
 
     @contextlib.asynccontextmanager
     async def opened(self, admission: Admission) -> AsyncIterator[None]:
-        """Let robots in within the context."""
+        """Accept robots within the context."""
         settings, session = self._settings, self._settings.session
         gate = Gate(admission, session, settings.origins, TrustedProxies(settings.trusted_proxies))
         handshakes = None if self._tls is None else TlsGate("robots", self._tls, self._lobby)

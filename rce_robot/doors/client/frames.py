@@ -1,7 +1,7 @@
-"""WebSocket frames as nearly all messages come and go: whole, and without extensions (RFC 6455, section 5.2).
+"""The most common WebSocket frames: whole messages without extensions (RFC 6455, section 5.2).
 
-What the ``websockets`` library does for a frame takes longer than everything else that the engine does for a
-small message. So these are read and written here; the library reads everything else. Pure.
+For a small message, the ``websockets`` library takes longer for a frame than the engine for all other work.
+So this module reads and writes these frames; the library reads all others. Pure.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from websockets.frames import Opcode
 
 try:
     from websockets.speedups import apply_mask
-except ImportError:  # the library was installed without its part in C
+except ImportError:  # the library was installed without its C extension
     from websockets.utils import apply_mask
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ _WHOLE = {int(FIN_TEXT): Opcode.TEXT, int(FIN_BINARY): Opcode.BINARY}
 
 
 class Found(NamedTuple):
-    """A message that came in one frame."""
+    """A message that was received in one frame."""
 
     opcode: Opcode
     data: bytes
@@ -46,12 +46,12 @@ def find_message(data: bytes, start: int, max_size: int) -> Found | None:
     """Read a masked frame that is a message as a whole.
 
     Args:
-        data: What came.
-        start: Where a frame begins in it.
+        data: The received data.
+        start: The beginning of a frame in it.
         max_size: Longest payload in bytes.
 
     Returns:
-        None if this is another frame, a wrong one, or not all of it has come: the library finds out.
+        None if the frame is of another kind, invalid or incomplete: the library handles it.
     """
     if len(data) < start + _SHORT.size:
         return None

@@ -1,4 +1,4 @@
-"""The door: who may connect, decided while the WebSocket handshake waits for its answer."""
+"""Admission to the door, decided while the WebSocket handshake waits for its answer."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ class Gate:
         self._share = LoopShare()
 
     async def admit(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Let a robot in (None), or say why not."""
+        """Admit a robot (None), or return the refusal."""
         assert isinstance(connection, RobotSocket)
         connection.speak()
         if ",".join(request.headers.get_all("Upgrade")).lower() != "websocket":
-            return None  # the library knows what to say to what is not a WebSocket handshake
+            return None  # not a WebSocket handshake: the library answers it
         try:
             self._check_origin(request.headers.get_all("Origin"))
             authorization = request.headers.get_all("Authorization")
@@ -79,20 +79,20 @@ class Gate:
         return None
 
     async def answer(self, connection: ServerConnection, request: Request, response: Response) -> None:  # noqa: ARG002 - the library's call
-        """Tell a client that was let in which of the features that it asked for it gets."""
+        """Tell an admitted client which of its requested features it gets."""
         assert isinstance(connection, RobotSocket)
         session = connection.receiver
         if isinstance(session, Session) and session.features:
             response.headers[FEATURES_HEADER] = ",".join(sorted(session.features))
 
     def _check_origin(self, origins: list[str]) -> None:
-        """Refuse pages of other sites: a browser would let them in with whatever its user may reach."""
+        """Refuse requests of other sites' pages, which a browser would send from its user's network."""
         for origin in origins:
             if origin not in self._origins and "*" not in self._origins:
                 raise HandshakeError(_FORBIDDEN, f"Origin {origin} may not connect here.")
 
     async def _claim(self, credentials: Credentials, address: str) -> Namespace:
-        """Log in. A former connection of the robot that turns out to be dead makes room for the new one."""
+        """Log in. A dead former connection of the robot makes room for the new one."""
         try:
             spec = await self._admission.log_in(credentials, address)
         except HandshakeError as error:

@@ -1,12 +1,12 @@
-"""What waits to be sent to one robot: two lanes, bounded, fair among interfaces (sans-I/O).
+"""The messages that wait for one robot: two lanes, bounded, fair among interfaces (sans-I/O).
 
-* The *control lane* carries what is small and urgent: ``ST``, ``ER``, small service messages. It always
-  goes first and is never thinned out: when it is full, the sender is told.
+* The *control lane* carries small, urgent messages: ``ST``, ``ER``, small service messages. It always goes
+  first and never drops messages: when it is full, the sender is told.
 * The *data lane* holds one queue per interface. Interfaces take turns by deficit round robin, so that a
-  stream of 10 MB images leaves room for every small message that comes meanwhile.
+  stream of 10 MB images leaves room for every small message that arrives meanwhile.
 
-A robot that stops reading fills its own queues and nothing else. A topic's queue then forgets its oldest
-message for every new one and counts it; a service's queue refuses, so that the caller learns of it.
+A robot that stops reading fills only its own queues. A topic's queue then drops its oldest message for every
+new one and counts it; a service's queue refuses, so that the caller gets an error.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class OutboxLimits:
-    """How much may wait for one robot. A queue always takes one message, however large."""
+    """The limits of one robot's queues. A queue always takes one message of any size."""
 
     queue_messages: int = 128
     """Messages per interface."""
@@ -44,8 +44,8 @@ class _Flow:
 
     Attributes:
         tag: Of the interface.
-        queue: What waits, oldest first.
-        credit: What it may send now, in bytes.
+        queue: The waiting messages, oldest first.
+        credit: Bytes that it may send now.
         latched: By source, the bytes that its latched message counts: none if they are counted elsewhere.
     """
 
@@ -75,7 +75,7 @@ class Outbox:
         self._data_bytes = 0
         self._latched_bytes = 0
         self.dropped: Counter[str] = Counter() if dropped is None else dropped
-        """Interface tag to the number of its messages that were thrown away; may outlive the outbox."""
+        """Interface tag to the number of its dropped messages; may outlive the outbox."""
 
     def __bool__(self) -> bool:
         return bool(self._states or self._control or self._ring)
@@ -128,14 +128,14 @@ class Outbox:
     def put_latched(self, tag: str, source: str, message: Queued, *, shared: bool) -> None:
         """Queue the latched message of a source of the topic ``tag``, in place of an earlier one.
 
-        It is not part of what the limits hold and what makes room for others: a burst of many topics' latched
+        It does not count for the limits, and is not dropped to make room: a burst of many topics' latched
         messages waits until the robot has read it.
 
         Args:
             tag: Of the interface.
-            source: Whose message it is; empty for what is said of all sources.
+            source: The source of the message; empty for a statement about all sources.
             message: The message.
-            shared: Its bytes are kept elsewhere too and counted there.
+            shared: Whether its bytes are also kept elsewhere and counted there.
         """
         flow = self._flow(tag, OverflowPolicy.DROP_OLDEST)
         if flow.queue.remove_kept(source):
@@ -149,7 +149,7 @@ class Outbox:
         self._latched_bytes += flow.latched[source]
 
     def drop_latched(self, tag: str, source: Hashable) -> None:
-        """Forget the latched message of a source that was not sent yet."""
+        """Drop the unsent latched message of a source."""
         flow = self._flows.get(tag)
         if flow is not None and flow.queue.remove_kept(source):
             self._latched_bytes -= flow.latched.pop(source)
@@ -157,7 +157,7 @@ class Outbox:
             self._leave_if_empty(flow)
 
     def pop(self) -> Queued | None:
-        """Take the message to send next, None if nothing waits."""
+        """Take the message to send next; return None if the queues are empty."""
         if self._states:
             key = next(iter(self._states))
             return self._states.pop(key)
@@ -170,7 +170,7 @@ class Outbox:
         return None
 
     def discard(self, tag: str) -> None:
-        """Forget the messages of an interface that is gone; that it is gone is still said."""
+        """Drop the messages of a removed interface, except the statement of its removal."""
         flow = self._flows.pop(tag, None)
         if flow is not None and flow.queue:
             self._ring.remove(flow)
@@ -178,9 +178,9 @@ class Outbox:
             self._latched_bytes -= sum(flow.latched.values())
 
     def shed(self, size: int) -> None:
-        """Forget the oldest messages of the topics that hold most, until ``size`` bytes are free.
+        """Drop the oldest messages of the topics that hold most, until ``size`` bytes are free.
 
-        Latched messages go last.
+        Latched messages are dropped last.
         """
         goal = self.bytes - size
         while self.bytes > goal and self._drop_of_largest_topic():
@@ -191,7 +191,7 @@ class Outbox:
                     self.drop_latched(flow.tag, source)
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Drop all messages."""
         for flow in self._ring:
             self.dropped[flow.tag] += len(flow.queue)
         self._flows.clear()
@@ -201,7 +201,7 @@ class Outbox:
         self._data_bytes = self._control_bytes = self._latched_bytes = 0
 
     def _flow(self, tag: str, overflow: OverflowPolicy) -> _Flow:
-        """Return the queue of an interface; it is made if there is none."""
+        """Return the queue of an interface; make it if it does not exist."""
         flow = self._flows.get(tag)
         if flow is None:
             limits = self._limits
@@ -212,7 +212,7 @@ class Outbox:
         return flow
 
     def _make_room_in(self, flow: _Flow, size: int) -> bool:
-        """Drop what an interface must lose before ``size`` more bytes may come; False if it refuses them."""
+        """Drop messages of an interface to make room for ``size`` bytes; return False if it refuses them."""
         if not flow.queue:
             return True
         before = flow.queue.droppable_bytes

@@ -1,7 +1,7 @@
-"""One robot's connection, from handshake to end: what it sends is handled, what it gets is queued.
+"""One robot's connection, from handshake to end: handles its messages, and queues messages to it.
 
-Data messages are handled right where the network hands them over. What takes time runs in the session's
-task group: requests to the master one after another, service calls side by side.
+Data messages are handled directly when they arrive. Longer work runs in the session's task group: requests to
+the master one after another, service calls concurrently.
 """
 
 from __future__ import annotations
@@ -48,20 +48,20 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 LARGE_TEXT = 1 << 20
-"""Texts from here on are handled in steps, between which other users have their turns, in bytes."""
+"""Size in bytes from which texts are handled in steps, between which other users have their turns."""
 
 MAX_REASON = 100
-"""Characters of a reason that a close frame has room for."""
+"""Maximum length of a reason in a close frame."""
 
 
 class Session:
-    """A robot that is connected.
+    """A connected robot.
 
     Implements :class:`rce_robot.doors.base.DoorSession`, and the ``Receiver`` of
     :mod:`rce_robot.doors.client.websocket`.
 
     Life: made in the handshake; :meth:`run` from its end on; :meth:`on_lost` when the connection ends, with
-    or without a completed handshake; then the requests that wait are carried out, and :attr:`ended` is set.
+    or without a completed handshake; then waiting requests are carried out, and :attr:`ended` is set.
     """
 
     def __init__(
@@ -84,27 +84,27 @@ class Session:
         self._outbox = Outbox(settings.outbox, dropped)
         self._requests: asyncio.Queue[tuple[Request, int] | None] = asyncio.Queue()
         self._pending_bytes = 0
-        """Of incomplete messages, when they were last looked at."""
+        """Bytes of incomplete messages at the last check."""
         self._waiting_bytes = 0
-        """Text bytes of the requests that wait or are being carried out."""
+        """Text bytes of waiting and running requests."""
         self._tasks: asyncio.TaskGroup | None = None
         self._calls: set[asyncio.Task[None]] = set()
         self._loop = asyncio.get_running_loop()
         self._now = self._loop.time
         self._reason = ""
         self._abort: asyncio.TimerHandle | None = None
-        """A robot that was dropped has a moment to hear why."""
+        """A timer: a dropped robot has a moment to receive the reason."""
         self.features = features
-        """What the robot's client knows beyond the first protocol; see :mod:`rce.protocol.http`."""
+        """The client's features beyond the first protocol; see :mod:`rce.protocol.http`."""
         self.client = client
-        """From where the robot is connected, and since when."""
+        """The robot's address and the time of its connection."""
         self.lost = False
         """Whether the connection ended."""
         self.ended = asyncio.Event()
-        """Set when nothing of the session is left."""
+        """Set when the session has ended completely."""
 
     async def run(self) -> None:
-        """Serve the robot until its connection ended and its last requests were carried out."""
+        """Serve the robot until its connection has ended and its last requests are carried out."""
         try:
             async with asyncio.TaskGroup() as self._tasks:
                 worker = self._tasks.create_task(self._carry_out_requests())
@@ -126,7 +126,7 @@ class Session:
         await self.ended.wait()
 
     async def probe(self) -> bool:
-        """Tell whether the robot still answers; a connection that does not is ended."""
+        """Return whether the robot still answers; end the connection if it does not."""
         if not self.lost:
             with contextlib.suppress(TimeoutError, ConnectionClosed):
                 async with asyncio.timeout(self._settings.probe_timeout):
@@ -139,7 +139,7 @@ class Session:
         return not self.ended.is_set()
 
     def tick(self) -> None:
-        """Drop what has been incomplete for too long; to be called every few seconds."""
+        """Drop messages that have been incomplete for too long; called every few seconds."""
         for event in self._stream.expire(self._now()):
             self._handle(event)
 
@@ -147,23 +147,23 @@ class Session:
 
     @property
     def knows_sources(self) -> bool:
-        """Whether the robot can be told of the sources of latched messages."""
+        """Whether the robot supports sources of latched messages."""
         return LATCH in self.features
 
     @property
     def held(self) -> int:
-        """Bytes that wait: to be sent, to become complete, to be carried out."""
+        """Bytes of waiting messages: to be sent, completed or carried out."""
         return self._socket.held + self._stream.pending_bytes + self._outbox.bytes + self._waiting_bytes
 
     def shed(self, size: int) -> None:
-        """Drop what is incomplete, then what waits to be sent, oldest first: about ``size`` bytes."""
+        """Drop incomplete messages, then waiting ones, oldest first: about ``size`` bytes."""
         goal = self.held - size
         for event in self._stream.drop_oldest(size):
             self._handle(event)
         self._outbox.shed(max(0, self.held - goal))
 
     def fail(self, reason: str) -> None:
-        """Drop the connection, and all that waits, because of the robot's use of it."""
+        """Drop the connection and all waiting messages, because of the robot's usage."""
         self._socket.fail(CloseCode.TRY_AGAIN_LATER, reason[:MAX_REASON])
         self._outbox.clear()
         self._stream.drop_oldest(self._stream.pending_bytes)
@@ -182,7 +182,7 @@ class Session:
         return taken
 
     def send_latched(self, tag: str, source: str, message: Queued, *, shared: bool) -> None:
-        """Send the latched message of a source in the data lane, where nothing pushes it out."""
+        """Send the latched message of a source in the data lane, where it is not dropped."""
         if LATCH in self.features:
             message = LatchedDelivery(message, source)
         if self._socket.writable and not self._outbox:
@@ -192,7 +192,7 @@ class Session:
             self._owner.grew()
 
     def send_sources(self, tag: str, sources: Sequence[str]) -> None:
-        """Send an ``LT`` after what was sent before, to a client that knows of it."""
+        """Send an ``LT`` after earlier messages, to a client that supports it."""
         if LATCH not in self.features:
             return
         message = _outgoing(LatchedSources(i_tag=tag, sources=tuple(sources)))
@@ -203,11 +203,11 @@ class Session:
             self._owner.grew()
 
     def drop_latched(self, tag: str, source: str) -> None:
-        """Forget the latched message of a source that was not sent yet."""
+        """Drop the unsent latched message of a source."""
         self._outbox.drop_latched(tag, source)
 
     def await_binaries(self, large: LargeData, ids: Sequence[str]) -> None:
-        """Have a large message come again when its binary values are there."""
+        """Handle a large message again when its binary values have arrived."""
         for event in self._stream.await_binaries(large, ids, self._now()):
             self._handle(event)
         self._look_at_pending()
@@ -222,7 +222,7 @@ class Session:
         return taken
 
     def report(self, problem: str, call: CallId | None = None) -> None:
-        """Send an ``ER``; one that finds the lane full is dropped, the log has it."""
+        """Send an ``ER``; if the lane is full, drop and log it."""
         self._send_report(ErrorReport(problem=problem, call=call))
 
     def _send_report(self, report: ErrorReport) -> None:
@@ -238,11 +238,11 @@ class Session:
             self._outbox.put_state(tag, message)
 
     def discard(self, tag: str) -> None:
-        """Forget what waits for an interface that is gone."""
+        """Drop the waiting messages of a removed interface."""
         self._outbox.discard(tag)
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> bool:
-        """Run something until the connection ends; False if too much runs already."""
+        """Run a coroutine until the connection ends; return False if too many run already."""
         if self._tasks is None or self.lost or len(self._calls) >= self._settings.max_calls:
             work.close()
             return False
@@ -292,11 +292,11 @@ class Session:
         self._look_at_pending()
 
     def on_part(self) -> None:
-        """Count a large message that is still on its way."""
+        """Count a large message that is still being received."""
         self._owner.grew()
 
     def on_writable(self) -> None:
-        """Send what waits, as far as the connection takes it."""
+        """Send waiting messages, as far as the connection takes them."""
         while self._socket.writable:
             message = self._outbox.pop()
             if message is None:
@@ -314,7 +314,7 @@ class Session:
         if self._tasks is None:
             self._end()
 
-    # Own
+    # Private
 
     def _end(self) -> None:
         if not self.ended.is_set():
@@ -395,7 +395,7 @@ class Session:
             self._requests.put_nowait((request, size))
 
     async def _guard(self, work: Coroutine[Any, Any, None]) -> None:
-        """Keep a fault of ours in one call from ending the session."""
+        """Prevent a bug in one call from ending the session."""
         try:
             await work
         except Exception:  # noqa: BLE001 - logged; it must not end anything else

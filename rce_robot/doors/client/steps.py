@@ -1,9 +1,9 @@
-"""Has the ``websockets`` parser work in small steps, also on frames that are large.
+"""Makes the ``websockets`` parser work in small steps, also on large frames.
 
-The library collects a frame in one buffer that grows, and copies it as a whole to take the mask off. At 60 MB
-each of the two holds the event loop for tens of milliseconds. Here the payload of a large frame is unmasked
-piece by piece, as it comes in, right into memory of its size. The parser gets an empty payload in its place;
-what handles the frame takes the real one from :meth:`Steps.take`.
+The library collects a frame in one growing buffer, and copies it as a whole to unmask it. At 60 MB each of
+the two blocks the event loop for tens of milliseconds. This module unmasks the payload of a large frame piece
+by piece, as it arrives, directly into memory of its size. The parser gets an empty payload in its place; the
+handler of the frame takes the real one from :meth:`Steps.take`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rce.buffers import unfilled
 
 try:
     from websockets.speedups import apply_mask
-except ImportError:  # the library was installed without its part in C
+except ImportError:  # the library was installed without its C extension
     from websockets.utils import apply_mask
 
 if TYPE_CHECKING:
@@ -27,17 +27,17 @@ if TYPE_CHECKING:
     from websockets.streams import StreamReader
 
 LARGE_FRAME = 64 << 10
-"""Payloads from here on are taken out of the parser's hands, in bytes. Their length is always in 8 bytes."""
+"""Size in bytes from which payloads bypass the parser. Their length always takes 8 bytes."""
 
 READS_PER_STEP = 4
-"""Reads of the parser before others may have their turn; a frame takes three or four."""
+"""Reads of the parser before other users have their turn; a frame takes three or four."""
 
 
 class Steps:
-    """Lets a server's parser stop after a few frames; it continues with the next data, or with none.
+    """Lets a server's parser stop after a few frames; it continues with or without new data.
 
     Args:
-        reader: Where the parser reads.
+        reader: The reader of the parser.
     """
 
     def __init__(self, reader: StreamReader) -> None:
@@ -52,29 +52,29 @@ class Steps:
         self.stopped = False
         """Whether the parser could continue."""
         self.is_between_frames = False
-        """Whether the parser waits for a frame of which it has nothing yet."""
+        """Whether the parser waits for the first byte of a frame."""
         reader.read_exact = self._read_exact  # type: ignore[method-assign]  # the library makes the reader
         reader.at_eof = self._at_eof  # type: ignore[method-assign]  # as above
 
     @property
     def held(self) -> int:
-        """Bytes of the large payload that is coming in, or was not taken yet."""
+        """Bytes of the large payload that is being received, or was not taken yet."""
         return self._filled
 
     def allow(self, reads: int | None = READS_PER_STEP) -> None:
-        """Let so many reads pass; None for any number, for a connection that takes no turns."""
+        """Allow a number of reads; None for any number, for a connection without turns."""
         self._left = math.inf if reads is None else reads
         self.stopped = False
 
     def take(self) -> bytes | None:
-        """Return the payload of the large frame that the parser handed on, once; None if there is none."""
+        """Return, once, the payload of the large frame that the parser passed on; None without one."""
         payload, self._payload = self._payload, None
         if payload is not None:
             self._filled = 0
         return payload
 
     def _at_eof(self) -> Generator[None, None, bool]:
-        """Look for the end of the stream, which the parser does before each frame."""
+        """Check for the end of the stream, which the parser does before each frame."""
         self.is_between_frames = True
         is_at_end = yield from self._is_at_end()
         self.is_between_frames = False
@@ -90,7 +90,7 @@ class Steps:
         first, _, mask = self._header
         if self._left == math.inf or first[0] & 0x0F > Opcode.BINARY:  # the parser refuses it
             return (yield from self._read(n))
-        # A step of its own: what came before is handled first, and the payload before what comes after.
+        # A separate step: earlier data is handled first, and the payload before later data.
         self._left = -1
         yield from self._wait_for_turn()
         self._payload = yield from self._unmasked(n, bytes(mask))
@@ -103,7 +103,7 @@ class Steps:
             yield
 
     def _unmasked(self, size: int, mask: bytes) -> Generator[None, None, bytes]:
-        """Read a payload of a size; a parser that is given up lets go of what has come."""
+        """Read a payload of a size; an abandoned parser releases the received data."""
         memory = unfilled(size)
         try:
             with memory.getbuffer() as view:

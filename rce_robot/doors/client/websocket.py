@@ -1,14 +1,14 @@
 """A WebSocket connection without a task between the network and the engine.
 
 The ``websockets`` library does the handshake, the parsing, pings and the end of a connection. Three things
-are different here, because the time they take is a large part of a message's way through the engine:
+differ here, because they take a large part of a message's time in the engine:
 
-* A message that came as a whole in one frame is taken out of what was read without the library's parser
+* A message in one frame is taken from the received data without the library's parser
   (:mod:`rce_robot.doors.client.frames`).
-* A complete message is handed to the :class:`Receiver` from within ``data_received``; there is no queue
-  and no task to be woken.
-* Frames are written straight to the transport: a server's frames are neither masked nor compressed, so a
-  header of 2 to 10 bytes goes out before the payload, which is not copied.
+* A complete message is passed to the :class:`Receiver` from within ``data_received``, without a queue or a
+  task.
+* Frames are written directly to the transport: a server's frames are neither masked nor compressed, so a
+  header of 2 to 10 bytes precedes the payload, which is not copied.
 
 The rule for writing is the transport's own: write while :attr:`RobotSocket.writable`, then wait for
 :meth:`Receiver.on_writable`.
@@ -39,36 +39,39 @@ if TYPE_CHECKING:
     from rce_robot.outgoing import Buffer, Outgoing
 
 LARGE_PART = LARGE_FRAME
-"""Bytes of an incomplete message from which on the receiver is told of every part."""
+"""Bytes of an incomplete message from which the receiver is notified of every part."""
 
 MAX_FRAGMENTS = 4096
 """Frames that one message may be split into."""
 
 JOIN_PER_STEP = 1 << 20
-"""Bytes of a message in fragments that are joined before others may have their turn."""
+"""Bytes of a fragmented message that are joined before other users have their turn."""
 
 UNSENT_LOW_WATER = 256 << 10
-"""Bytes that the kernel holds for a slow robot beyond what is on its way; more would only grow stale."""
+"""Unsent bytes that the kernel holds for a slow robot; more would only become stale."""
 
 
 class Receiver(Protocol):
-    """What a :class:`RobotSocket` tells of. All methods are called in the event loop and must not block."""
+    """Receives the events of a :class:`RobotSocket`.
+
+    All methods are called in the event loop and must not block.
+    """
 
     def on_text(self, text: bytes) -> Iterator[None] | None:
-        """A text message came; not yet checked to be UTF-8.
+        """Handle a text message that is not yet checked to be UTF-8.
 
         Returns:
-            What is left to do, in steps between which others have their turns; None if nothing is.
+            The remaining work, in steps between which others have their turns; None if it is done.
         """
 
     def on_binary(self, data: bytes) -> None:
-        """A binary message came."""
+        """Handle a binary message."""
 
     def on_part(self) -> None:
-        """A part of a large message came; :attr:`RobotSocket.held` grew."""
+        """Handle a part of a large message; :attr:`RobotSocket.held` grew."""
 
     def on_writable(self) -> None:
-        """The connection takes messages again."""
+        """The connection accepts messages again."""
 
     def on_lost(self, reason: str) -> None:
         """The connection ended. Called once, also when the handshake did not complete."""
@@ -80,13 +83,13 @@ class RobotSocket(GuardedConnection):
     _share: LoopShare | None = None
     _user = ""
     _begin = 0
-    """How much of the oldest of what came has been handled."""
+    """How much of the oldest received data has been handled."""
     receiver: Receiver | None = None
-    """Gets what arrives. Set while the handshake is answered."""
+    """Receives messages. Set while the handshake is answered."""
 
     @property
     def held(self) -> int:
-        """Bytes of a message that is not complete, and of those that the network has not taken yet, about."""
+        """Approximate bytes of an incomplete message, and of messages that the network has not taken yet."""
         parts = self._steps.held + self._fragment_bytes + self._work_bytes
         incomplete = len(self.protocol.reader.buffer) + self._input_bytes + parts
         return incomplete + self.transport.get_write_buffer_size()
@@ -131,16 +134,16 @@ class RobotSocket(GuardedConnection):
             self.send_data()
 
     def abort(self) -> None:
-        """Drop the connection at once; the robot is not expected to answer any more."""
+        """Drop the connection at once, without waiting for the robot."""
         self.transport.abort()
 
     def share_loop(self, share: LoopShare, user: str) -> None:
-        """Handle what comes from now on in the turns of this user."""
+        """Handle received data in the turns of this user from now on."""
         self._share = share
         self._user = user
 
     def go_on(self) -> bool:
-        """Handle a few frames of what came, or a part of a large one; return whether there is more."""
+        """Handle a few received frames, or a part of a large one; return whether there is more."""
         if self._work:
             self._work_on()
             return True
@@ -156,16 +159,16 @@ class RobotSocket(GuardedConnection):
         self._end_of_input()
         return False
 
-    # What the base class calls
+    # Called by the base class
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Prepare the socket for small and timely messages."""
         super().connection_made(transport)
         self._input: deque[bytes] = deque()
-        """What came while it was not this user's turn."""
+        """Data received while it was not this user's turn."""
         self._input_bytes = 0
         self._waits = False
-        """Whether it waits for its turn."""
+        """Whether the connection waits for its turn."""
         self._paused_reading = False
         self._eof = False
         self._steps = Steps(self.protocol.reader)
@@ -178,12 +181,13 @@ class RobotSocket(GuardedConnection):
         self._failed = False
         sock = transport.get_extra_info("socket")
         if sock is not None and hasattr(socket, "TCP_NOTSENT_LOWAT") and sock.family != socket.AF_UNIX:
-            # Without it megabytes of old images fill the kernel's buffer, where nothing can pass them.
+            # Without it megabytes of old images fill the kernel's buffer, where other messages cannot
+            # overtake them.
             with contextlib.suppress(OSError):
                 sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_LOW_WATER)
 
     def data_received(self, data: bytes) -> None:
-        """Handle what comes, now or when it is the user's turn."""
+        """Handle received data, now or when it is the user's turn."""
         if self._share is None:
             self._steps.allow(None)
             super().data_received(data)
@@ -202,7 +206,7 @@ class RobotSocket(GuardedConnection):
             self.receiver.on_part()
 
     def eof_received(self) -> bool | None:  # type: ignore[override]  # true keeps the transport, says asyncio
-        """Handle first what came before the end; over TLS only what has its turn before all is closed."""
+        """First handle data received before the end; over TLS only data with a turn before the close."""
         if not self._waits:
             super().eof_received()
             return None
@@ -210,7 +214,7 @@ class RobotSocket(GuardedConnection):
         return self.transport.get_extra_info("sslcontext") is None  # a TLS transport cannot be kept
 
     def process_event(self, event: Event) -> None:
-        """Take complete data messages out of the base class's hands."""
+        """Handle complete data messages in place of the base class."""
         if type(event) is not Frame or event.opcode > Opcode.BINARY:
             super().process_event(event)
             return
@@ -239,7 +243,7 @@ class RobotSocket(GuardedConnection):
         if self.receiver is not None:
             self.receiver.on_lost(str(exc or self.close_exc))
 
-    # Own
+    # Private
 
     def _take_message(self, data: bytes) -> bool:
         """Handle the next frame without the library, if it is a message; return whether it is."""
@@ -264,7 +268,7 @@ class RobotSocket(GuardedConnection):
         return True
 
     def _end_of_input(self) -> None:
-        """Read on, because all that came has been handled."""
+        """Resume reading, because all received data has been handled."""
         self._waits = False
         if self._eof:
             self._eof = False
@@ -286,7 +290,7 @@ class RobotSocket(GuardedConnection):
         self._fragments.append(data)
         self._fragment_bytes += len(data)
         if self.protocol.current_size is not None:
-            self.protocol.current_size = self._fragment_bytes  # it was not told of large ones
+            self.protocol.current_size = self._fragment_bytes  # it was not notified of large ones
         if len(self._fragments) > MAX_FRAGMENTS:
             self.fail(CloseCode.MESSAGE_TOO_BIG, "too many fragments")
         elif frame.fin:
