@@ -51,7 +51,7 @@ async def open_socket(host: str, port: int) -> socket.socket:
         A connected socket that does not block and sends without delay.
 
     Raises:
-        OSError: The name cannot be resolved (``socket.gaierror``), or nobody answers.
+        OSError: The name cannot be resolved (``socket.gaierror``), or no address answers.
     """
     return await connect_first(await resolve(host, port))
 
@@ -60,7 +60,7 @@ async def open_url_socket(url: str) -> socket.socket:
     """Connect to the host of a WebSocket or HTTP URL as :func:`open_socket` does.
 
     Raises:
-        OSError: The name cannot be resolved (``socket.gaierror``), or nobody answers.
+        OSError: The name cannot be resolved (``socket.gaierror``), or no address answers.
         ValueError: The URL has no host, or its port is not a number.
     """
     parts = urlsplit(url)

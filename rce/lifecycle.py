@@ -83,7 +83,7 @@ class LifeCycle(Generic[S, E]):
             raise ValueError(f"the life cycle of a {subject} has no row for {_listed(tuple(lost))}")
 
     def allows(self, state: S, event: E) -> bool:
-        """Tell whether an event can happen in a state."""
+        """Return whether an event can happen in a state."""
         return event in self.table[state]
 
     def advance(self, state: S, event: E, name: str = "", recent: tuple[E, ...] = ()) -> S:
@@ -135,7 +135,7 @@ class StateMachine(Generic[S, E]):
         return self._state
 
     def allows(self, event: E) -> bool:
-        """Tell whether an event can happen now."""
+        """Return whether an event can happen now."""
         return self._cycle.allows(self._state, event)
 
     def advance(self, event: E) -> S:

@@ -130,7 +130,7 @@ class BoundedQueue(Generic[T]):
         return self._entries[0][0] if self._entries else None
 
     def has_kept(self, key: Hashable) -> bool:
-        """Tell whether an item with this key is kept."""
+        """Return whether an item with this key is kept."""
         return key in self._kept
 
     def put(self, item: T, size: int, key: Hashable = None) -> bool:

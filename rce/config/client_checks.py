@@ -39,7 +39,7 @@ class Parts:
     interfaces: list[tuple[int, AddInterface]] = field(default_factory=list)
     connections: list[tuple[int, Connection]] = field(default_factory=list)
     origins: Mapping[tuple[str, int], str] = field(default_factory=dict)
-    """Where the file asks for items that it does not list itself, by key and index."""
+    """Places in the file that ask for items that it does not list itself, by key and index."""
 
     def place(self, key: str, index: int, field_: str = "") -> str:
         """Return the place of an item, or of one of its fields, in the file."""

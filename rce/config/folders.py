@@ -27,7 +27,7 @@ def run_dir(environ: Mapping[str, str] | None = None) -> Path:
     ``$XDG_RUNTIME_DIR`` counts only if it is this user's: ``su`` and ``sudo`` may hand on another one's.
 
     Raises:
-        RunDirError: It cannot be made, is not a folder, or belongs to somebody else.
+        RunDirError: It cannot be made, is not a folder, or another user owns it.
     """
     environ = os.environ if environ is None else environ
     runtime = environ.get("XDG_RUNTIME_DIR", "")
@@ -48,7 +48,7 @@ def private_folder(path: Path) -> Path:
     """Make a folder that only its owner may enter, or check that an existing one is such a folder.
 
     Raises:
-        RunDirError: It cannot be made, is not a folder, or belongs to somebody else.
+        RunDirError: It cannot be made, is not a folder, or another user owns it.
     """
     try:
         path.mkdir(mode=0o700, exist_ok=True)

@@ -88,7 +88,7 @@ class TlsSettings(Section, frozen=True, kw_only=True):
 
 
 class EngineSettings(Section, frozen=True, kw_only=True):
-    """What all programs share."""
+    """Settings that all programs share."""
 
     dev: Annotated[
         bool,

@@ -1,4 +1,4 @@
-"""The task set's side of the control channel: dials the master indefinitely.
+"""The task set's side of the control channel: dials the master, again after each loss.
 
 One task, :meth:`TaskSetChannel.run`, owns everything. A connection starts with ``Hello``, which has the whole
 state of the task set, so the channel keeps no reports while it is not connected. It keeps requests until they

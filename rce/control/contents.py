@@ -47,7 +47,7 @@ _CHUNK = 1 << 16
 
 
 def is_for_contents(path: str) -> bool:
-    """Tell whether a request's path asks for contents."""
+    """Return whether a request's path asks for contents."""
     return path.startswith(_PREFIX)
 
 

@@ -50,7 +50,7 @@ class Fit(Enum):
 
 
 class DesiredState:
-    """What is desired of one endpoint.
+    """The desired state of one endpoint.
 
     Invariant: whole specs and patches that lead to the same revision lead to the same :attr:`whole`, up to
     the order of its parts.

@@ -32,7 +32,7 @@ _SIZE = struct.Struct("!HH")
 
 
 class Part(Enum):
-    """What a frame holds."""
+    """The kind of a frame."""
 
     INPUT = b"i"
     """Bytes for the command's standard input."""
@@ -62,7 +62,7 @@ class Frame(NamedTuple):
 
 
 class Command(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What is to be run."""
+    """The command to run."""
 
     argv: tuple[str, ...] = ()
     """The program and its arguments; empty: a shell."""

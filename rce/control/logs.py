@@ -8,14 +8,14 @@ from msgspec import Struct, field
 
 
 class LogStream(Enum):
-    """Where a line of a node's log comes from."""
+    """The origin of a line of a node's log."""
 
     STDOUT = "stdout"
     STDERR = "stderr"
     ROSOUT = "rosout"
     """The node's log records in ROS. The environment has those of all nodes, as in ROS's ``rosout.log``."""
     ENGINE = "engine"
-    """What became of the node: how it ended, when it is started again."""
+    """The node's life cycle: how it ended, when it is started again."""
 
 
 class LogLevel(Enum):
@@ -29,7 +29,7 @@ class LogLevel(Enum):
 
 
 class LogQuery(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What of the logs of a container's node is to be read."""
+    """Selects the lines to read from the logs of a container's node."""
 
     streams: tuple[LogStream, ...] = ()
     """Only these; all if empty. The environment's log knows ``rosout`` only, which is another log there."""

@@ -72,7 +72,7 @@ class MachineInfo(Struct, frozen=True, kw_only=True, omit_defaults=True, tag_fie
     requirements: bool = False
     """Whether it installs what packages that users bring ask for in their ``requirements.txt``."""
     detail: str = ""
-    """What is missing on this machine, in words."""
+    """Text on what is missing on this machine."""
 
 
 class _Message(Struct, frozen=True, kw_only=True, omit_defaults=True, tag_field="t"):

@@ -19,7 +19,7 @@ PATCHES = "patches"
 
 
 class LinkAddress(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Where an endpoint accepts links. On the same machine the unix socket is used, else TCP."""
+    """The address of an endpoint for links. On the same machine the unix socket is used, else TCP."""
 
     machine: str = ""
     """Equal strings mean that the unix socket of one can be reached from the other."""
@@ -69,7 +69,7 @@ class PackageSpec(Struct, frozen=True, kw_only=True):
 
 
 class EndpointKind(Enum):
-    """What an endpoint is."""
+    """The kind of an endpoint."""
 
     ROBOT = "robot"
     CONTAINER = "container"
@@ -91,7 +91,7 @@ class EndpointSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class EndpointContents(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What an endpoint's spec holds beside interfaces, links and connections."""
+    """The contents of an endpoint's spec beside interfaces, links and connections."""
 
     resources: Resources = Resources()
     nodes: tuple[NodeSpec, ...] = ()
@@ -100,7 +100,7 @@ class EndpointContents(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class SpecPatch(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What changed in the spec of an endpoint. It fits only what has the revision ``base``."""
+    """The changes in the spec of an endpoint. It applies only to the revision ``base``."""
 
     id: str
     base: int
@@ -140,7 +140,7 @@ class NodeState(Enum):
 
 
 class NodeStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What a container reports of one node."""
+    """The status of one node, as its container reports it."""
 
     tag: str
     state: NodeState
@@ -189,7 +189,7 @@ class EndpointStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class StatusPatch(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What changed in the status of an endpoint. It fits only what has the number before its own."""
+    """The changes in the status of an endpoint. It applies only to the status with the number before it."""
 
     status: EndpointStatus
     """As it is now; but of interfaces only those that are new or changed, and of connections only those that
@@ -213,7 +213,7 @@ class InterfaceUsage(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class NodeUsage(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What a node consumes, with all processes that it started."""
+    """The resources that a node uses, with all processes that it started."""
 
     cpu_s: float = 0.0
     memory: int = 0
@@ -222,7 +222,7 @@ class NodeUsage(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class EndpointUsage(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What an endpoint consumes. All but the interfaces: containers only."""
+    """The resources that an endpoint uses. All but the interfaces: containers only."""
 
     interfaces: dict[str, InterfaceUsage] = {}
     nodes: dict[str, NodeUsage] = {}

@@ -2,8 +2,8 @@
 
 Authenticated connections are not counted, so many robots may share the address of a proxy. Of the others, the
 *silent* ones (which have sent nothing useful yet) are closed first: the handshake of a real client takes one
-round trip, while a connection that is held open on purpose stays. So an attacker who fills the lobby mostly
-closes their own connections.
+round trip, while a connection that is held open on purpose stays. So a client that fills the lobby causes
+its own connections to be closed.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ class PlainPort:
         self._complaints = Complaints()
 
     def refuses(self, transport: asyncio.Transport, data: bytes, now: float) -> bool:
-        """Tell whether a connection is refused for its first bytes; if so, it is answered and closed.
+        """Return whether a connection is refused for its first bytes; if so, it is answered and closed.
 
         Args:
             transport: Of the connection.

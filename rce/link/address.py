@@ -34,7 +34,7 @@ async def own_address(master: str, port: int, hurry: asyncio.Event | None = None
 
 
 def is_any(host: str) -> bool:
-    """Tell whether binding ``host`` binds every address of the machine."""
+    """Return whether binding ``host`` binds every address of the machine."""
     return host in ("", "0.0.0.0", "::")  # noqa: S104 - compared, not bound
 
 

@@ -123,7 +123,7 @@ class CallServer:
             holding.release()
 
     def has(self, channel: Channel, call_id: int) -> bool:
-        """Tell whether a request is being served or waits."""
+        """Return whether a request is being served or waits."""
         return (channel, call_id) in self._serving or any(
             waiting[:2] == (channel, call_id) for waiting in self._waiting
         )

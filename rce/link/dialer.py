@@ -18,7 +18,7 @@ _LONG_ENOUGH = 1.0
 
 
 async def keep_dialed(link: Link, hub: LinkHub) -> None:
-    """Dial a link indefinitely, again whenever its carrier ended. Ends by cancellation only."""
+    """Dial a link, again whenever its carrier ended. Ends by cancellation only."""
     pauses = hub.timeouts.redial.start()
     while True:
         if not hub.can_reach(link.spec):

@@ -55,7 +55,7 @@ _DIRECT_SIZE = 16 * KIB
 
 
 class FrameType(IntEnum):
-    """What a frame is for."""
+    """The type of a frame."""
 
     HELLO = 1
     """Dialing end's first frame: names the link and has its token."""

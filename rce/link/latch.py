@@ -70,7 +70,7 @@ class LatchedMessages:
         return kept.number
 
     def retain(self, sources: Collection[str]) -> bool:
-        """Forget all but these sources; tell whether there were others."""
+        """Forget all but these sources; return whether there were others."""
         ended = [source for source in self._kept if source not in sources]
         for source in ended:
             self._forget(source)

@@ -90,7 +90,7 @@ class Pacer:
         self._arm()
 
     def ask(self, go: Callable[[], None], *, urgent: bool) -> bool:
-        """Tell whether a part may pass now; if not, ``go`` is called when it is its turn to ask again."""
+        """Return whether a part may pass now; if not, ``go`` is called when it is its turn to ask again."""
         if self._pause(urgent=urgent) <= 0 and (urgent or self._serving or not self._waiting):
             return True
         self._waiting[go] = urgent or self._waiting.get(go, False)

@@ -37,7 +37,7 @@ _HIGH_WATER = 64 * KIB
 _LOW_WATER = 16 * KIB
 """So little lies in the transport's buffer that urgent frames wait for a fragment or two only."""
 _NOT_SENT = 128 * KIB
-"""What the kernel may hold unsent of a TCP link, for the same reason."""
+"""Most unsent bytes of a TCP link in the kernel, for the same reason."""
 _TURN = 1 * MIB
 """Bytes after which a link that could continue writing lets the event loop do something else."""
 

@@ -27,17 +27,17 @@ _VERSION = re.compile(VERSION_PATTERN)
 
 
 def is_name(text: str) -> bool:
-    """Tell whether ``text`` may name a user, robot, container, node or interface."""
+    """Return whether ``text`` may name a user, robot, container, node or interface."""
     return len(text) <= MAX_NAME_LENGTH and _NAME.fullmatch(text) is not None
 
 
 def is_message_type(text: str) -> bool:
-    """Tell whether ``text`` may name a message or service type (``std_msgs/String``)."""
+    """Return whether ``text`` may name a message or service type (``std_msgs/String``)."""
     return len(text) <= 2 * MAX_NAME_LENGTH and _MESSAGE_TYPE.fullmatch(text) is not None
 
 
 def is_version(text: str) -> bool:
-    """Tell whether ``text`` may be the version of a package (``1.2.0``, ``2.0-rc1``)."""
+    """Return whether ``text`` may be the version of a package (``1.2.0``, ``2.0-rc1``)."""
     return len(text) <= MAX_VERSION_LENGTH and _VERSION.fullmatch(text) is not None
 
 

@@ -47,7 +47,7 @@ def read_cores(value: object) -> float:
         Cores.
 
     Raises:
-        ValueError: It is none; the text says what would be one.
+        ValueError: The value is not valid; the text says what is.
     """
     if not isinstance(value, str):
         cores = _plain(value, _CORES_HELP)
@@ -69,7 +69,7 @@ def read_memory(value: object) -> int:
         Bytes.
 
     Raises:
-        ValueError: It is none; the text says what would be one.
+        ValueError: The value is not valid; the text says what is.
     """
     if not isinstance(value, str):
         amount = _plain(value, _MEMORY_HELP) * _MEBI
@@ -97,7 +97,7 @@ def read_bandwidth(value: object) -> int:
         Bytes per second.
 
     Raises:
-        ValueError: It is none; the text says what would be one.
+        ValueError: The value is not valid; the text says what is.
     """
     if not isinstance(value, str):
         rate = _plain(value, _BANDWIDTH_HELP)

@@ -133,7 +133,7 @@ def _candidates(tree: Tree) -> Iterator[Entry]:
 
 
 def _is_usual(entry: Entry) -> bool:
-    """Tell whether a file is in a folder for nodes."""
+    """Return whether a file is in a folder for nodes."""
     return "/".join(entry.parts[1:-1]) in FOLDERS
 
 

@@ -115,7 +115,7 @@ def decode_serialized(text: str | bytes) -> SerializedData | None:
 
 
 def is_shallow(text: str | bytes, max_depth: int) -> bool:
-    """Tell whether ``text`` cannot be nested too deep, at the cost of two scans in C."""
+    """Return whether ``text`` cannot be nested too deep, at the cost of two scans in C."""
     if isinstance(text, str):
         return _openers(text, "{", max_depth) + _openers(text, "[", max_depth) <= max_depth
     return _openers(text, b"{", max_depth) + _openers(text, b"[", max_depth) <= max_depth

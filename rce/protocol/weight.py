@@ -54,7 +54,7 @@ class Address(NamedTuple):
 
 
 def is_light(text: bytes) -> bool:
-    """Tell whether a text can be parsed and converted within a few milliseconds."""
+    """Return whether a text can be parsed and converted within a few milliseconds."""
     size = len(text)
     if size <= _SHORT:
         return True

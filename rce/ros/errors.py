@@ -16,7 +16,7 @@
     |   +-- MalformedFrameError     a header or length that breaks the protocol
     |   +-- HandshakeRefusedError   the two ends do not agree on type or name
     +-- TypeMismatchError           one topic or service used with two types in one node
-    +-- ServiceError                a service call that has no response
+    +-- ServiceError                a service call got no response
     |   +-- ServiceNotFoundError    the service has no provider
     |   +-- ServiceLostError        the provider could not be reached or went away before it answered
     |   +-- ServiceFaultError       the provider answered with an error; handlers raise it to do so

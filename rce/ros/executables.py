@@ -65,7 +65,7 @@ class ExecutableFinder:
 
 
 def is_executable(file: str | Path) -> bool:
-    """Tell whether a path is a file that this user may execute."""
+    """Return whether a path is a file that this user may execute."""
     # Not pathlib's method: it raises if a folder may not be entered.
     return os.path.isfile(file) and os.access(file, os.R_OK | os.X_OK)  # noqa: PTH113
 

@@ -65,7 +65,7 @@ class LogRecord(NamedTuple):
 
 
 def started(seconds: float) -> str:
-    """What ROS's ``rosout`` node writes to its file when it starts, at that many seconds since the epoch."""
+    """Return the first line of ROS's ``rosout`` node when it starts, at that many seconds since the epoch."""
     return f"\n\n{seconds:.9f}  Node Startup\n"
 
 

@@ -24,12 +24,12 @@ _BASE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 
 def is_graph_name(name: str) -> bool:
-    """Tell whether ``name`` is a legal global, relative or private name."""
+    """Return whether ``name`` is a legal global, relative or private name."""
     return _GRAPH_NAME.fullmatch(name) is not None and "//" not in name
 
 
 def is_base_name(name: str) -> bool:
-    """Tell whether ``name`` is a legal name without any namespace, as nodes have it."""
+    """Return whether ``name`` is a legal name without any namespace, as nodes have it."""
     return _BASE_NAME.fullmatch(name) is not None
 
 

@@ -1,9 +1,9 @@
 """Search for packages below a folder of the package path, in depth as rospack does.
 
-A folder with a manifest is a package, and what is below it is not searched. Folders that hold a file of
-:data:`IGNORE_MARKS` are left out with all below; those with :data:`NO_SUBFOLDERS` end the search there;
-hidden folders are left out. Symbolic links are followed, each folder once, so that loops end. Of two packages
-of one name the one nearer to the root counts, then the first by the alphabet.
+A folder with a manifest is a package, and folders below it are not searched. Folders that hold a file of
+:data:`IGNORE_MARKS` are left out with their subfolders; those with :data:`NO_SUBFOLDERS` end the search
+there; hidden folders are left out. Symbolic links are followed, each folder once, so that loops end. Of two
+packages of one name the one nearer to the root counts, then the first by the alphabet.
 
 A search is remembered for as long as no folder or manifest that it looked at has changed: a package that is
 added or renamed later is found.

@@ -15,7 +15,7 @@ _CREDENTIAL = "secret"
 
 
 class Role(StrEnum):
-    """What a service runs."""
+    """The role of a service."""
 
     ENGINE = "engine"
     """All programs, by ``rce up``."""

@@ -66,7 +66,7 @@ class Plan:
             file.write(json.dumps(asdict(self)).encode())
             file.seek(0)
             os.set_inheritable(file.fileno(), True)
-            # The command line is there for those who look for the process, its last word for the forks' own.
+            # The command line is for users who look for the process; its last word reserves room for forks.
             room = "-" * max(len("".join(program.argv)) for program in self.programs)
             os.execv(  # noqa: S606 - this interpreter
                 sys.executable,

@@ -77,7 +77,7 @@ def prepare(programs: Iterable[Program], shared: Iterable[str]) -> Mapping[str, 
 
 
 def _has_streams() -> bool:
-    """Tell whether the descriptors 0 to 2 are taken, so that no pipe gets their numbers."""
+    """Return whether the descriptors 0 to 2 are taken, so that no pipe gets their numbers."""
     return None not in (sys.stdin, sys.stdout, sys.stderr)
 
 

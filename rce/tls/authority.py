@@ -152,7 +152,7 @@ def read_details(pem: bytes) -> Details:
 
 
 def is_signed_by(certificate: bytes, authority: bytes) -> bool:
-    """Tell whether an authority has signed a certificate, both as PEM."""
+    """Return whether an authority has signed a certificate, both as PEM."""
     try:
         x509.load_pem_x509_certificate(certificate).verify_directly_issued_by(
             x509.load_pem_x509_certificate(authority)

@@ -68,7 +68,7 @@ class CertificateFolder:
         return self.certificate(REVOKED)
 
     def has(self, name: str) -> bool:
-        """Tell whether a certificate and its key are there."""
+        """Return whether a certificate and its key are there."""
         return self.certificate(name).exists() and self.key(name).exists()
 
     def make_authority(self, days: float = AUTHORITY_DAYS) -> None:

@@ -224,7 +224,7 @@ class ActionServer:
         self._feedback.publish_serialized(kind.serialize(message))
 
     async def sleep(self, seconds: float) -> bool:
-        """Sleep in ROS time; tell whether the node continues."""
+        """Sleep in ROS time; return whether the node continues."""
         return await self._node.sleep(seconds)
 
     # Work

@@ -28,7 +28,7 @@ class GoalServer(Protocol):
         """Publish feedback to the goal's clients."""
 
     async def sleep(self, seconds: float) -> bool:
-        """Sleep in ROS time; tell whether the node continues."""
+        """Sleep in ROS time; return whether the node continues."""
 
 
 class ServerGoal:

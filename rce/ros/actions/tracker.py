@@ -105,7 +105,7 @@ class GoalTracker:
         return ()
 
     def must_repeat(self, now: float) -> bool:
-        """Tell whether goal or cancellation must be sent again; they then count as sent now."""
+        """Return whether goal or cancellation must be sent again; they then count as sent now."""
         waits = not self.is_acknowledged or self.comm is CommState.WAITING_FOR_CANCEL_ACK
         if self.is_done or not waits or now - self.sent_at < REPEAT_AFTER:
             return False

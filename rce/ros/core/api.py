@@ -242,7 +242,7 @@ def _uri(role: str, value: Any) -> str:
 
 
 def _holds_none(value: Any) -> bool:
-    """Tell whether a value is or holds XML-RPC's extension ``nil``, which not all clients can read."""
+    """Return whether a value is or holds XML-RPC's extension ``nil``, which not all clients can read."""
     if isinstance(value, dict):
         return any(map(_holds_none, value.values()))
     return any(map(_holds_none, value)) if isinstance(value, list) else value is None

@@ -39,7 +39,7 @@ class ParameterTree:
         return value
 
     def has(self, name: str) -> bool:
-        """Tell whether ``name`` is a parameter or a namespace of some."""
+        """Return whether ``name`` is a parameter or a namespace of some."""
         try:
             self.get(name)
         except KeyError:

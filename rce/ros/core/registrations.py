@@ -12,7 +12,7 @@ from enum import Enum
 
 
 class Kind(Enum):
-    """What a node can register."""
+    """The kind of a registration."""
 
     PUBLISHER = "publisher"
     SUBSCRIBER = "subscriber"

@@ -180,7 +180,7 @@ class Core:
             raise ParameterMissingError(name) from error
 
     def delete_param(self, name: str) -> bool:
-        """Delete a parameter or namespace by its global name; tell whether it was set."""
+        """Delete a parameter or namespace by its global name; return whether it was set."""
         try:
             self._perform(self.graph.delete_parameter(name))
         except KeyError:

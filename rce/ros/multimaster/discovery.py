@@ -92,12 +92,12 @@ class Discovery:
 
     @property
     def info(self) -> MasterInfo | None:
-        """What is registered at the own master; None until it was asked."""
+        """The registrations at the own master; None until it was asked."""
         return self._monitor.info
 
     @property
     def monitor_uri(self) -> str:
-        """Where the RPC server is."""
+        """The URI of the RPC server."""
         return self._own.monitor_uri
 
     @contextmanager

@@ -66,15 +66,15 @@ class SyncFilter:
     do_not_sync: Patterns = _NONE
 
     def takes_publisher(self, node: str, topic: str, kind: str) -> bool:
-        """Tell whether a node's publishing of a topic is synchronized."""
+        """Return whether a node's publishing of a topic is synchronized."""
         return not self.ignore_publishers.match(topic) and self._takes_topic(node, topic, kind)
 
     def takes_subscriber(self, node: str, topic: str, kind: str) -> bool:
-        """Tell whether a node's subscription to a topic is synchronized."""
+        """Return whether a node's subscription to a topic is synchronized."""
         return not self.ignore_subscribers.match(topic) and self._takes_topic(node, topic, kind)
 
     def takes_service(self, node: str, service: str) -> bool:
-        """Tell whether a service is synchronized."""
+        """Return whether a service is synchronized."""
         if any(self.do_not_sync.match(name) for name in (node, service)):
             return False
         if self.ignore_nodes.match(node) or self.ignore_services.match(service):
@@ -161,7 +161,7 @@ class SyncLists:
         return lists
 
     def takes_host(self, master: str) -> bool:
-        """Tell whether a master is synchronized with."""
+        """Return whether a master is synchronized with."""
         ignored = Patterns(_for_master(self.ignore_hosts, ""))
         chosen = Patterns(_for_master(self.sync_hosts, ""))
         return not ignored.match(master) and (not chosen or chosen.match(master))

@@ -57,7 +57,7 @@ ZERO = Stamp(0, 0)
 
 
 class Kind(Enum):
-    """What a heartbeat is for."""
+    """The kind of a heartbeat."""
 
     STATE = "state"
     REQUEST = "request"

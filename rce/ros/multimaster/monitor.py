@@ -52,7 +52,7 @@ class MasterMonitor:
         self._last: Snapshot | None = None
 
     async def poll(self, now: float) -> bool:
-        """Read the master; tell whether it changed.
+        """Read the master; return whether it changed.
 
         Args:
             now: The time of day, in seconds.

@@ -30,7 +30,7 @@ class Patterns:
         return f"Patterns({list(self._patterns)!r})"
 
     def match(self, name: str) -> bool:
-        """Tell whether a whole name fits one of the patterns."""
+        """Return whether a whole name fits one of the patterns."""
         lowered = name.lower()
         return any(_fits(parts, lowered) for parts in self._parts)
 

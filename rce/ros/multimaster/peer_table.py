@@ -41,7 +41,7 @@ class PeerKey(NamedTuple):
 
     @property
     def monitor_uri(self) -> str:
-        """Where its RPC server is."""
+        """The URI of its RPC server."""
         return f"http://{self.host}:{self.rpc_port}/"
 
 

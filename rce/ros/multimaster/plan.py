@@ -19,7 +19,7 @@ ANY_TYPE = "*"
 
 
 class RegistrationKind(Enum):
-    """What is registered."""
+    """The kind of a registration."""
 
     SUBSCRIBER = "subscriber"
     PUBLISHER = "publisher"

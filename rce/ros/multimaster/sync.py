@@ -58,13 +58,13 @@ class SyncSettings:
     namespaces: Mapping[str, str] = field(default_factory=dict)
     """Master's name (``*``: every other) -> namespace that its names get here, which takes a relay."""
     relay_to: tuple[tuple[str, int], ...] = ()
-    """Where to make relay links to: hosts and ports."""
+    """Hosts and ports to make relay links to."""
     relay_listen: int | None = None
     """Port on which to take relay links; None: none, 0: a free one."""
     relay_addr: str = ""
     """Address on which to take relay links; if empty, all."""
     relay_token: str = field(default="", repr=False)
-    """What both sides of a relay link must know."""
+    """The token that both sides of a relay link must have."""
     relay_name: str = ""
     """This side's name on relay links; if empty, the local master's."""
 

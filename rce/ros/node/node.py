@@ -343,7 +343,7 @@ class Node(GraphMember):
         await self._parameters.set(self.resolve(name), value)
 
     async def has_param(self, name: str) -> bool:
-        """Tell whether a parameter or namespace is set."""
+        """Return whether a parameter or namespace is set."""
         return await self._parameters.has(self.resolve(name))
 
     async def delete_param(self, name: str) -> None:

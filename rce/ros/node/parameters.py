@@ -72,7 +72,7 @@ class Parameters:
         self._note(name, value)  # the master reports a change to all nodes except the one that made it
 
     async def has(self, name: str) -> bool:
-        """Tell whether a parameter or namespace is set."""
+        """Return whether a parameter or namespace is set."""
         return bool(await self._master.call("hasParam", name))
 
     async def delete(self, name: str) -> None:

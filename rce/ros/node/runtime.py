@@ -28,7 +28,7 @@ class Types:
 
     @property
     def registry(self) -> TypeRegistry:
-        """Where types come from."""
+        """The source of types."""
         if self._registry is None:
             from rce.ros.types import TypeRegistry
 

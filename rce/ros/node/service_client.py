@@ -165,7 +165,7 @@ class ServiceClient:
 
 
 async def answers(runtime: Runtime, name: str) -> bool:
-    """Tell whether a service has a provider that can be reached."""
+    """Return whether a service has a provider that can be reached."""
     uri = await runtime.master.lookup_service(name)
     if uri is None:
         return False

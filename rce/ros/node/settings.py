@@ -102,7 +102,7 @@ def anonymous_name(name: str) -> str:
 
 
 def is_loopback(host: str) -> bool:
-    """Tell whether only programs of this machine can reach ``host``."""
+    """Return whether only programs of this machine can reach ``host``."""
     if host == "localhost":
         return True
     try:

@@ -43,7 +43,7 @@ class SlaveApi:
     topics: Topics
     master_uri: str
     tcpros_address: Callable[[], tuple[str, int]]
-    """Where subscribers connect to."""
+    """The address that subscribers connect to."""
     on_shutdown: Callable[[str], None]
     """Takes the reason for which the node is told to stop."""
     on_parameter: Callable[[str, Any], bool]

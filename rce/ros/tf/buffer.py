@@ -102,7 +102,7 @@ class Buffer:
             The transform with its time; zero if it is valid at all times.
 
         Raises:
-            UnknownFrameError: There is no such frame.
+            UnknownFrameError: The frame does not exist.
             ConnectivityError: The two are in different trees.
             ExtrapolationError: The time is not within the cache.
             FrameLoopError: The frames are not a tree.
@@ -143,7 +143,7 @@ class Buffer:
         )
 
     def can_transform(self, target: str, source: str, time: Time | None = None) -> bool:
-        """Tell whether :meth:`lookup` has an answer."""
+        """Return whether :meth:`lookup` has an answer."""
         try:
             self.lookup(target, source, time)
         except TransformError:
@@ -154,7 +154,7 @@ class Buffer:
         """Return the latest time at which all edges between two frames are known; zero: they always hold.
 
         Raises:
-            UnknownFrameError: There is no such frame.
+            UnknownFrameError: The frame does not exist.
             ConnectivityError: The two are in different trees.
             FrameLoopError: The frames are not a tree.
         """
@@ -231,7 +231,7 @@ class Buffer:
 
 
 class _End:
-    """Where a way up ended, the frames on it, and why it did not reach the root."""
+    """The end of a path towards the root, the frames on it, and why it did not reach the root."""
 
     __slots__ = ("frame", "obstacle", "passed")
 

@@ -119,7 +119,7 @@ class TransformListener:
         )
 
     def can_transform(self, target: str, source: str, time: Time | None = None) -> bool:
-        """Tell whether :meth:`lookup` has an answer."""
+        """Return whether :meth:`lookup` has an answer."""
         return self._fresh_buffer().can_transform(self.resolve(target), self.resolve(source), time)
 
     async def wait_for(

@@ -118,7 +118,7 @@ class _Connection(asyncio.Protocol):
             self._transport.abort()
 
     def _next_event(self) -> bool:
-        """Handle one event; tell whether there may be more."""
+        """Handle one event; return whether there may be more."""
         event = self._http.next_event()
         if event is h11.NEED_DATA or event is h11.PAUSED:
             if self._http.they_are_waiting_for_100_continue:

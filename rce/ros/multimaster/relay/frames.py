@@ -143,7 +143,7 @@ class Call:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a service answered."""
+    """The answer of a service."""
 
     CODE: ClassVar[bytes] = b"A"
     call: int

@@ -10,7 +10,7 @@ class Throttle(Protocol):
     """Decides on messages in the order in which they come."""
 
     def passes(self, now: float, size: int) -> bool:
-        """Tell whether a message of ``size`` bytes at ``now`` (seconds) is passed on."""
+        """Return whether a message of ``size`` bytes at ``now`` (seconds) is passed on."""
 
 
 class Everything:
