@@ -139,7 +139,7 @@ class RobotInterface(Interface):
         """
 
     def take_large(self, large: LargeData) -> None:
-        """Handle a data message that was not parsed yet, because that takes long.
+        """Handle an unparsed data message, whose parsing takes long.
 
         Raises:
             RobotError: It is refused.
@@ -154,7 +154,7 @@ class RobotInterface(Interface):
         """Note that a message of the robot with this id was refused; the robot has been told."""
 
     def on_active(self, active: bool) -> None:
-        """Tell the robot."""
+        """Tell the robot whether the interface is in use."""
         self.active = active
         self.robot.show_active(self.tag, active)
 

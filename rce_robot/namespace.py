@@ -1,4 +1,4 @@
-"""One robot as the engine knows it, connected or not: its endpoint, its interfaces and its session.
+"""One robot, connected or not: its endpoint, its interfaces and its session.
 
 The endpoint outlives connections: while a robot is away its interfaces and their connections stay, until
 the master drops the robot or it comes back.
@@ -43,30 +43,30 @@ if TYPE_CHECKING:
 
 _UNUSED = InterfaceUsage()
 COLLECT_AFTER = 16 << 20
-"""Bytes given up after which it is made sure that they are free."""
+"""Dropped bytes after which a garbage collection makes sure that they are free."""
 
 
 class Forms(Protocol):
-    """Makes what reads and writes an interface's messages."""
+    """Makes the forms of interfaces."""
 
     def pair(self, spec: InterfaceSpec, type_: InterfaceType) -> tuple[Form, Form]:
-        """Return the forms from and to the robot; raises :class:`rce.link.InterfaceError` for a bad spec."""
+        """Return the forms from and to the robot; raise :class:`rce.link.InterfaceError` for a bad spec."""
 
 
 class NamespaceListener(Protocol):
-    """What a namespace tells and asks the task set."""
+    """The interface of a namespace to the task set."""
 
     def changed(self, namespace: Namespace) -> None:
         """The robot's status changed."""
 
     def failed(self, namespace: Namespace, text: str) -> None:
-        """Something failed that the robot's user must know."""
+        """Report a fault to the robot's user."""
 
     def robot_left(self, namespace: Namespace, reason: str) -> None:
         """The robot's connection ended."""
 
     async def ask_master(self, id: EndpointId, request: Request) -> tuple[str, ...]:  # noqa: A002
-        """Have the master carry out a robot's request; return what went wrong."""
+        """Have the master carry out a robot's request; return the faults."""
 
 
 class Namespace:
@@ -93,7 +93,7 @@ class Namespace:
         self.id = id
         self.revision = 0
         self.session: DoorSession | None = None
-        """The session from handshake to end, also while it cannot send (yet, or any more)."""
+        """The session from handshake to end, including times when it cannot send (yet, or any more)."""
         self.dropped: Counter[str] = Counter()
         self._live: DoorSession | None = None
         self._forms = forms
@@ -103,7 +103,7 @@ class Namespace:
         self._applying = asyncio.Lock()
         self._pool = pool
         self._given_up = 0
-        """Bytes, since the last look for garbage."""
+        """Bytes dropped since the last garbage collection."""
         self._holdings = Holdings(self._note)
         self._account = ledger.open(id.user, self)
         self._endpoint = Endpoint(
@@ -120,7 +120,7 @@ class Namespace:
         self._changed()
 
     async def patch(self, patch: SpecPatch) -> bool:
-        """Do what :meth:`apply` does, with what changed; return False if what it fits is not there."""
+        """Apply a patch as :meth:`apply` a spec; return False if its base revision is not applied."""
         async with self._applying:
             if patch.revision > self.revision:
                 if patch.base != self.revision:
@@ -131,7 +131,7 @@ class Namespace:
         return True
 
     async def close(self, reason: str) -> None:
-        """End the connection, if there is one, and give up everything."""
+        """End the connection, if any, and remove all interfaces."""
         if self.session is not None:
             await self.session.close(reason)
         async with self._applying:
@@ -139,17 +139,17 @@ class Namespace:
         self._account.close()
 
     def status(self) -> EndpointStatus:
-        """Return all that the master is told."""
+        """Return the whole status for the master."""
         return self._reporter.whole(self.revision, self.session)
 
     def next_status(self, *, in_patches: bool) -> EndpointStatus | StatusPatch:
-        """Return what the master is to be told next, ``in_patches`` if it takes those."""
+        """Return the next report for the master; a patch if ``in_patches``."""
         return self._reporter.next(self.revision, self.session, in_patches=in_patches)
 
     def usage(self) -> EndpointUsage:
         """Return the counters of the interfaces that were used.
 
-        What was dropped on the way to the robot is added.
+        Messages dropped on the way to the robot are added.
         """
         return EndpointUsage(
             interfaces={
@@ -164,7 +164,7 @@ class Namespace:
         return msgspec.structs.replace(usage, dropped=usage.dropped + dropped) if dropped else usage
 
     def tick(self) -> None:
-        """Do what is to be done every few seconds."""
+        """Do periodic work; called every few seconds."""
         if self._live is not None:
             self._live.tick()
 
@@ -172,12 +172,12 @@ class Namespace:
 
     @property
     def held(self) -> int:
-        """Bytes of all messages that are kept: on the way from the robot and to it, latched, being served."""
+        """Bytes of all kept messages: on the way from and to the robot, latched, being served."""
         waiting = self._endpoint.waiting_bytes + self._holdings.bytes
         return waiting + (self.session.held if self.session is not None else 0)
 
     def shed(self, size: int) -> None:
-        """Drop the oldest of what waits, on the robot's side first."""
+        """Drop the oldest waiting messages, on the robot's side first."""
         before = self.held
         goal = before - size
         if self.session is not None:
@@ -202,11 +202,11 @@ class Namespace:
     # rce_robot.doors.base.Owner
 
     def grew(self) -> None:
-        """Count what waits."""
+        """Count waiting messages."""
         self._account.note()
 
     def take(self, message: DataMessage) -> None:
-        """Give a data message of the robot to its interface.
+        """Pass a data message of the robot to its interface.
 
         Raises:
             RobotError: It is refused.
@@ -223,10 +223,10 @@ class Namespace:
         interface.take(message)
 
     def take_large(self, large: LargeData) -> None:
-        """Give a data message that was not parsed yet to its interface.
+        """Pass an unparsed data message to its interface.
 
         Raises:
-            RobotError: It is refused; the interface knows.
+            RobotError: It is refused; the interface has been notified.
         """
         address = large.address
         interface = self._interfaces.get(address.i_tag)
@@ -245,7 +245,7 @@ class Namespace:
         raise error
 
     def keep_latched(self, i_tag: str, sources: Sequence[str]) -> None:
-        """Let what the robot's other sources latched at an interface end."""
+        """End the latched messages of the robot's other sources at an interface."""
         interface = self._interfaces.get(i_tag)
         if interface is not None:
             interface.keep_latched(sources)
@@ -257,17 +257,17 @@ class Namespace:
             interface.refused(call.msg_id, problem)
 
     async def ask_master(self, request: Request) -> tuple[str, ...]:
-        """Have a request of the robot carried out."""
+        """Have a request of the robot carried out; return the faults."""
         return await self._listener.ask_master(self.id, request)
 
     def joined(self, session: DoorSession) -> None:
-        """Give the robot what it must know at once."""
+        """Send the robot its initial messages."""
         self._live = session
         for interface in list(self._interfaces.values()):
             interface.robot_joined()
 
     def leaving(self, session: DoorSession) -> None:
-        """Fail what waits for the robot."""
+        """Fail the calls that wait for the robot."""
         if self._live is session:
             self._live = None
         for interface in list(self._interfaces.values()):
@@ -284,7 +284,7 @@ class Namespace:
 
     @property
     def connected(self) -> bool:
-        """Whether something can be sent to the robot."""
+        """Whether messages can be sent to the robot."""
         return self._live is not None
 
     def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy) -> bool:
@@ -296,32 +296,32 @@ class Namespace:
         return self._live is not None and self._live.send_urgent(message)
 
     def report(self, problem: str, call: CallId | None = None) -> None:
-        """Send an ``ER``, if the robot is there."""
+        """Send an ``ER``, if the robot is connected."""
         if self._live is not None:
             self._live.report(problem, call)
 
     def show_active(self, tag: str, active: bool) -> None:
-        """Send an ``ST``, if the robot is there."""
+        """Send an ``ST``, if the robot is connected."""
         if self._live is not None:
             self._live.show_active(tag, active)
 
     @property
     def knows_sources(self) -> bool:
-        """Whether the robot is there and names the sources of latched messages."""
+        """Whether the robot is connected and names the sources of latched messages."""
         return self._live is not None and self._live.knows_sources
 
     def send_latched(self, tag: str, source: str, message: Queued, *, shared: bool) -> None:
-        """Send the latched message of a source, if the robot is there."""
+        """Send the latched message of a source, if the robot is connected."""
         if self._live is not None:
             self._live.send_latched(tag, source, message, shared=shared)
 
     def send_sources(self, tag: str, sources: Sequence[str]) -> None:
-        """Send an ``LT``, if the robot is there and knows of it."""
+        """Send an ``LT``, if the robot is connected and supports it."""
         if self._live is not None:
             self._live.send_sources(tag, sources)
 
     def drop_latched(self, tag: str, source: str) -> None:
-        """Take a latched message back, if it was not sent yet."""
+        """Withdraw a latched message that was not sent yet."""
         if self._live is not None:
             self._live.drop_latched(tag, source)
 
@@ -334,19 +334,19 @@ class Namespace:
         return await self._pool.convert(self.id.user, job, parts)
 
     def await_binaries(self, large: LargeData, ids: Sequence[str]) -> None:
-        """Have a large message come again with its binary values."""
+        """Handle a large message again when its binary values have arrived."""
         if self._live is not None:
             self._live.await_binaries(large, ids)
 
     def run(self, work: Coroutine[Any, Any, None]) -> bool:
-        """Run something until the robot leaves."""
+        """Run a coroutine until the robot leaves."""
         if self._live is None:
             work.close()
             return False
         return self._live.spawn(work)
 
     def count_dropped(self, tag: str) -> None:
-        """Count a message that was thrown away before it was queued."""
+        """Count a message that was dropped before it was queued."""
         self.dropped[tag] += 1
 
     def closed(self, interface: RobotInterface) -> None:
@@ -357,7 +357,7 @@ class Namespace:
             if self._live is not None:
                 self._live.discard(interface.tag)
 
-    # What the endpoint calls
+    # Called by the endpoint
 
     def _make(self, port: Port) -> Interface:
         try:

@@ -1,4 +1,4 @@
-"""An interface's conversions in other processes: what is asked, and what the answer means."""
+"""An interface's conversions in other processes: requests and answers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Read(NamedTuple):
-    """What became of a message of the robot."""
+    """The result of converting a message of the robot."""
 
     payload: Buffer | None = None
     """The serialized message; None if there is a fault, or if it was a string."""
@@ -29,9 +29,9 @@ class Read(NamedTuple):
     fault: str = ""
     msg_id: str = ""
     text: str | None = None
-    """The message was a string, the word of a service."""
+    """The message was a string: a service's error text."""
     ids: tuple[str, ...] = ()
-    """Binary values that must come first."""
+    """Binary values that are still missing."""
 
 
 class Offload:
@@ -47,7 +47,7 @@ class Offload:
         self._spec = spec
 
     async def read_text(self, large: LargeData) -> Read:
-        """Parse and serialize a message of which only the text is there. Does not raise."""
+        """Parse and serialize a message from its text. Does not raise."""
         job = ReadText(
             i_tag=large.address.i_tag,
             stated_type=large.address.message_type,
@@ -67,7 +67,7 @@ class Offload:
         """Make the data message that carries a payload to the robot.
 
         Raises:
-            UnreadableError: It is not a message of the type, or cannot be shown.
+            UnreadableError: It is not a message of the type, or cannot be converted.
         """
         spec = self._spec
         job = Show(i_tag=spec.tag, message_type=spec.message_type, interface_type=spec.type, msg_id=msg_id)
@@ -100,10 +100,10 @@ def _understood(result: Result, parts: list[memoryview]) -> Read:
 
 
 def pack_value(msg: Any) -> bytes:
-    """Pack what a data message carries for :meth:`Offload.read_value`.
+    """Pack the content of a data message for :meth:`Offload.read_value`.
 
     Raises:
-        UnreadableError: It holds an integer that no message can hold.
+        UnreadableError: It holds an integer that is out of range for every message.
     """
     try:
         return msgspec.msgpack.encode(msg)

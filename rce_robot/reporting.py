@@ -1,4 +1,4 @@
-"""What the master is told of a robot: all at first, then what changed if it takes that."""
+"""Reports to the master about a robot: the whole status first, then patches if it accepts them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class RobotReporter:
         """The session at that time."""
 
     def whole(self, revision: int, session: DoorSession | None) -> EndpointStatus:
-        """Return all that there is to tell.
+        """Return the whole status.
 
         Args:
             revision: The newest spec that was applied.
@@ -46,13 +46,13 @@ class RobotReporter:
     def next(
         self, revision: int, session: DoorSession | None, *, in_patches: bool
     ) -> EndpointStatus | StatusPatch:
-        """Return what the master is to be told next.
+        """Return the next report for the master.
 
         Args:
             revision: The newest spec that was applied.
             session: The robot's session; None while it is away.
-            in_patches: Whether the master takes what changed. It still gets all when the robot came or left:
-                it forgets what it knew then.
+            in_patches: Whether the master takes patches. It still gets the whole status when the robot
+                connected or left, because it then forgets the former one.
         """
         self._number += 1
         news = self._endpoint.take_news()

@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 
 
 class AskedByRobot(RobotInterface):
-    """ServiceProvider: the robot calls the peer's service. Calls run side by side."""
+    """ServiceProvider: the robot calls the peer's service. Calls run concurrently."""
 
     def take(self, message: DataMessage) -> None:
         """Start a call."""
@@ -63,7 +63,7 @@ class AskedByRobot(RobotInterface):
 
     @contextlib.contextmanager
     def _held(self, size: int, msg_id: str) -> Iterator[None]:
-        """Count what a call holds; when memory is short, the call ends."""
+        """Count the bytes of a call; when memory is short, the call ends."""
         task = asyncio.current_task()
         assert task is not None
         given_up = False
@@ -88,7 +88,7 @@ class AskedByRobot(RobotInterface):
         except CallError as error:
             self._report(str(error), msg_id)
             return
-        except Exception:  # noqa: BLE001 - logged; the caller must hear of the end of its call
+        except Exception:  # noqa: BLE001 - logged; the caller must get an answer
             _log.exception("service call at %s", self.tag)
             self._report("internal error; the engine's log tells more", msg_id)
             return
@@ -102,7 +102,7 @@ class AskedByRobot(RobotInterface):
 
 
 class AnsweredByRobot(RobotInterface):
-    """ServiceClient: peers call the robot's service. Calls run side by side."""
+    """ServiceClient: peers call the robot's service. Calls run concurrently."""
 
     def __init__(
         self, port: Port, robot: RobotSide, form_in: Form, form_out: Form, *, call_timeout: float
@@ -115,7 +115,7 @@ class AnsweredByRobot(RobotInterface):
         """Ask the robot.
 
         Raises:
-            CallError: It is away, leaves, is busy, answers with a fault or not in time.
+            CallError: It is away, leaves, is busy, answers with a fault, or does not answer in time.
         """
         if not self.robot.connected:
             raise PeerLostError("the robot is not connected")
@@ -133,10 +133,10 @@ class AnsweredByRobot(RobotInterface):
             raise CallTimeoutError(f"the robot did not answer within {self._timeout:g} s") from error
         finally:
             del self._calls[msg_id]
-            del answer  # its error refers to this frame, and so to the request, until the collector comes
+            del answer  # its error refers to this frame, and so to the request, until it is collected
 
     def take(self, message: DataMessage) -> None:
-        """Complete a call. A string in place of ``msg`` is the robot's word for why it failed."""
+        """Complete a call. A string in place of ``msg`` is the robot's error text."""
         answer = self._calls.get(message.msg_id)
         if answer is None or answer.done():
             raise MisdirectedError.at(self.tag, message.msg_id, "no call waits for this answer")
@@ -189,11 +189,11 @@ class AnsweredByRobot(RobotInterface):
         self.not_rendered(msg_id, f"the robot's answer was refused: {problem}")
 
     def robot_left(self) -> None:
-        """Fail the calls that wait."""
+        """Fail the waiting calls."""
         self._fail_all(PeerLostError("the robot's connection ended before it answered"))
 
     def not_rendered(self, msg_id: str, problem: str) -> None:
-        """Fail the call; the robot did not ask for it and need not know."""
+        """Fail the call without notifying the robot, which did not ask for it."""
         answer = self._calls.get(msg_id)
         if answer is not None and not answer.done():
             answer.set_exception(PeerFaultError(problem))

@@ -1,7 +1,7 @@
 """The robot task set: robots' namespaces on one side, the master on the other.
 
-It keeps nothing on disk: after a restart the master's ``Sync`` and the robots' return bring everything
-back. While the master is away everything continues, except that no new robot can log in.
+It does not store data on disk: after a restart, the master's ``Sync`` and the returning robots restore its
+state. While the master is away it continues to work, but new robots cannot log in.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ _OK, _UNAVAILABLE = 200, 503
 
 
 class Channel(Protocol):
-    """What is needed of :class:`rce.control.channel.TaskSetChannel`."""
+    """The used part of :class:`rce.control.channel.TaskSetChannel`."""
 
     def send(self, message: ToMaster) -> None:
         """Send, or drop while the master is away."""
@@ -75,7 +75,7 @@ class Channel(Protocol):
     async def login(
         self, user: str, robot: str, password: str, address: str = "", token: str = ""
     ) -> LoginReply:
-        """Ask whether a robot may come in; raises :class:`ControlError` if the master stays away."""
+        """Ask whether a robot may log in; raise :class:`ControlError` if the master stays away."""
 
     async def client_request(
         self,
@@ -85,23 +85,23 @@ class Channel(Protocol):
         *,
         content: Request | None = None,
     ) -> ClientReply:
-        """Have a client's request carried out; raises :class:`ControlError` likewise."""
+        """Have a client's request carried out; raise :class:`ControlError` likewise."""
 
 
 class RobotTaskSet:
-    """All robots of one process. Implements what the gate and the namespaces ask for.
+    """All robots of one process. Implements the interfaces of the gate and the namespaces.
 
-    Invariant: every robot has one namespace at most; while an old one is being closed there is no new one.
+    Invariant: every robot has at most one namespace; a new one is made only after the old one is closed.
 
     Args:
-        hub: Joins the robots' endpoints to others.
+        hub: Links the robots' endpoints to others.
         forms: Makes converters and forwarders.
-        settings: How it is run.
-        name: Names this process to the master.
-        machine: What it runs on.
-        url: Where clients are sent.
+        settings: Its settings.
+        name: The name of this process for the master.
+        machine: Its machine.
+        url: The URL for clients.
         address: Where links to any of the robots are accepted.
-        lobby: Where robots wait until they have logged in.
+        lobby: Holds robots until they have logged in.
         pool: Converts large messages.
     """
 
@@ -139,14 +139,14 @@ class RobotTaskSet:
         self._master_features: frozenset[str] = frozenset()
         self._unused = UnusedMemory(resident_bytes())
 
-    # The master's side
+    # Messages of the master
 
     def use(self, channel: Channel) -> None:
-        """Take the channel, which was made with :meth:`hello` and :meth:`handle`."""
+        """Set the channel, which was made with :meth:`hello` and :meth:`handle`."""
         self._channel = channel
 
     def hello(self) -> Hello:
-        """Say who this is and what is there."""
+        """Return the task set's name, machine and robots."""
         self._master_features = frozenset()
         return Hello(
             version=CONTROL_VERSION,
@@ -161,7 +161,7 @@ class RobotTaskSet:
         )
 
     async def handle(self, message: ToTaskSet) -> None:
-        """Do what the master says."""
+        """Handle a message of the master."""
         match message:
             case Welcome():
                 self._master_features = frozenset(message.features)
@@ -185,13 +185,13 @@ class RobotTaskSet:
                 assert_never(message)
 
     def _probe(self, id_: EndpointId) -> None:
-        """End a robot's connection unless the robot answers: it wants to come in at another task set."""
+        """End a robot's connection unless the robot answers: it logs in at another task set."""
         namespace = self._namespaces.get(id_)
         if namespace is not None and namespace.session is not None and self._tasks is not None:
             self._tasks.create_task(namespace.session.probe())
 
     async def run(self) -> None:
-        """Report what is used, until cancelled; then close everything."""
+        """Report the usage, until cancelled; then close all namespaces."""
         try:
             async with asyncio.TaskGroup() as self._tasks:
                 while True:
@@ -204,13 +204,13 @@ class RobotTaskSet:
                     tasks.create_task(_end(namespace, "the robot endpoint is shutting down"))
             self._namespaces.clear()
 
-    # What the gate asks: rce_robot.doors.base.Admission
+    # Called by the gate: rce_robot.doors.base.Admission
 
     async def log_in(self, credentials: Credentials, address: str) -> EndpointSpec:
-        """Ask the master whether a robot may come in.
+        """Ask the master whether a robot may log in.
 
         Raises:
-            HandshakeError: It may not, or the master is away.
+            HandshakeError: It is refused, or the master is away.
         """
         try:
             async with asyncio.timeout(self._settings.login_timeout):
@@ -225,11 +225,11 @@ class RobotTaskSet:
         return reply.endpoint
 
     def find(self, id: EndpointId) -> Namespace | None:  # noqa: A002
-        """Return the robot's namespace if there is one."""
+        """Return the robot's namespace if it exists."""
         return self._namespaces.get(id)
 
     async def settle(self, spec: EndpointSpec) -> Namespace:
-        """Return the robot's namespace, made if there is none, with the spec applied."""
+        """Return the robot's namespace with the spec applied; make it if it does not exist."""
         id_ = EndpointId.parse(spec.id)
         while (closing := self._closing.get(id_)) is not None:
             await closing.wait()
@@ -249,12 +249,12 @@ class RobotTaskSet:
         return namespace
 
     async def _patch(self, patch: SpecPatch) -> None:
-        """Apply what changed in a robot's spec; what does not fit is asked for as a whole."""
+        """Apply a patch of a robot's spec; ask for the whole spec if it does not fit."""
         namespace = self._namespaces.get(EndpointId.parse(patch.id))
         if namespace is None or not await namespace.patch(patch):
             self._channel.send(SpecWanted(id=patch.id))
 
-    # What the namespaces ask: rce_robot.namespace.NamespaceListener
+    # Called by the namespaces: rce_robot.namespace.NamespaceListener
 
     def changed(self, namespace: Namespace) -> None:
         """Report a robot's status, once for all changes of one moment."""
@@ -272,7 +272,7 @@ class RobotTaskSet:
             self._channel.send(Left(id=str(namespace.id), reason=reason))
 
     async def ask_master(self, id: EndpointId, request: Request) -> tuple[str, ...]:  # noqa: A002
-        """Have a client's request carried out; return what went wrong."""
+        """Have a client's request carried out; return the faults."""
         type_ = type_of(request)
         try:
             if TYPED_REQUESTS in self._master_features:
@@ -284,7 +284,7 @@ class RobotTaskSet:
             return (f"{type_}: not done: {error}",)
         return reply.errors
 
-    # Own
+    # Private
 
     def _is_current(self, namespace: Namespace) -> bool:
         return self._namespaces.get(namespace.id) is namespace
@@ -324,11 +324,11 @@ class RobotTaskSet:
         )
 
     def _give_back_memory(self) -> None:
-        """Keep no more of the memory of former messages than is worth it."""
+        """Return the memory of former messages to the kernel when it is worthwhile."""
         held = self._ledger.total
         if self._unused.is_due(resident_bytes(), held, self._ledger.growths):
             if self._unused.idle:
-                gc.collect()  # what ended may be in cycles that hold messages; the collector counts no bytes
+                gc.collect()  # cycles may hold messages; the collector does not count bytes
             give_back_free_memory()
             self._unused.given_back(resident_bytes(), held)
 
@@ -341,7 +341,7 @@ class RobotTaskSet:
             await self.settle(spec)
 
     def _drop(self, id_: EndpointId, reason: str, revision: int) -> None:
-        """Start to close a robot's namespace; the master hears when it is gone."""
+        """Start to close a robot's namespace; report its end to the master."""
         namespace = self._namespaces.pop(id_, None)
         if namespace is None or self._tasks is None:
             self._channel.send(Gone(id=str(id_), revision=revision))
