@@ -1,4 +1,4 @@
-"""What ``rce-ros`` takes on a robot: memory and processor, idle and with a topic to the cloud and back."""
+"""The cost of ``rce-ros`` on a robot: memory and processor, idle and with a topic to the cloud and back."""
 
 from __future__ import annotations
 

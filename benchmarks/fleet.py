@@ -59,12 +59,12 @@ POSE_LIMIT_US = 50
 
 @dataclass
 class Fleet:
-    """A planner and robots that do at once what they are told, without any delay.
+    """A planner and robots that carry out commands at once, without any delay.
 
     Attributes:
-        planner: What is measured.
+        planner: The measured planner.
         now: Time of the fleet, seconds.
-        requests: Plans that are asked for and not made.
+        requests: Requested plans that are not made yet.
     """
 
     planner: FleetPlanner
@@ -89,19 +89,19 @@ class Fleet:
         return PoseSeen(robot, *self.places[robot], 0.0)
 
     def report(self, robot: str) -> ReportSeen:
-        """What a robot's move client says next."""
+        """Return the next message of a robot's move client."""
         revision, cells = self.revisions[robot]
         return ReportSeen(robot, ClientReport(revision, ClientState.IDLE, cells))
 
     def drive(self, robot: str) -> bool:
-        """Put a robot into the next cell that it was granted; tell whether there is one."""
+        """Put a robot into its next granted cell; return whether it has one."""
         granted = self.planner.state.ledger.granted(robot)
         if len(granted) > 1:
             self.places[robot] = self.planner.state.grid.centre(granted[1])
         return len(granted) > 1
 
     def say_all(self) -> None:
-        """Let everybody be heard, so that no robot is lost."""
+        """Send a message of every robot, so that the planner counts none as lost."""
         for robot in self.places:
             self.tell(self.pose(robot))
             self.tell(self.report(robot))
@@ -109,7 +109,7 @@ class Fleet:
 
 
 def joined(count: int) -> Fleet:
-    """A fleet whose robots have their places, each sent somewhere, with a plan asked for and not made."""
+    """Return a fleet of placed robots, each with a goal, and with a requested plan that is not made yet."""
     edge = ceil(sqrt(count * CELLS_PER_ROBOT))
     grid = GridMap(edge, edge)
     rng = Random(count)
@@ -127,13 +127,13 @@ def joined(count: int) -> Fleet:
 
 
 def finish_plans(fleet: Fleet) -> None:
-    """Make all plans that are asked for, one after another."""
+    """Make all requested plans, one after another."""
     while fleet.requests:
         fleet.tell(PlanMade(compute_plan(fleet.requests.pop())))
 
 
 def pose_cost(count: int, *, batches: int) -> dict[str, Any]:
-    """What a pose costs: of robots that stand, and of robots that come into their next cell with it."""
+    """Measure the cost of a pose, of standing robots and of robots that enter their next cell with it."""
     fleet = joined(count)
     finish_plans(fleet)
     robots = list(fleet.places)
@@ -154,7 +154,7 @@ def pose_cost(count: int, *, batches: int) -> dict[str, Any]:
 
 
 def _timed(fleet: Fleet, robot: str) -> float:
-    """Seconds that a robot's pose takes; plans that it leads to are not made yet."""
+    """Return the seconds that a robot's pose takes, without the plans that follow from it."""
     pose = fleet.pose(robot)
     began = thread_time()
     instructions = fleet.planner.handle(pose, fleet.now)
@@ -172,7 +172,7 @@ async def plan_cost(count: int) -> dict[str, Any]:
     gc.freeze()
     async with PlanWorker(logging.getLogger("benchmark")) as worker:
         await worker.compute(PlanRequest(0, 1, 1, (), (), (), (), (), 0, 1))
-        # This plan knows of the first goal only; the next one knows them all.
+        # This plan has the first goal only; the next one has all of them.
         fleet.tell(PlanMade(compute_plan(fleet.requests.pop())))
         request = fleet.requests.pop()
         steps: dict[str, float] = {}
@@ -207,7 +207,7 @@ async def plan_cost(count: int) -> dict[str, Any]:
 
 
 class Traffic:
-    """Robots that drive a cell every two seconds, and what the planner and the station send meanwhile.
+    """Robots that drive a cell every two seconds, and the traffic of the planner and the station.
 
     Attributes:
         spent: Bytes so far: from the planner as whole states and as changes, to one page likewise.
@@ -229,7 +229,7 @@ class Traffic:
     async def run(self, seconds: int) -> None:
         """Drive."""
         await self._tick()
-        self.spent = dict.fromkeys(self.spent, 0)  # The page has everything now.
+        self.spent = dict.fromkeys(self.spent, 0)  # The page has the whole state now.
         for _ in range(seconds * 10):
             await self._tick()
 
@@ -244,7 +244,7 @@ class Traffic:
         finish_plans(fleet)
         self._publish()
         self._feed.send_poses(fleet.now)
-        self._feed.on_event("", "")  # so that there is something to take
+        self._feed.on_event("", "")  # produces the next changes
         self.spent["page, changes"] += sum(map(len, (await self._page.take())[:-1]))
 
     def _move(self, robot: str) -> None:

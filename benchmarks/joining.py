@@ -1,4 +1,4 @@
-"""A fleet joins one container, robot after robot: what each costs, and whether it grows with those before."""
+"""A fleet joins one container, robot after robot: the cost of each, and whether it grows with the fleet."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _readable(row: dict[str, Any], first: dict[str, Any]) -> dict[str, Any]:
 
 
 async def _join(client: Robot, number: int) -> None:
-    """Wire a robot to the container; returns when all its interfaces are in use."""
+    """Connect a robot to the container; return when all its interfaces are in use."""
     interfaces, pairs = [], []
     for index, topic in enumerate(TOPICS):
         kinds = ("Publisher", "Subscriber")
@@ -91,7 +91,7 @@ async def _join(client: Robot, number: int) -> None:
 
 
 class _Meter:
-    """Counts what the engine's processes compute, and what its control channels carry."""
+    """Measures the processor time of the engine's processes, and the bytes of its control channels."""
 
     def __init__(self, running: RunningEngine) -> None:
         self._port = running.control_port
@@ -103,7 +103,7 @@ class _Meter:
         return spent | {"bytes": float(self._control_bytes())}
 
     def _control_bytes(self) -> int:
-        """What the kernel counts on the master's ends of the control channels."""
+        """Return the kernel's byte counts of the master's ends of the control channels."""
         command = ["ss", "-tinHO", "state", "established", f"( sport = :{self._port} )"]
         told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
         return sum(int(sent or received) for sent, received in _BYTES.findall(told))

@@ -1,4 +1,4 @@
-"""Latched messages: what a robot that comes late waits for one map, and for a burst of many at once."""
+"""Latched messages: how long a late robot waits for one map, and for a burst of many at once."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LONGEST_S = 120.0
 
 
 async def run(running: RunningEngine, *, passes: int) -> list[dict[str, Any]]:
-    """A robot latches maps, each of a source of its own; another one comes again and again."""
+    """A robot latches maps, each of a separate source; another one connects repeatedly."""
     payload = serialized_string(SIZE)
     rows = []
     async with Connection(running.url, "testUser", "testUser", "mapper") as mapper:

@@ -36,7 +36,7 @@ ENDS = (
 
 
 class Echo(Interface):
-    """The far end: what comes in on i1 goes out on i2."""
+    """The far end: sends messages from i1 back on i2."""
 
     out: Port
 
@@ -79,7 +79,7 @@ class Near(Interface):
 
 
 def spec(side: int, address: LinkAddress) -> EndpointSpec:
-    """What one side is: 0 dials."""
+    """Return one side of the link; side 0 dials."""
     numbers = range(1, len(ENDS) + 1)
     return EndpointSpec(
         id=f"user/e{side}",
@@ -96,7 +96,7 @@ def spec(side: int, address: LinkAddress) -> EndpointSpec:
 
 
 class BareEcho(asyncio.Protocol):
-    """What the socket and the loop cost without us."""
+    """A bare echo: the cost of the socket and the loop without the engine."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Keep the transport."""
@@ -108,7 +108,7 @@ class BareEcho(asyncio.Protocol):
 
 
 async def serve_far_end(folder: Path, ready: Connection) -> None:
-    """Be the far end until killed; tell the TCP ports of the link and of the bare echo."""
+    """Run the far end until killed; report the TCP ports of the link and of the bare echo."""
     loop = asyncio.get_running_loop()
     hub = LinkHub("here")
     await hub.listen_unix(folder / "link")

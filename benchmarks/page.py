@@ -1,8 +1,8 @@
 """Makes the tables of the performance page from the summary of the benchmarks: ``python -m benchmarks.page``.
 
-A table stands between ``<!-- figures: NAME -->`` and ``<!-- end -->``: the name of a suite, ``roundtrips``
-for round trips side by side, or ``targets``. With ``--check`` nothing is written; a page that differs ends
-with 1.
+Each table is between ``<!-- figures: NAME -->`` and ``<!-- end -->``: the name of a suite, ``roundtrips`` for
+round trips side by side, or ``targets``. With ``--check`` the page is not written; the program ends with 1 if
+it differs.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _PATHS = ("bare websockets echo", "forwarder", "forwarder, one frame", "converte
 
 
 def made(page: str, summary: dict[str, Any]) -> str:
-    """Return a page with its tables made anew."""
+    """Return a page with updated tables."""
 
     def fill(found: re.Match[str]) -> str:
         return f"{found[1]}\n{block(found['name'], summary)}\n{found[3]}"
@@ -33,7 +33,7 @@ def made(page: str, summary: dict[str, Any]) -> str:
 
 
 def block(name: str, summary: dict[str, Any]) -> str:
-    """Return a table, and what it was measured on."""
+    """Return a table and the machine of its measurement."""
     if name == "targets":
         return "\n".join(_targets(summary)) + "\n"
     suite = "roundtrip" if name == "roundtrips" else name
@@ -101,7 +101,7 @@ def _shown(value: object) -> str:
 
 
 def main(check: bool) -> int:
-    """Write the page, or tell whether it is current."""
+    """Write the page, or check whether it is current."""
     summary = json.loads(SUMMARY.read_text(encoding="utf-8"))
     page = PAGE.read_text(encoding="utf-8")
     wanted = made(page, summary)

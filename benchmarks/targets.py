@@ -1,4 +1,4 @@
-"""What the engine should reach, and which row of which suite tells whether it does."""
+"""The targets of the engine, and the rows of the suites that show whether they are reached."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ RATIOS["forwarder, one frame"] = RATIOS["forwarder"]
 
 @dataclass(frozen=True)
 class Target:
-    """A figure that is wanted."""
+    """A target figure."""
 
     what: str
     suite: str
     read: Callable[[Rows], float | None]
-    """Finds the figure; None: the rows do not hold it."""
+    """Finds the figure; None if the rows do not contain it."""
     limit: float
     incarnation: str
     at_least: bool = False
 
     def is_met(self, figure: float) -> bool:
-        """Tell whether a figure is good enough."""
+        """Return whether a figure reaches the target."""
         return figure >= self.limit if self.at_least else figure <= self.limit
 
 

@@ -1,4 +1,4 @@
-"""A robot for measurements: the client protocol with as little of its own around it as possible.
+"""A robot for measurements: a minimal client of the client protocol.
 
 Its JSON is read and written by msgspec, as in ``rce_client``; with the standard library's ``json`` the client
 would take most of the time of a large message.
@@ -78,7 +78,7 @@ class Robot:
                     self._note(_read(frame))
 
     async def wait_inactive(self, *tags: str, timeout: float = 60) -> None:
-        """Wait until no one of these interfaces is active."""
+        """Wait until all of these interfaces are inactive."""
         async with asyncio.timeout(timeout):
             while any(self.status.get(tag) for tag in tags):
                 frame = await self.socket.recv()

@@ -1,7 +1,7 @@
 """Puts the files that the pages link to, such as examples, into the site: a hook of mkdocs.
 
 On a code host the links lead into the project; in the site they lead to copies below ``files/``. A link to a
-file that is not there stays as it is, and fails the build.
+missing file is not changed, and fails the build.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _LINK = re.compile(r"\]\((\.\./[^)#\s]+)([^)]*)\)")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
-    """Add what the pages link to outside of their folder."""
+    """Add the files that the pages link to outside of their folder."""
     for page in list(files.documentation_pages()):
         for found in _LINK.finditer(page.content_string):
             place = outside(page.src_uri, found[1])
@@ -33,7 +33,7 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:  # noqa: ARG001
-    """Let the links lead to the copies."""
+    """Point the links to the copies."""
     source = page.file.src_uri
 
     def to_copy(found: re.Match[str]) -> str:
@@ -51,10 +51,10 @@ def outside(source: str, link: str) -> str:
 
     Args:
         source: The page, as seen from the documentation's folder.
-        link: What it links to.
+        link: The target of its link.
 
     Returns:
-        Empty if the link stays in the documentation, or no such file is in the project.
+        Empty if the link stays in the documentation, or the file is not in the project.
     """
     place = os.path.normpath(PurePosixPath("docs", source).parent / link)
     return "" if place.startswith(("docs/", "..")) or not (ROOT / place).is_file() else place

@@ -1,7 +1,7 @@
 """Writes the docstrings' references (``:meth:`publish```) as links of the reference pages, for mkdocstrings.
 
-A reference to something that a page shows becomes a link, which fails the build if it leads nowhere; any
-other is shown as a name. The pages are read for what they show, so nothing is listed twice.
+A reference to an object that a page shows becomes a link, which fails the build if it is broken; any other is
+shown as a name. The shown objects are read from the pages, so no second list is needed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Roles(griffe.Extension):
 
 
 def _places(package: griffe.Module) -> dict[str, str]:
-    """Return where the pages show an object: its own path, and those by which it is known, to its anchor."""
+    """Return the anchors of the shown objects, by their own paths and their aliases."""
     shown = {name for page in PAGES.glob("*.md") for name in _SHOWN.findall(page.read_text())}
     places: dict[str, str] = {}
     for name in sorted(shown):
@@ -47,7 +47,7 @@ def _places(package: griffe.Module) -> dict[str, str]:
                 if isinstance(member, griffe.Alias) and not member.inherited:
                     continue  # it is only imported there
                 if not member.has_docstring:
-                    continue  # it is not shown
+                    continue  # not shown
                 anchor = f"{name}.{member.name}"
                 places |= {anchor: anchor, f"{item.path}.{member.name}": anchor}
                 places.setdefault(member.canonical_path, anchor)
@@ -71,7 +71,7 @@ def _objects(item: griffe.Object) -> Iterator[griffe.Object]:
 
 
 def _path(item: griffe.Object, name: str) -> str:
-    """Return the whole path of a name as a docstring of ``item`` means it."""
+    """Return the full path of a name in a docstring of ``item``."""
     first, _, rest = name.partition(".")
     scope: griffe.Object | griffe.Alias | None = item
     while scope is not None:

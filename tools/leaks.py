@@ -1,7 +1,7 @@
-"""Counts what an engine left on its machine: processes, mounts, cgroups, networks, sockets, folders.
+"""Counts the remains of an engine on its machine: processes, mounts, cgroups, networks, sockets, folders.
 
-Only what can belong to one engine is counted, told by its folder and by names that only its containers have:
-others may work on the same machine.
+It counts only objects of one engine, identified by its folder and by names that only its containers have,
+because other engines may run on the same machine.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ INTERFACES = Path("/sys/class/net")
 _PF_EXITING = 0x4
 """A flag of ``/proc/PID/stat`` (Linux's ``include/linux/sched.h``)."""
 DEAD_AFTER_S = 600.0
-"""An empty cell of this age is nobody's."""
+"""Age from which an empty control group has no owner."""
 
 
 class Footprint(NamedTuple):
-    """What a process holds."""
+    """The resources of a process."""
 
     fds: int
     networks: int
@@ -36,7 +36,7 @@ class Footprint(NamedTuple):
 
 
 class Traces:
-    """All that was ever seen of one engine. Call :meth:`look` often: what dies early was seen, too.
+    """All observed processes of one engine. Call :meth:`look` often, to observe short-lived ones too.
 
     Args:
         folder: In the command lines or environment variables of its programs; holds all of its files.
@@ -52,7 +52,7 @@ class Traces:
         self._tokens: set[str] = set()
 
     def look(self) -> list[proc.Process]:
-        """Find all of its processes that run now, and remember all that there is."""
+        """Find all of its running processes, and remember them."""
         self._note_names()
         table = proc.table()
         roots = [pid for pid in table if self._is_ours(pid)]
@@ -63,17 +63,17 @@ class Traces:
         return list(found.values())
 
     def processes(self) -> list[proc.Process]:
-        """All of its processes that run now, those included that can only be told by having been seen."""
+        """Return all of its running processes, including those that are only known from observation."""
         self.look()
         known = (proc.read(pid) for pid in self._seen)
         return [one for one in known if one is not None and one.start == self._seen[one.pid]]
 
     def cgroups(self) -> list[Path]:
-        """Its cgroups, in every hierarchy."""
+        """Return its cgroups, in every hierarchy."""
         return [path for path in task_set_cgroups() if path.name.removeprefix("rce-") in self._tokens]
 
     def left(self, but: Collection[int] = ()) -> list[str]:
-        """All that should be gone once its containers are.
+        """Return the objects that should not exist after the end of its containers.
 
         Args:
             but: Processes that may stay, by pid: its programs, if they run.
@@ -112,7 +112,7 @@ class Traces:
         return [line for line in lines if any(needle in line for needle in needles)]
 
     def _files(self) -> Iterator[Path]:
-        """What of containers is still in folders of state, and sockets. Logs are kept."""
+        """Return the remains of containers in state folders, and sockets. Logs are kept."""
         for path in _walk(self._folder):
             of_container = path.name in self._marks and "logs" not in path.parts
             if of_container or (path.is_socket() and "link" in path.name) or path.suffix == ".new":
@@ -120,7 +120,7 @@ class Traces:
 
 
 def footprint(pid: int) -> Footprint:
-    """Look at a process's descriptors and memory."""
+    """Return a process's descriptors and memory."""
     kinds: Counter[str] = Counter()
     with contextlib.suppress(OSError):
         for entry in Path(f"/proc/{pid}/fd").iterdir():
@@ -131,7 +131,7 @@ def footprint(pid: int) -> Footprint:
 
 
 def task_set_cgroups() -> Iterator[Path]:
-    """The cgroups of all container task sets of the machine that have some."""
+    """Return the cgroups of all container task sets of the machine."""
     for parent, folders, _ in os.walk(CGROUPS):
         ours = [name for name in folders if name.startswith("rce-") and name != "rce-engine"]
         yield from (Path(parent, name) for name in ours)
@@ -139,7 +139,7 @@ def task_set_cgroups() -> Iterator[Path]:
 
 
 def sweep_cgroups(folder: Path) -> list[Path]:
-    """Kill what is left in the cgroups of an engine that a test has ended, and remove them.
+    """Kill the remaining processes in the cgroups of an engine that a test has ended, and remove them.
 
     Args:
         folder: Holds all of the engine's files.
@@ -160,7 +160,7 @@ def sweep_cgroups(folder: Path) -> list[Path]:
 
 
 def sweep_dead_cgroups() -> None:
-    """Remove what killed test runs left: cgroups of task sets with nothing in them for long.
+    """Remove the remains of killed test runs: cgroups of task sets that have been empty for long.
 
     Younger ones may be those of a test run beside this one.
     """
@@ -171,7 +171,7 @@ def sweep_dead_cgroups() -> None:
 
 
 def _is_old(cell: Path) -> bool:
-    """Whether a cell is there for longer than any container takes to start."""
+    """Whether a control group has existed for longer than any container takes to start."""
     try:
         return time.time() - cell.stat().st_ctime > DEAD_AFTER_S
     except OSError:
@@ -179,7 +179,7 @@ def _is_old(cell: Path) -> bool:
 
 
 def _walk(folder: Path) -> Iterator[Path]:
-    """All that is in a folder; what vanishes meanwhile is left out."""
+    """Return the contents of a folder, without files that disappear meanwhile."""
     for parent, folders, names in os.walk(folder):
         yield from (Path(parent, name) for name in (*folders, *names))
 

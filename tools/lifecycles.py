@@ -123,10 +123,10 @@ def section(cycle: Cycle) -> Iterator[str]:
 
 
 def meaning(member: Enum) -> str:
-    """Return what the docstring of a member of an enum says.
+    """Return the docstring of a member of an enum.
 
     Raises:
-        LookupError: It has none.
+        LookupError: It does not have one.
     """
     doc = _module(type(member).__module__)[f"{type(member).__qualname__}.{member.name}"].docstring
     if doc is None:

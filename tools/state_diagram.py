@@ -1,8 +1,8 @@
 """Draws a life cycle as SVG. Pure: table in, text out, the same text for the same table.
 
-States stand below each other. What leads down leaves a state on its right side, what leads up on its left.
-All that leads to one state on one side joins one line, at dots. States that may all follow each other, by the
-same events, share a box. Events that change nothing are not drawn.
+States are below each other. Transitions down leave a state on its right side, transitions up on its left. All
+transitions to one state on one side join one line, at dots. States that may all follow each other, by the
+same events, share a box. Events without a transition are not drawn.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ def word(one: Enum) -> str:
 
 @dataclass
 class Box:
-    """States that are drawn as one, with what leaves them.
+    """States that are drawn as one, with their outgoing transitions.
 
     Attributes:
         states: The states.
         number: Its place from the top.
         down: Box number to the events that lead there, on the right side.
         up: The same for boxes above, on the left side.
-        entered: The sides on which something comes in: ``down`` means from above.
+        entered: The sides of incoming transitions: ``down`` means from above.
         top: Upper edge, pixels.
     """
 
@@ -63,12 +63,12 @@ class Box:
         return SLOT * slots + 10
 
     def slot(self, number: int) -> int:
-        """Return the height of a slot's line; the first one is for what comes in."""
+        """Return the height of a slot's line; the first one is for incoming transitions."""
         return self.top + 5 + SLOT * number + SLOT // 2
 
 
 def boxes_of(table: Table) -> list[Box]:
-    """Return the boxes of a life cycle, with what leads from one to another."""
+    """Return the boxes of a life cycle, with their transitions."""
     boxes = [Box(states, number) for number, states in enumerate(_groups(table))]
     place = {state: box for box in boxes for state in box.states}
     for box in boxes:
@@ -120,7 +120,7 @@ def _label(events: Sequence[str]) -> str:
 
 
 def _lines(boxes: Sequence[Box], side: str, edge: int, sign: int, space: int) -> list[str]:
-    """Draw what leads to each state on one side; the lines of the nearest targets are the inner ones."""
+    """Draw the transitions to each state on one side; the lines of the nearest targets are the inner ones."""
     targets = [box for box in boxes if side in box.entered]
     parts = []
     for number, target in enumerate(targets if sign > 0 else reversed(targets)):

@@ -27,7 +27,7 @@ class Side:
     argv: tuple[str, ...]
     env: dict[str, str] = field(default_factory=dict)
     words: frozenset[str] = frozenset()
-    """What it can do beyond echo and idle."""
+    """Its commands beyond echo and idle."""
 
     def start(self, uri: str, *words: str) -> subprocess.Popen[str]:
         """Start its program at a master."""

@@ -15,7 +15,7 @@ from benchmarks.ros.sides import SYSTEM_PYTHON, end
 
 LONGEST_S = 300.0
 TARGET = 1.2
-"""What a tool's time at our core may be at most, of its time at a rosmaster."""
+"""The maximum of a tool's time at our core, relative to its time at a rosmaster."""
 
 COMMANDS = (
     "rosnode list",

@@ -1,6 +1,6 @@
 """Our side: ``ours.py echo | ping SIZES | talk SECONDS | listen | serve | call SECONDS | beat COUNT | idle``.
 
-The other programs in this folder understand the same words.
+The other programs in this folder take the same arguments.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ SET_BOOL = "std_srvs/SetBool"
 
 
 def ready() -> None:
-    """Tell who measures."""
+    """Print the name of the measured library."""
     print("ready", flush=True)
 
 
 async def echo(node: Node) -> None:
-    """Send everything back."""
+    """Send every message back."""
     pong = await node.advertise("pong", STRING, queue_size=10)
     await node.subscribe("ping", STRING, pong.publish)
     ready()
@@ -32,7 +32,7 @@ async def echo(node: Node) -> None:
 
 
 async def ping(node: Node, sizes: str) -> None:
-    """Send each size so often, one message in flight; print the round trips in seconds."""
+    """Send each size repeatedly, one message in flight; print the round trips in seconds."""
     answered = asyncio.Event()
     await node.subscribe("pong", STRING, lambda _: answered.set())
     publisher = await node.advertise("ping", STRING, queue_size=10)
@@ -66,7 +66,7 @@ async def talk(node: Node, seconds: str) -> None:
 
 
 async def listen(node: Node) -> None:
-    """Count messages; print how many came between the first and the last, and the seconds between these."""
+    """Count messages; print how many arrived from the first to the last, and the seconds between these."""
     first = last = 0.0
     count = 0
 
@@ -121,7 +121,7 @@ async def idle(node: Node) -> None:
 
 
 async def main(word: str, *arguments: str) -> None:
-    """Do what the command line says."""
+    """Run the command of the command line."""
     work: dict[str, Callable[..., Awaitable[None]]] = {
         "echo": echo,
         "ping": ping,
