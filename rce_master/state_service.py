@@ -1,4 +1,4 @@
-"""The owner of the state: takes commands one by one, keeps what they change, and tells who acts on it."""
+"""The owner of the state: applies commands one by one, stores their changes, and notifies listeners."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _log = logging.getLogger(__name__)
 MAX_WAITING = 10_000
 MAX_BATCH = 256
 MAX_COMMANDS = 512
-"""Commands in one batch, about; while they are done nothing else is."""
+"""Approximate number of commands in one batch, which blocks the event loop."""
 
 Outcome = MasterError | None
-"""What became of a command: None if it was done, else why not."""
+"""The result of a command: None on success, else the error."""
 
 
 @dataclass(slots=True)
@@ -129,7 +129,7 @@ class StateService:
         await self._store.check()
 
     async def submit(self, command: Command) -> None:
-        """Do a command; returns when it is stored and everybody was told.
+        """Do a command; return when it is stored and all listeners were notified.
 
         Raises:
             RefusedError: It cannot be done; nothing changed.
@@ -211,7 +211,7 @@ class StateService:
         except RefusedError as error:
             return error
         except Exception as error:  # noqa: BLE001 - logged
-            # A fault of ours in one command must not take the whole cloud down; nothing of it was applied.
+            # A bug in one command must not stop the whole cloud; the command was not applied.
             _log.exception("could not apply %r", command)
             return MasterError(f"internal error: {error!r}")
         return None
@@ -243,7 +243,7 @@ async def load_converted(store: Store, term: int) -> Snapshot:
 
 
 def _touch_once(done: Sequence[Changes]) -> None:
-    """Leave each endpoint touched by the last of several changes only: its spec holds them all by now."""
+    """Keep each endpoint only in the last of several changes: its spec contains all of them."""
     later: dict[str, Touched] = {}
     for changes in reversed(done):
         once = {}

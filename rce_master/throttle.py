@@ -1,10 +1,10 @@
-"""Slows down who guesses passwords, by address and user (pure: the time is an argument).
+"""Slows down the guessing of passwords, by address and user (pure: the time is an argument).
 
 A check that fails costs a token of two buckets: that of the address and user, and that of the address.
 
 When the first is empty the next check has to wait for a token, and is refused when that takes longer than
-anybody waits at a door. When the second is empty checks wait for a moment, but are not refused: many robots
-and people share an address behind a router, and who guesses there must not keep them out.
+a login at a door may wait. When the second is empty checks wait for a moment, but are not refused: many
+robots and people share an address behind a router, and an attacker there must not lock them out.
 
 A check that succeeds costs nothing, so a fleet behind one address is never slowed down by itself, and wrong
 passwords from one address cost those at other addresses nothing.

@@ -1,4 +1,4 @@
-"""Gives containers their machines: those that are asked for, those that wait, those that lost theirs.
+"""Places containers: new ones, waiting ones, and those that lost their machine.
 
 - A container that is asked for while no container machine is connected waits for one: robots may start
   before their cloud.
@@ -6,7 +6,7 @@
   for with ``wait``.
 - Whenever there may be room, those that wait are looked at in the order in which they were asked for, and
   each that fits is placed: one passes another only while that one fits nowhere. No room is kept free for
-  large ones, because nobody knows when a container ends; an operator makes room by ``rce drain`` or
+  large ones, because the end of a container cannot be predicted; an operator makes room by ``rce drain`` or
   ``rce resize``.
 """
 
@@ -47,7 +47,7 @@ def admit(tx: Transaction, container: Container, *, wait: bool) -> None:
 
 
 def place_waiting(tx: Transaction) -> None:
-    """Place every container that is placed nowhere and for which there is a machine."""
+    """Place every unplaced container that fits on a machine."""
     waiting = [e for e in tx.tables.endpoints.by("task_set", "") if isinstance(e, Container)]
     if not waiting:
         return

@@ -1,4 +1,4 @@
-"""The records that the state is made of. All are immutable: a change replaces a record.
+"""The records of the state. All are immutable: a change replaces a record.
 
 Persistent records go to the store; the others (what is observed now) are made anew after a restart.
 """
@@ -29,13 +29,13 @@ class UserRole(Enum):
     """What a user may do."""
 
     VIEWER = "viewer"
-    """Sees everything of everybody, and changes nothing."""
+    """Sees the objects of all users, and cannot change any."""
     USER = "user"
     """Their own robots and containers."""
     OPERATOR = "operator"
-    """The same; sees everything of everybody, and steers every fleet at its station."""
+    """The same; also sees the objects of all users, and controls every fleet at its station."""
     ADMIN = "admin"
-    """Everything of everybody."""
+    """All objects of all users."""
 
     @property
     def sees_all(self) -> bool:
@@ -49,7 +49,7 @@ class UserRole(Enum):
 
 
 class User(Struct, frozen=True, kw_only=True):
-    """Somebody who may log in."""
+    """A user who may log in."""
 
     name: str
     role: UserRole
@@ -77,7 +77,7 @@ class Token(Struct, frozen=True, kw_only=True):
     used: float = 0.0
     """When it was last used, to the minute; 0: never."""
     scope: str = ""
-    """What it is good for: all that its user may do (empty), or one of ``robot:ID`` and ``metrics``."""
+    """Its scope: all permissions of its user (empty), or one of ``robot:ID`` and ``metrics``."""
 
     @property
     def id(self) -> str:
@@ -90,7 +90,7 @@ class Token(Struct, frozen=True, kw_only=True):
         return self.scope.removeprefix(ROBOT_SCOPE) if self.scope.startswith(ROBOT_SCOPE) else ""
 
     def is_expired(self, now: float) -> bool:
-        """Return whether it is worth nothing any more."""
+        """Return whether it has expired."""
         return bool(self.expires) and self.expires <= now
 
 
@@ -176,7 +176,7 @@ def user_package_key(user: str, name: str, version: str) -> str:
 
 
 class _Endpoint(Struct, frozen=True, kw_only=True):
-    """What robots and containers have in common."""
+    """The base of robots and containers."""
 
     id: str
     """``user/tag``."""
@@ -184,7 +184,7 @@ class _Endpoint(Struct, frozen=True, kw_only=True):
     task_set: str = ""
     """Process name of the task set that is responsible; empty: none."""
     size: int = 0
-    """Bytes of all that its user put into it, as :func:`rce_master.state.endpoints.size_of` counts them."""
+    """Bytes of its contents, as :func:`rce_master.state.endpoints.size_of` counts them."""
 
     @property
     def user(self) -> str:
@@ -236,7 +236,7 @@ Endpoint: TypeAlias = Robot | Container
 
 
 class TaskSet(Struct, frozen=True, kw_only=True):
-    """A task set that is there, or was there a short while ago."""
+    """A task set that is connected, or was recently."""
 
     process: str
     kind: TaskSetKind
@@ -248,14 +248,14 @@ class TaskSet(Struct, frozen=True, kw_only=True):
 
 
 class Drain(Struct, frozen=True, kw_only=True):
-    """A machine that an operator wants to be emptied; kept until that is taken back."""
+    """A machine that is drained; kept until the operator cancels the drain."""
 
     process: str
     """Of its container task set."""
 
 
 class Counter(Struct, frozen=True, kw_only=True):
-    """A number that only grows: what it gave out is never given out again."""
+    """A number that only increases: its values are never reused."""
 
     name: str
     value: int

@@ -156,7 +156,7 @@ def left(tx: Transaction, command: TaskSetLeft) -> None:
 
 
 def status_reported(tx: Transaction, command: StatusReported) -> None:
-    """Note what a task set reports of one endpoint; of one that is not placed there it is ignored.
+    """Apply a task set's report about one endpoint; ignore it if the endpoint is not placed there.
 
     So is what comes from a task set after its channel ended.
     """
@@ -194,7 +194,7 @@ def _follows(patch: StatusPatch, known: EndpointStatus | None) -> bool:
 
 
 def spec_requested(tx: Transaction, command: SpecRequested) -> None:
-    """Have the whole spec of an endpoint sent to its task set again."""
+    """Send the whole spec of an endpoint to its task set again."""
     endpoint = tx.tables.endpoints.get(command.id)
     if endpoint is not None and endpoint.task_set == command.process:
         tx.changes.wanted_specs.append((command.process, command.id))
@@ -240,7 +240,7 @@ def _ended(tx: Transaction, command: EndpointGone) -> None:
 
 
 def fault(tx: Transaction, command: FaultReported) -> None:
-    """Tell the user of an endpoint of a fault."""
+    """Report a fault to the user of an endpoint."""
     user = command.id.partition("/")[0]
     if user not in tx.tables.users:
         raise NotFoundError(f"there is no user {user!r}")
@@ -249,7 +249,7 @@ def fault(tx: Transaction, command: FaultReported) -> None:
 
 
 def tick(tx: Transaction, _: Tick) -> None:
-    """End grace times that are over, place what waits, tell users who have waited for long."""
+    """End expired grace times, place waiting containers, and notify users who have waited for long."""
     robots.expire(tx)
     for presence in list(tx.tables.presence):
         if not presence.connected:
@@ -274,10 +274,10 @@ def _expire(tx: Transaction, presence: Presence) -> None:
 
 
 def restart(tx: Transaction, revision: int) -> None:
-    """Begin with what the store held: nobody is connected, and every grace time starts now.
+    """Start with the store's contents: no task set is connected, and every grace time starts now.
 
-    Revisions continue above ``revision``. What task sets report has no say in it: a revision that nobody gave
-    would be in force as long as the store is.
+    Revisions continue above ``revision``. Reports of task sets do not affect this: a revision that no master
+    gave would stay in force as long as the store exists.
     """
     tx.raise_counter("revision", revision)
     tx.tables.first_revision = tx.newest("revision")

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def add(tx: Transaction, command: AddToken) -> None:
-    """Keep a token; forget what expired, and a login too many."""
+    """Keep a token; remove expired ones, and the oldest login beyond the limit."""
     token = command.token
     user = tx.tables.users.get(token.user)
     if user is None:
@@ -42,7 +42,7 @@ def note_uses(tx: Transaction, command: NoteTokenUses) -> None:
 
 
 def remove(tx: Transaction, command: RemoveToken) -> None:
-    """Forget the token that somebody gives back."""
+    """Remove a token that its owner revokes."""
     token = tx.tables.tokens.get(command.digest)
     if token is None:
         raise NotFoundError("there is no such token")
@@ -50,7 +50,7 @@ def remove(tx: Transaction, command: RemoveToken) -> None:
 
 
 def revoke(tx: Transaction, command: RevokeToken) -> None:
-    """Forget a token by its id, and end the session that was opened by it."""
+    """Remove a token by its id, and end the session that uses it."""
     found = [t for t in tx.tables.tokens.by("user", command.user) if t.id == command.id]
     if not found:
         raise NotFoundError(
@@ -62,7 +62,7 @@ def revoke(tx: Transaction, command: RevokeToken) -> None:
 
 
 def revoke_robot(tx: Transaction, command: RevokeRobotToken) -> None:
-    """Forget the token of a robot, and end the robot's session."""
+    """Remove the token of a robot, and end the robot's session."""
     user, robot = command.user, command.robot
     found = [t for t in tx.tables.tokens.by("user", user) if t.robot == robot]
     if not found:
@@ -73,7 +73,7 @@ def revoke_robot(tx: Transaction, command: RevokeRobotToken) -> None:
 
 
 def forget(tx: Transaction, token: Token, reason: str) -> None:
-    """Remove a token, and send away the robot that came in by it."""
+    """Remove a token, and disconnect the robot that uses it."""
     tx.delete(tx.tables.tokens, token.digest)
     robot = tx.tables.robot(f"{token.user}/{token.robot}") if token.robot else None
     if robot is not None and robot.credential == token.digest:
@@ -101,7 +101,8 @@ def _check_scoped(tx: Transaction, token: Token, *, replaces: bool) -> None:
 def _make_room(tx: Transaction, user: str) -> None:
     """Forget the logins that were not used for longest, until there is room for one more.
 
-    Refusing the new one instead would lock out who has the password: without a login nothing can be revoked.
+    Refusing the new one instead would lock out the owner of the password, who could not revoke tokens without
+    a login.
     """
     logins = [t for t in tx.tables.tokens.by("user", user) if not t.scope]
     surplus = len(logins) + 1 - tx.settings.max_tokens

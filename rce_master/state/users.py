@@ -32,7 +32,7 @@ def add_user(tx: Transaction, command: AddUser) -> None:
 def set_password(tx: Transaction, command: SetPassword) -> None:
     """Change a password; end the user's logins, and the sessions of robots that came in by the password.
 
-    Tokens of robots and of programs stay: they were made so that the fleet does not hang on a password.
+    Tokens of robots and of programs stay: they make the fleet independent of the password.
     """
     user = _find(tx, command.name)
     tx.put(replace(user, password=command.password))
@@ -47,7 +47,7 @@ def set_password(tx: Transaction, command: SetPassword) -> None:
 
 
 def set_role(tx: Transaction, command: SetRole) -> None:
-    """Change what a user may do. Robots of one who may change nothing any more are sent away."""
+    """Change a user's role. Robots of a user who becomes read-only are disconnected."""
     user = _find(tx, command.name)
     if user.role is command.role:
         return
@@ -60,7 +60,7 @@ def set_role(tx: Transaction, command: SetRole) -> None:
 
 
 def remove_user(tx: Transaction, command: RemoveUser) -> None:
-    """Remove a user and everything it owns."""
+    """Remove a user with all robots, containers, packages and tokens."""
     user = _find(tx, command.name)
     _keep_an_admin(tx, user)
     for endpoint in tx.tables.endpoints.by("user", user.name):
@@ -75,7 +75,7 @@ def remove_user(tx: Transaction, command: RemoveUser) -> None:
 
 
 def remember_login(tx: Transaction, command: RememberLogin) -> None:
-    """Keep the mark of a password that was right, for a user who is still there."""
+    """Keep the mark of a correct password, if the user still exists."""
     login = command.login
     if login.user in tx.tables.users and tx.tables.known_logins.get(login.user) != login:
         tx.put(login)

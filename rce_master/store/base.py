@@ -1,7 +1,7 @@
 """The interface of a store.
 
-A store knows nothing of robots or users: it keeps bytes under a table's name and a key. That is all a
-replicated store would have to do, too.
+A store does not know robots or users: it keeps bytes under a table's name and a key. A replicated store would
+need only the same functions.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 Snapshot = Mapping[str, Mapping[str, bytes]]
-"""All that a store holds: table name to key to encoded record."""
+"""The contents of a store: table name to key to encoded record."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class Store(Protocol):
         """
 
     async def begin_term(self) -> int:
-        """Take over: begin a new term, and end that of whoever wrote before.
+        """Take over: begin a new term, and end the term of the former writer.
 
         Returns:
             The term, greater than all before; it survives a crash.
@@ -64,4 +64,4 @@ class Store(Protocol):
         """
 
     async def close(self) -> None:
-        """Let go of everything; may be called twice."""
+        """Close the store; may be called twice."""

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class FolderLock:
-    """Held while it is open; the kernel gives it back however the process ends.
+    """Held while it is open; the kernel releases it when the process ends for any reason.
 
     Args:
         folder: Made if it is not there, readable by its owner only.
@@ -39,7 +39,7 @@ class FolderLock:
             ) from error
 
     def close(self) -> None:
-        """Give it back."""
+        """Release it."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
